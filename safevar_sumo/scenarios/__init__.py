@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from safevar_sumo.scenarios.along import Along
+from safevar_sumo.scenarios.ahead import Along
 from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION,
     SPEED_DIMENSION,
@@ -20,8 +20,7 @@ from safevar_sumo.scenarios.base import (
 )
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
-from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
+from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.weather import WEATHERS, equals_clear, weather_in_words, weather_of
 
 SCENARIOS: Mapping[str, type[Any]] = {

@@ -11,8 +11,7 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Grade, PreCrash, Roads, World, XmlChanges
-from safevar_sumo.scenarios.crossing_target import FOOTPATH_NETWORK, PersonMover, VehicleMover
+from safevar_sumo.scenarios.base import Frame, Grade, PreCrash, Roads, World, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import (
     BODIES,
     FROM_LEFT,
@@ -31,8 +30,17 @@ from safevar_sumo.scenarios.euro_ncap import (
     clear_gap,
     lateral_offset,
 )
-from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.scenarios.target import PARKED_GAP, EncounterConstants, Target, TargetTest, Times, value_at
+from safevar_sumo.scenarios.target import (
+    FOOTPATH_NETWORK,
+    PARKED_GAP,
+    EncounterConstants,
+    PersonMover,
+    Target,
+    TargetTest,
+    Times,
+    VehicleMover,
+    value_at,
+)
 
 KERB_LANE = "kerb_0"
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}

@@ -14,8 +14,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import KMH_PER_MS, FloatArray
-from safevar_sumo.scenarios.base import Coordinates, XmlChanges
-from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.base import Coordinates, Frame, XmlChanges
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""

@@ -25,7 +25,7 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import VUT, Lane, Point
-from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.perception import PointBatch

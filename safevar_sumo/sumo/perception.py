@@ -14,7 +14,7 @@ import numpy as np
 from safevar_sumo.ads.driver import STEP_DECIMALS, DelayLine
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import VUT, Point, Scenario, Scene
-from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, scene_of
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.copies import copied_id, copy_and_name

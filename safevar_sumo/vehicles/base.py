@@ -12,7 +12,7 @@ from msgspec import Meta
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Guard, open_rows, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.sensors import Sensors
+from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
@@ -159,6 +159,31 @@ def _select_state(is_rolling: BoolArray, steady: Any, rest: Any) -> Any:
         columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
         return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
     return steady if steady is None else np.where(is_rolling, steady, rest)
+
+
+class SensingVehicle(Vehicle):
+    """A vehicle with delayed sensors of limited range, whose pedals balance the slope at a steady speed.
+
+    Its constants have a `step` [s], the sensors' `latency` [s] and `sensor_range` [m]; its state has the history
+    `seen`.
+    """
+
+    __slots__ = ()
+
+    def sensors(self, prepared: Any) -> Sensors:
+        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
+
+    def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
+        """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
+        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
+        return sensed, state._replace(seen=past)
+
+
+def pedals_on_slope(back: Any, drive: FloatArray, brake: FloatArray) -> Command:
+    """Pedals that balance the deceleration `back` by the slope, the only resistance, given the accelerations by full
+    pedals [m/s^2].
+    """
+    return Command(*(np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / drive, -back / brake)))
 
 
 HIGHEST_SPEED = 1000.0

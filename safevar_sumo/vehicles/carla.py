@@ -62,7 +62,6 @@ class _Prepared(NamedTuple):
     mass: FloatArray
     radius: FloatArray
     engine_inertia_per_step: FloatArray
-    wheel_inertia: FloatArray
     wheel_inertia_per_step: FloatArray
     unbraked_wheel_inertia: FloatArray
     wheel_damping: FloatArray
@@ -92,9 +91,7 @@ class _Prepared(NamedTuple):
 
 
 class CarlaState(NamedTuple):
-    """State of N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s],
-    pedals [-].
-    """
+    """N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-]."""
 
     speed: FloatArray
     wheel_speed: FloatArray
@@ -106,28 +103,14 @@ class CarlaState(NamedTuple):
     brake: FloatArray
 
 
-class _Driveline(NamedTuple):
-    """Coefficients of engine, clutch and wheels that depend on the gears of N vehicles; arrays of shape (N,)."""
-
-    clutch: FloatArray
-    clutch_times_ratio: FloatArray
-    clutch_at_wheel: FloatArray  # clutch strength times ratio^2
-    engine_without_throttle: FloatArray  # inertia over a tyre step, plus damping without throttle
-    damping_by_throttle: FloatArray
-
-    @classmethod
-    def of(cls, p: _Prepared, gear: FloatArray) -> _Driveline:
-        in_gear, ratio = gear > NEUTRAL, OVERALL_RATIOS[gear.astype(np.intp)]
-        clutch = p.clutch * in_gear
-        damping = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        clutch_times_ratio = ratio * clutch
-        return cls(
-            clutch,
-            clutch_times_ratio,
-            clutch_times_ratio * ratio,
-            p.engine_inertia_per_step + damping,
-            p.damping_full - damping,
-        )
+def _driveline(p: _Prepared, gear: FloatArray) -> tuple[FloatArray, ...]:
+    """Coefficients that depend on the gears: the clutch's strength, times the ratio, times the ratio squared; the
+    engine's inertia over a tyre step plus its damping without throttle; its further damping by full throttle.
+    """
+    in_gear, ratio = gear > NEUTRAL, OVERALL_RATIOS[gear.astype(np.intp)]
+    clutch, damping = p.clutch * in_gear, np.where(in_gear, p.damping_engaged, p.damping_neutral)
+    by_ratio = ratio * clutch
+    return clutch, by_ratio, by_ratio * ratio, p.engine_inertia_per_step + damping, p.damping_full - damping
 
 
 class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -147,8 +130,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     throttle_rise, throttle_fall, brake_rise, brake_fall
         Rates of the pedals [1/s] (PxVehiclePadSmoothingData: 6 up, 10 down).
     shift_up, shift_down
-        Engine speeds over max_rpm above and below which the automatic gearbox shifts [-] (PxVehicleAutoBoxData: 0.65
-        and 0.5).
+        Engine speeds over max_rpm above and below which the gearbox shifts [-] (PxVehicleAutoBoxData: 0.65 and 0.5).
     shift_latency
         Minimum time between the beginnings of two shifts [s] (PxVehicleAutoBoxData: 2).
     camera_height, camera_design_radius
@@ -210,7 +192,6 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             throttle_rates=(np.array(-self.throttle_fall * substep), np.array(self.throttle_rise * substep)),
             brake_rates=(np.array(-self.brake_fall * substep), np.array(self.brake_rise * substep)),
             engine_inertia_per_step=np.array(ENGINE_INERTIA / tyre_step),
-            wheel_inertia=wheel_inertia,
             wheel_inertia_per_step=wheel_inertia / tyre_step,
             unbraked_wheel_inertia=wheel_inertia / tyre_step + wheel_damping,
             wheel_damping=wheel_damping,
@@ -263,7 +244,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         The gearbox has shifted up to the gear for this speed; where it would now shift down, its last shift has just
         ended.
         """
-        p, zeros = prepared, np.zeros_like(prepared.mass)
+        p = prepared
         rim, force = self._rim_at(p, speed)
         wheel_speed = rim / p.radius
         resistance = p.wheel_damping * wheel_speed + p.radius * force
@@ -274,25 +255,20 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             # torque m = -c_e w_e.
             engine_drag = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
             clutch_torque = np.maximum(resistance / ratio, engine_drag)
-            return (
-                clutch_torque,
-                ratio * (engine_drag - resistance / ratio),
-                np.minimum(ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit),
-            )
+            engine_speed = np.minimum(ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit)
+            return clutch_torque, ratio * (engine_drag - resistance / ratio), engine_speed
 
-        gear = zeros + 1
+        gear = np.ones_like(p.mass)
         for ratio in OVERALL_RATIOS[1:-1]:
             gear += engine_in(ratio)[-1] > p.shift_up * p.engine_limit
         clutch_torque, brake_torque, engine_speed = engine_in(OVERALL_RATIOS[gear.astype(np.intp)])
         brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
-        state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, zeros, zeros, zeros)
         throttle_torque = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
         throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(throttle_torque, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         shifts_down = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
-        return state._replace(
-            throttle=throttle, brake=brake, since_shift=np.where(shifts_down, p.shift_time, p.shift_latency)
-        )
+        since_shift = np.where(shifts_down, p.shift_time, p.shift_latency)
+        return CarlaState(speed, wheel_speed, engine_speed, gear, gear, since_shift, throttle, brake)
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
         """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may
@@ -325,7 +301,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             brake = _pedal_position(command.brake, s.brake, p.brake_rates)
             gear, target, since_shift = _shift(p, s, throttle)
             if driveline is None or gear is not s.gear:
-                driveline = _Driveline.of(p, gear)
+                driveline = _driveline(p, gear)
             s = CarlaState(*self._roll(p, s, driveline, throttle, brake), gear, target, since_shift, throttle, brake)
         is_held = (s.brake > p.zeros) & (s.speed < p.standstill)
         if np.count_nonzero(is_held):
@@ -333,7 +309,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return s
 
     def _roll(
-        self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray, brake: FloatArray
+        self, p: _Prepared, s: CarlaState, driveline: tuple[FloatArray, ...], throttle: FloatArray, brake: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Engine, clutch, wheels, tyres and body over one substep; returns the speeds of vehicle [m/s], wheels and
         engine [rad/s].
@@ -346,14 +322,12 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         D is the air drag. The tyre force F is explicit. It may end the slip within a step but never reverse it, so the
         slip cannot oscillate.
         """
-        clutch, clutch_times_ratio = driveline.clutch, driveline.clutch_times_ratio
-        engine = driveline.engine_without_throttle + driveline.damping_by_throttle * throttle + clutch
-        wheel = p.unbraked_wheel_inertia + driveline.clutch_at_wheel * (ONE - clutch / engine)
+        clutch, clutch_times_ratio, clutch_at_wheel, engine_without_throttle, damping_by_throttle = driveline
+        engine = engine_without_throttle + damping_by_throttle * throttle + clutch
+        wheel = p.unbraked_wheel_inertia + clutch_at_wheel * (ONE - clutch / engine)
         # Coefficients of a tyre step for the speeds (of a wheel, at its rim), for torques and for the tyre force:
-        engine_share, engine_gain = (
-            p.engine_inertia_per_step / engine,
-            throttle * self._torque(p, s.engine_speed) / engine,
-        )
+        engine_share = p.engine_inertia_per_step / engine
+        engine_gain = throttle * self._torque(p, s.engine_speed) / engine
         rim_by_torque = p.radius / wheel
         rim_share, rim_by_engine = p.wheel_inertia_per_step / wheel, clutch_times_ratio * rim_by_torque
         rim_loss = brake * p.brake_torque * rim_by_torque
@@ -386,9 +360,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return force
 
     def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
-        """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its
-        limit.
-        """
+        """Engine torque at full throttle [N m]: linear between the points of the curve."""
         speed_share = engine_speed / p.engine_limit
         rising_line = TORQUE_IDLE + TORQUE_RISE * speed_share
         falling_line = TORQUE_PEAK - TORQUE_FALL * (speed_share - PEAK_SPEED)

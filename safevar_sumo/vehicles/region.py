@@ -177,9 +177,6 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
         if bound.constraint.sum
     ]
     domain_ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
-    for bound in bounds:
-        if bound.constraint.sum:
-            _refuse_unreachable(source, bound, characteristics)
     vertices = _vertices(tuple(linear), *domain_ends) if linear else np.zeros((0, len(characteristics)))
     if vertices is None:
         raise InputError(
@@ -255,19 +252,6 @@ def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) ->
     for column, weight in weights:
         total = total + weight * settings[:, column]
     return total
-
-
-def _refuse_unreachable(source: str, bound: _Bounds, characteristics: CharacteristicSet) -> None:
-    terms = np.array(
-        [
-            [getattr(characteristics, end)[characteristics.names.index(name)] * weight for end in ("lower", "upper")]
-            for name, weight in bound.constraint.sum.items()
-        ]
-    )
-    smallest, largest = (float(extreme(terms, axis=1).sum()) for extreme in (np.min, np.max))
-    if largest < bound.minimum or smallest > bound.maximum:
-        problem = f"constraints: {bound.constraint.quantity} is between {smallest:g} and {largest:g} in the domains"
-        raise InputError(source, problem, bound.condition)
 
 
 @lru_cache(maxsize=16)

@@ -7,9 +7,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
+from safevar_sumo.records import BoolArray, Command, FloatArray
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, SensingVehicle, Slope, SumoType, pedals_on_slope
+from safevar_sumo.vehicles.sensors import delay_signal, extend_history, start_history
 
 
 class _Prepared(NamedTuple):
@@ -23,7 +23,7 @@ class _Prepared(NamedTuple):
     max_speed: FloatArray
     actuator_lag: FloatArray
     sensor_range: FloatArray
-    reaction_time: FloatArray
+    latency: FloatArray
     brake_delay: FloatArray
     brake_gain: FloatArray
     back: float | FloatArray  # deceleration by the slope
@@ -43,7 +43,7 @@ class SumoState(NamedTuple):
     brake_commands: FloatArray
 
 
-class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
 
     Parameters
@@ -88,7 +88,7 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             max_speed=c["maxSpeed"],
             actuator_lag=c["tau"],
             sensor_range=c["sensorRange"],
-            reaction_time=c["reactionTime"],
+            latency=c["reactionTime"],
             brake_delay=c["brakeDelay"],
             brake_gain=c["brakeGain"],
             back=slope.back,
@@ -110,10 +110,8 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return SumoState(zeros, zeros, zeros, zeros, zeros + 1, None, commands)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
-        """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
-        brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
-        throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
+        throttle, brake = pedals_on_slope(p.back, p.accel, p.brake_gain * p.decel)
         return rest._replace(
             speed=speed,
             acceleration=rest.acceleration + p.back,
@@ -121,18 +119,6 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             brake=brake,
             brake_commands=rest.brake_commands + brake,
         )
-
-    def sensors(self, prepared: _Prepared) -> Sensors:
-        return Sensors(prepared.reaction_time, prepared.sensor_range, np.ones_like(prepared.sensor_range))
-
-    def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
-        """Sensors report the scene as it was `reactionTime` ago, and nothing beyond `sensorRange` times the
-        visibility.
-        """
-        sensed, past = sensed_observation(
-            seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step
-        )
-        return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
         """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin(slope), da/dt = (target - a) / T."""

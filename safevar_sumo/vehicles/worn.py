@@ -7,9 +7,17 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
+from safevar_sumo.records import BoolArray, Command, FloatArray
+from safevar_sumo.vehicles.base import (
+    LEVEL,
+    Characteristics,
+    Positive,
+    SensingVehicle,
+    Slope,
+    SumoType,
+    pedals_on_slope,
+)
+from safevar_sumo.vehicles.sensors import delay_signal, extend_history, start_history
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
 """Tread depths with published stopping distances [mm]; the last depth is the legal minimum in Europe."""
@@ -55,7 +63,7 @@ class WornState(NamedTuple):
     brake_commands: FloatArray
 
 
-class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A car with two axles that never lock: each axle brakes up to the friction that its load allows.
 
     Parameters
@@ -155,21 +163,9 @@ class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         )
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
-        """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
-        brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
-        throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)
+        throttle, brake = pedals_on_slope(p.slope.back, p.drive, p.brake)
         return rest._replace(speed=speed, throttle=throttle, brake=brake, brake_commands=rest.brake_commands + brake)
-
-    def sensors(self, prepared: _Prepared) -> Sensors:
-        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
-
-    def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
-        """The sensors report the scene as it was `sensorLatency` ago, and nothing beyond `sensorRange` times the
-        visibility.
-        """
-        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
-        return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: WornState, command: Command) -> WornState:
         p = prepared

@@ -7,8 +7,7 @@ import pytest
 
 from safevar_sumo.records import Trace
 from safevar_sumo.scenarios import Lane
-from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
-from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
+from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.target import EncounterConstants, Target, scene_of
 from tests.made_up import made_up_runs
 

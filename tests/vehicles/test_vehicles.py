@@ -9,7 +9,7 @@ import pytest
 
 from safevar_sumo.records import Observation
 from safevar_sumo.vehicles import VEHICLES
-from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
+from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import delay_signal
 from tests.vehicles.runs import (
@@ -32,7 +32,10 @@ def kinetic_energy(model: str, run: Drive) -> np.ndarray:
     """Kinetic energy of all moving parts [J], shape (T, N)."""
     p, states = run.prepared, run.states
     if isinstance(SYSTEMS[model].vehicle, Carla):
-        wheels_and_engine = [p.wheel_inertia * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2 for s in states]
+        wheels_and_engine = [
+            WHEELS * 0.5 * WHEEL_MASS * p.radius**2 * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2
+            for s in states
+        ]
         return np.stack([(p.mass * s.speed**2 + spins) / 2 for s, spins in zip(states, wheels_and_engine, strict=True)])
     if isinstance(SYSTEMS[model].vehicle, Lgsvl):
         return np.stack([(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])

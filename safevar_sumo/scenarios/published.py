@@ -1,4 +1,6 @@
-"""A pedestrian walks into the lane."""
+"""The scenarios of the published study: a pedestrian walks into the lane; both lanes ahead are blocked by parked
+vehicles.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scenario, Scene, World
-from safevar_sumo.scenarios.frame import MAX_SKEW, Frame
+from safevar_sumo.scenarios.base import MAX_SKEW, VUT, Frame, Grade, PreCrash, Scenario, Scene, World
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 PEDESTRIAN = "pedestrian"
@@ -106,5 +107,55 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
             separation=trace.gap,
             distance=centre_distance - half_length,
             closing_speed=approach / centre_distance,
+            in_conflict=trace.gap > 0,
+        )
+
+
+PARKED_VEHICLE = "parked_ahead"
+
+
+class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
+
+    Parameters
+    ----------
+    duration
+        Length of a run [s].
+    grade
+        Rise of the road over its length, negative downhill [%].
+
+    Notes
+    -----
+    A run ends with a collision or after `duration`, as a vehicle that has stopped may start again.
+    """
+
+    network: str = "lead_vehicle_stopped"
+    duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
+    grade: Grade = 0.0
+    reactive_actors = False
+    pre_crash = PreCrash.LEAD_STOPPED
+    centre_to_centre = True
+
+    def begin(self, world: World) -> tuple[Frame, FloatArray]:
+        frame = Frame.through_origin(world.lane_of(VUT))
+        rear = frame.along(world.vehicle_positions(PARKED_VEHICLE)) - world.vehicle_length(PARKED_VEHICLE)
+        return frame, rear
+
+    def observe(
+        self, world: World, step: float, memory: tuple[Frame, FloatArray]
+    ) -> tuple[Scene, tuple[Frame, FloatArray]]:
+        frame, parked_rear = memory
+        gap = parked_rear - frame.along(world.vehicle_positions(VUT))
+        zeros = np.zeros_like(gap)
+        return Scene(gap, zeros, zeros, zeros > 0), memory  # never over
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """Safety degree: distance between the centres of two vehicles of equal length; TTC = gap / v (docs/method.md,
+        section 4).
+        """
+        return Encounter(
+            separation=trace.gap + trace.vehicle_length,
+            distance=trace.gap,
+            closing_speed=trace.speed,
             in_conflict=trace.gap > 0,
         )
