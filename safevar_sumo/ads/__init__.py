@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.ads.apollo import Apollo
 from safevar_sumo.ads.base import REACTION_PARAMETERS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
 from safevar_sumo.ads.fmu import FmuAds
+from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FullBraking, FuzzySafety, Rss
-from safevar_sumo.ads.world_on_rails import WorldOnRails
 
 ADS: Mapping[str, type[Any]] = {
     "acc": Acc,

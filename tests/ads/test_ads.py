@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from safevar_sumo.ads import ADS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.ads.world_on_rails import WorldOnRails
+from safevar_sumo.ads.published import WorldOnRails
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Along, CarToCar

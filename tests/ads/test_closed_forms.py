@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from safevar_sumo.ads.apollo import Apollo
 from safevar_sumo.ads.car_following import Krauss
-from safevar_sumo.ads.world_on_rails import WorldOnRails
+from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.records import Nominal, Observation, PedalTables
 
 STEP = 0.05

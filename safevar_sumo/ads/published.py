@@ -1,0 +1,264 @@
+"""The two driving systems of the published study: Apollo, a modular system, and World On Rails, an end-to-end
+policy.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.base import Ads
+from safevar_sumo.ads.driver import DelayLine, interpolate_tables
+from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
+
+WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
+HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
+TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
+CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
+LEAST_DISTANCE = 0.05  # m, smallest distance over which a deceleration is planned
+FIRST_COMMAND_ROUNDING = 1e-9  # s
+
+
+class _ApolloMemory(NamedTuple):
+    """The original vehicle; time between calls; whether it stops; planned deceleration, commanded acceleration,
+    creeping time [SI].
+    """
+
+    nominal: Nominal
+    step: float
+    stops: BoolArray
+    planned_deceleration: FloatArray
+    commanded_acceleration: FloatArray
+    creeping_time: FloatArray
+
+
+class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Apollo (Baidu): plans its stop and follows it through a calibration table.
+
+    Cruises, plans a comfortable stop before the obstacle, creeps to the end of the stop and holds.
+
+    Parameters
+    ----------
+    first_command
+        Time from the start of the run to the first command to a standing vehicle [s].
+    perception_range
+        Largest gap at which it detects obstacles, in clear weather [m].
+    cruise_speed, cruise_gain, cruise_acceleration
+        Speed to accelerate to [m/s], acceleration per speed error [1/s], and largest acceleration [m/s^2].
+    jerk
+        Limit on the change of the commanded acceleration [m/s^3].
+    stop_gap
+        Gap at which the planned deceleration ends [m].
+    comfortable_deceleration
+        It begins to brake when stopping at `stop_gap` requires this deceleration [m/s^2].
+    largest_deceleration
+        Largest deceleration that it commands [m/s^2].
+    creep_speed, creep_time
+        Speed and duration of the final creep, a soft stop with the brake released [m/s, s].
+    pedal_lag
+        Lag of the pedals assumed in planning [s].
+    """
+
+    first_command: Annotated[float, Meta(ge=0)]
+    cruise_speed: WidePositive
+    cruise_gain: WidePositive
+    cruise_acceleration: WidePositive
+    jerk: WidePositive
+    stop_gap: Annotated[float, Meta(ge=0)]
+    comfortable_deceleration: WidePositive
+    largest_deceleration: WidePositive
+    creep_speed: Annotated[float, Meta(ge=0)]
+    creep_time: Annotated[float, Meta(ge=0)]
+    pedal_lag: Annotated[float, Meta(ge=0)]
+    perception_range: WidePositive = 100.0
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _ApolloMemory:
+        zeros = np.zeros(n)
+        return _ApolloMemory(
+            nominal,
+            step,
+            stops=zeros > 0,
+            planned_deceleration=zeros,
+            commanded_acceleration=zeros,
+            creeping_time=zeros,
+        )
+
+    def drive(self, seen: Observation, memory: _ApolloMemory) -> tuple[Command, _ApolloMemory]:
+        plan = self._plan(seen, memory)
+        command = self._pedals(seen, plan)
+        if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
+            return command, plan
+        is_waiting = seen.speed == 0
+        array_fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
+        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _ApolloMemory(
+            memory.nominal, memory.step, *array_fields
+        )
+
+    def _plan(self, seen: Observation, memory: _ApolloMemory) -> _ApolloMemory:
+        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and
+        hold.
+        """
+        speed = seen.speed
+        is_detected = seen.gap <= self.perception_range * seen.visibility
+        distance = np.where(is_detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
+        needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
+        # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk
+        # limit.
+        lost_distance = speed * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
+        planned_deceleration = speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
+        begins_braking = (planned_deceleration > self.comfortable_deceleration) & ~memory.stops
+        stops = memory.stops | begins_braking
+        last_acceleration, largest_change = memory.commanded_acceleration, np.array(self.jerk * memory.step)
+        if np.count_nonzero(begins_braking):
+            # Planning is continuous in time: braking began within the last step, when the needed deceleration passed
+            # the limit.
+            rise = np.maximum(planned_deceleration - memory.planned_deceleration, 1e-9)
+            share = np.where(
+                begins_braking, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0
+            )
+            last_acceleration = np.where(begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration)
+            largest_change = largest_change * share
+
+        braking = np.minimum(needed_deceleration, self.largest_deceleration)
+        braking = np.minimum(braking, np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME)
+        cruising = np.minimum(self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration)
+        change = np.where(stops, -braking, cruising) - last_acceleration
+        acceleration = last_acceleration + np.minimum(np.maximum(change, -largest_change), largest_change)
+
+        is_creeping = stops & (speed < self.creep_speed + CREEP_MARGIN)
+        creeping_time = memory.creeping_time + memory.step * is_creeping
+        acceleration[is_creeping] = 0.0
+        acceleration[creeping_time > self.creep_time] = -HOLDING_DECELERATION
+        return memory._replace(
+            stops=stops,
+            planned_deceleration=planned_deceleration,
+            commanded_acceleration=acceleration,
+            creeping_time=creeping_time,
+        )
+
+    def _pedals(self, seen: Observation, memory: _ApolloMemory) -> Command:
+        """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
+        nominal = memory.nominal
+        coasting, full_throttle = interpolate_tables(
+            nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle
+        )
+        excess = memory.commanded_acceleration + coasting
+        throttle = np.minimum(np.maximum(excess / (full_throttle + coasting), 0.0), 1.0)
+        brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
+        throttle[memory.stops], brake[~memory.stops] = 0.0, 0.0
+        return Command(throttle, brake)
+
+
+UpTo60 = Annotated[float, Meta(ge=0, le=60)]
+Throttle = Annotated[float, Meta(ge=0, le=1)]
+Delay = Annotated[float, Meta(ge=0, le=5)]
+SPEED_LIMIT = 20 / KMH_PER_MS
+"""Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
+SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
+"""The first three of the four speed levels in the policy's source code, 0 to 8 m/s; between them the throttle is linear
+in speed.
+"""
+PASSED_GAP = -0.5
+"""Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin to brake for it."""
+RELEASE_GAP = -1.0
+"""Once braking, the policy brakes until the obstacle is this far behind the front bumper [m]."""
+
+
+class _RailsMemory(NamedTuple):
+    """Whether the policy brakes; commands not yet carried out, newest last; delay lines.
+
+    `recognition_line` delays gap and lateral position, `hesitation_line` the brake command.
+    """
+
+    is_braking: BoolArray
+    pending_commands: tuple[Command, ...]
+    recognition_line: DelayLine
+    hesitation_line: DelayLine
+
+
+class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """World On Rails (Chen, Koltun, Kraehenbuehl 2021): a vision policy at 20 Hz.
+
+    Full brake for a near obstacle in its corridor, else throttle up to its speed limit.
+
+    Parameters
+    ----------
+    first_command
+        Time from the start of the run to the first throttle of a standing vehicle [s].
+    latency
+        Time from an image to its command [s], rounded to whole steps.
+    corridor
+        Half the width of the corridor in which the policy brakes for obstacles; it releases the brake when they leave
+        the corridor [m].
+    brake_gap, brake_gap_per_speed
+        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at the
+        lateral position `brake_place`.
+    brake_place
+        Lateral position of an obstacle for which the policy brakes earliest [m], negative on the side that it comes
+        from.
+    brake_gap_before, brake_gap_past
+        Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of
+        `brake_place`, and by `brake_gap_past` for each metre past it, so that the policy brakes later for obstacles
+        that enter or leave its path. The visibility multiplies the remaining gap.
+    throttle
+        Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
+    recognition_delay
+        Additional time to recognise an obstacle, compared with clear weather [s].
+    hesitation
+        Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake
+        at once.
+    """
+
+    first_command: UpTo60
+    latency: UpTo60
+    corridor: UpTo60
+    brake_gap: float
+    brake_gap_per_speed: float
+    brake_place: float
+    brake_gap_before: UpTo60
+    brake_gap_past: UpTo60
+    throttle: tuple[Throttle, Throttle, Throttle]
+    recognition_delay: Delay = 0.0
+    hesitation: Delay = 0.0
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _RailsMemory:
+        idle = Command(np.zeros(n), np.zeros(n))
+        return _RailsMemory(
+            np.zeros(n, dtype=bool),
+            (idle,) * round(self.latency / step),
+            DelayLine.by(self.recognition_delay, step),
+            DelayLine.by(self.hesitation, step),
+        )
+
+    def drive(self, seen: Observation, memory: _RailsMemory) -> tuple[Command, _RailsMemory]:
+        (gap, lateral), recognition_line = memory.recognition_line.delayed(np.array([seen.gap, seen.lateral]))
+        is_braking = self._decide_to_brake(seen, gap, lateral, memory.is_braking)
+        is_waiting = (seen.speed == 0) & (seen.time < self.first_command)
+        throttle = np.where(is_braking | is_waiting | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
+        command, *pending_commands = (*memory.pending_commands, Command(throttle, is_braking.astype(float)))
+        delayed_brake, hesitation_line = memory.hesitation_line.delayed(command.brake)
+        memory = _RailsMemory(is_braking, tuple(pending_commands), recognition_line, hesitation_line)
+        return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
+
+    def _decide_to_brake(
+        self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
+    ) -> BoolArray:
+        """Whether the recognised obstacle is near and in the corridor; then the policy's probability of braking exceeds
+        one half.
+        """
+        offset = lateral - self.brake_place
+        reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
+        braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
+        is_in_corridor = np.abs(lateral) <= self.corridor
+        starts_braking = is_in_corridor & (gap <= braking_gap) & (gap > PASSED_GAP)
+        keeps_braking = is_in_corridor & was_braking & (gap > RELEASE_GAP)
+        is_braking: BoolArray = starts_braking | keeps_braking
+        return is_braking
+
+    def _throttle(self, speed: FloatArray) -> FloatArray:
+        low, middle, high = self.throttle
+        level = speed / SPEED_LEVELS[1]
+        upper = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
+        return np.asarray(np.where(level < 1, low + (middle - low) * level, upper))
