@@ -171,54 +171,6 @@ STUDY = st.lists(
     ),
     max_size=3,
 )
-VALUES = st.one_of(
-    st.floats().map(str),
-    st.floats(-9, 9).map("{:+g}%".format),
-    st.floats(-9, 9).map("{:+g}%".format),
-    st.sampled_from(
-        [
-            "+10%",
-            "-200%",
-            "1.0..1.5:3",
-            "1..2:0",
-            "1..2:-3",
-            "2..1:2",
-            "1e999",
-            "5e-324",
-            "nan",
-            "inf",
-            "1..2:1e9",
-            "%",
-            "..",
-            ":",
-            "1e300%",
-        ]
-    ),
-    st.text(max_size=8),
-)
-CHANGES = st.tuples(
-    st.sampled_from([*SMOKE.names, "mass ", "f_diff"]), st.sampled_from(["=", "=", " = ", "=="]), VALUES
-).map("".join)
-SIMULATE = st.lists(
-    st.one_of(
-        st.tuples(st.just("--set"), CHANGES),
-        st.tuples(st.just("--set"), CHANGES),
-        st.sampled_from([("--json",), ("--no-filter",), ("--beyond",), ("--trace", "t.csv")]),
-        st.sampled_from(
-            [
-                ("--fewest",),
-                ("--nothing",),
-                ("--trace", "."),
-                ("--plot", "p.txt"),
-                ("--slower", "0"),
-                ("--point", "x"),
-                ("--solution", "nsga2:0:0"),
-                ("--json",),
-            ]
-        ),
-    ),
-    max_size=3,
-)
 
 
 @contextmanager
@@ -247,11 +199,3 @@ def test_study_takes_or_refuses_its_flags(monkeypatch: pytest.MonkeyPatch) -> No
 
 def searched(flags: list[tuple[str, ...]]) -> None:
     tried("study", "smoke", "--runs", "1", "--evaluations", "10", *(part for flag in flags for part in flag))
-
-
-def simulated(flags: list[tuple[str, ...]]) -> None:
-    tried("simulate", "smoke", *(part for flag in flags for part in flag))
-
-
-def test_simulate_takes_or_refuses_its_flags() -> None:
-    FEW(given(SIMULATE)(simulated))()

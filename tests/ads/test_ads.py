@@ -148,14 +148,6 @@ def test_sensors_that_are_late_warn_as_much_later(scenario: Any, latency: float)
     assert warned < 2.2 - latency + 1e-9
 
 
-def test_a_warning_changes_nothing_and_who_brakes_has_warned() -> None:
-    early, late = (driven(CarToCar(test="CCRs", speed=50), Aeb(warning_time=time)) for time in (6.0, 0.0))
-    np.testing.assert_array_equal(early.trace.brake, late.trace.brake)
-    brakes = int(np.argmax(late.trace.brake[:, 0] > 0))
-    assert late.warning_ttc[0] == pytest.approx(late.trace.gap[brakes, 0] / late.trace.speed[brakes, 0])
-    assert early.warning_ttc[0] == pytest.approx(5.0, abs=STEP), "as far as the scene goes"
-
-
 class Near(ScalarAds):
     """Warns, and does no more, below a gap of 20 m."""
 

@@ -103,20 +103,6 @@ def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> Non
     assert throttle == [0.0] * 6 + [0.9] * 3, "0.2 s is step 4, the command arrives two steps later"
 
 
-@pytest.mark.parametrize(
-    ("gap", "begins", "goes_on"), [(-0.4, True, True), (-0.6, False, True), (-0.9, False, True), (-1.1, False, False)]
-)
-def test_world_on_rails_begins_to_brake_for_nobody_beside_it_and_lets_go_a_metre_past_him(
-    gap: float, begins: bool, goes_on: bool
-) -> None:
-    ads = world_on_rails()
-    command, _ = ads.drive(seen(1.0, 3.0, gap), ads.start(1, KNOWN, STEP))
-    assert bool(command.brake[0]) == begins
-    _, braking = ads.drive(seen(1.0, 3.0, 5.0), ads.start(1, KNOWN, STEP))
-    command, _ = ads.drive(seen(1.05, 3.0, gap), braking)
-    assert bool(command.brake[0]) == goes_on
-
-
 def onset(ads: Apollo, speed: float, visibility: float = 1.0, start: float = 60.0) -> float:
     """The gap at which Apollo first brakes while its speed stays constant [m]."""
     memory, gap, time = ads.start(1, KNOWN, STEP), start, 0.0

@@ -101,8 +101,6 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
     assert stages[-1] == ("settings", 3, 3)
-    table = pd.DataFrame({"tireFric": [1.2, None, np.nan], "mass": pd.array([None, None, 2500], dtype="Int64")})
-    pd.testing.assert_frame_equal(sv.evaluate("sun", table, jobs=1), frame)
 
 
 def test_a_criterion_is_a_number_a_word_or_an_object() -> None:

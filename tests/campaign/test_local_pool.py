@@ -194,6 +194,3 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
         reproduced(study_at(study, point, "test"), mass=original + 200)
         == f" --point '{point}' --set mass={original + 200}"
     )
-    rated = load_study("euro_ncap_rating")
-    cell = assemble(rated).matrix[3].name
-    assert f"--point '{cell}'" in reproduced(study_at(rated, cell, "test"))

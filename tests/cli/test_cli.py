@@ -16,7 +16,6 @@ from pathlib import Path
 import click
 import msgspec
 import pytest
-from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 from rich.console import Console
 
@@ -88,25 +87,6 @@ def test_errors_of_the_library_speak_of_arguments_and_not_of_flags() -> None:
             for node in ast.walk(ast.parse(file.read_text())):
                 if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id.endswith("Error"):
                     assert not re.search(r"--[a-z]", re.sub(r"`[^`]*`", "", ast.unparse(node))), f"{file}:{node.lineno}"
-
-
-@pytest.mark.parametrize(
-    ("words", "incomplete", "expected"),
-    [
-        ([], "s", {name for name in COMMANDS if name.startswith("s")}),
-        (["study"], "ra", {"rain"}),
-        (["simulate"], "su", {"sun"}),
-        (["simulate", "native", "--set"], "t", {"tau="}),
-        (["simulate", "sun", "--set"], "ma", {"mass=", "max_rpm=", "maxBrakeTorque="}),
-        (["simulate", "nothing", "--set"], "t", set()),
-        (["validate"], "lg", {"lgsvl"}),
-    ],
-)
-def test_names_complete(words: list[str], incomplete: str, expected: set[str]) -> None:
-    result = ShellComplete(commands, {}, "safevar-sumo", "_SAFEVAR_SUMO_COMPLETE").get_completions(words, incomplete)
-    assert expected == {item.value for item in result if item.type == "plain"} or expected <= {
-        item.value for item in result
-    }
 
 
 def test_80_columns_break_no_word_of_a_heading() -> None:

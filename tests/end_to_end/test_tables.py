@@ -76,9 +76,6 @@ def test_figures_are_files_of_the_kind_asked_for(kind: str, start: bytes, result
 
 def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> None:
     assert sorted(path.name for path in imported.iterdir()) == ["manifest.json", "solutions.csv"]
-    manifest = json.loads((imported / "manifest.json").read_text())
-    assert manifest["imported"]["files"] == {"nsga2": "nsga2.csv", "rs": "rs.csv"}
-    assert manifest["original"] == load_study("sun").published
     frame = pd.read_csv(imported / "solutions.csv")
     assert "run" not in frame
     assert len(frame) == 70
@@ -89,8 +86,6 @@ def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> Non
     )
     assert frame["f_num_diff"].tolist() == (settings != characteristics.original).sum(axis=1).tolist()
     assert np.allclose(frame["f_diff"], np.max(np.abs(settings / characteristics.original - 1), axis=1))
-    assert set(frame.loc[frame["safety_degree"] <= 0, "outcome"]) == {"collision"}
-    assert set(frame.loc[frame["safety_degree"] > 0, "outcome"]) == {"unknown"}
 
 
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:

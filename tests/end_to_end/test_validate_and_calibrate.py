@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import re
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -73,9 +70,6 @@ def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None
         assert set(output["original"][name]) == {"reference", "here"}
     assert output["collisions"]["reference"] == output["collisions"]["here"] == output["collisions"]["both"]
     assert (in_tmp / "plot.png").stat().st_size > 50_000
-    kept = tomllib.loads((in_tmp / "kept.toml").read_text())["sun"]["mine.csv"]
-    assert (kept["rows"], kept["collisions"]) == (40, output["collisions"])
-    assert kept["spearman"]["safety_degree"] == pytest.approx(1.0)
 
 
 @pytest.mark.slow
@@ -108,23 +102,6 @@ def small_fit() -> tuple[str, ...]:
         '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n'
     )
     return "calibrate", "mine.toml", "--trials", "5", "--out", "found.toml"
-
-
-def test_a_full_disk_loses_neither_the_old_file_nor_the_fit(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    replace = os.replace
-
-    def full(source: Path, target: Path) -> None:
-        if target.name == "found.toml":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target)
-
-    Path("found.toml").write_text("old")
-    monkeypatch.setattr(os, "replace", full)
-    done = run(*small_fit(), expect=2)
-    assert "cannot write found.toml: No space left on device" in done.stderr
-    assert re.search(r"brake_gap +. +m +. +[\d.]+ ", done.stdout), "what was found is printed first"
-    assert Path("found.toml").read_text() == "old"
-    assert sorted(path.name for path in in_tmp.iterdir()) == ["found.toml", "mine.toml"]
 
 
 def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import openpyxl
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
 from safevar_sumo.analysis.rating.render import rating_in_words
-from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Points, Rater, colours_of, darken
@@ -22,6 +20,7 @@ from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import refused
 
 PROTOCOL = protocol_of(EURO_NCAP_2026)
 CELLS = PROTOCOL.cells
@@ -105,22 +104,6 @@ def test_the_extended_range_is_stepped(good: int, share: float) -> None:
     assert points_of(results(impact)).tests["CMRs"][0, 1] == pytest.approx(0.15 * share)
 
 
-def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_held() -> None:
-    impact, standard = np.full(N, np.nan), numbers("CBNA", "standard")
-    for red, earned in ((6, True), (7, False)):
-        impact[standard[:red]] = 50.0
-        points = points_of(results(impact)).tests["CBNA"][0]
-        assert points[0] == pytest.approx(1 - red / 12)
-        assert (points[2] > 0) == earned
-    layers = PROTOCOL.layers_of("CBNA")
-    held, claim = (
-        sum(bool(one.simulated_conditions) for one in layers),
-        next(one.name for one in layers if not one.simulated_conditions),
-    )
-    shares = [points_of(results(), claims).tests["CBNA"][0, 2] / 0.125 for claims in ({}, {"CBNA": [claim]})]
-    assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.5, 40))
 def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, more: float) -> None:
@@ -186,31 +169,28 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
     }
 
 
-def _rate(*arguments: str) -> Any:
-    return CliRunner().invoke(commands, ["rating", "euro_ncap_rating", *arguments])
-
-
-def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simulated(tmp_path: Path) -> None:
-    book = openpyxl.Workbook()
-    book.save(there := tmp_path / "there.xlsx")
-    (text := tmp_path / "text.xlsx").write_text("no spreadsheet")
-    new = str(tmp_path / "new.xlsx")
-    for arguments, message in (
-        (["--xlsx", new], "--xlsx with --template"),
-        (["--template", str(there)], "--xlsx with --template"),
-        (["--template", str(there), "--xlsx", str(there)], "--force"),
-        (["--preprocessed", str(there)], "--force"),
-        (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "but not both"),
-        (["--template", "nothing.xlsx", "--xlsx", new], "nothing.xlsx: cannot be read as a spreadsheet"),
-        (["--template", str(tmp_path), "--xlsx", new], "cannot be read as a spreadsheet"),
-        (["--template", str(text), "--xlsx", new], "text.xlsx"),
-        (["--template", str(there), "--xlsx", new], "has no sheet 'Version'"),
-        (["--set", "treadDepth=1.6..8:3"], "one value"),
-        (["--solution", "nsga2:0:0"], "has no solutions"),
-        (["--set", "treadDepth=1"], "treadDepth"),
-        (["--plot", str(there)], ".png"),
-    ):
-        error = _rate(*arguments).exception
-        assert isinstance(error, InputError), (arguments, error)
-        assert message in str(error), (arguments, str(error))
-    assert not Path(new).exists()
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("--xlsx new.xlsx", "--xlsx with --template"),
+        ("--template there.xlsx", "--xlsx with --template"),
+        ("--template there.xlsx --xlsx there.xlsx", "--force"),
+        ("--preprocessed there.xlsx", "--force"),
+        ("--template there.xlsx --preprocessed there.xlsx --xlsx new.xlsx", "but not both"),
+        ("--template nothing.xlsx --xlsx new.xlsx", "nothing.xlsx: cannot be read as a spreadsheet"),
+        ("--template . --xlsx new.xlsx", "cannot be read as a spreadsheet"),
+        ("--template text.xlsx --xlsx new.xlsx", "text.xlsx"),
+        ("--template there.xlsx --xlsx new.xlsx", "has no sheet 'Version'"),
+        ("--set treadDepth=1.6..8:3", "one value"),
+        ("--solution nsga2:0:0", "has no solutions"),
+        ("--set treadDepth=1", "treadDepth"),
+        ("--plot there.xlsx", ".png"),
+    ],
+)
+def test_what_cannot_be_written_or_read_is_refused_before_anything_is_simulated(
+    typed: str, message: str, in_tmp: Path
+) -> None:
+    openpyxl.Workbook().save("there.xlsx")
+    Path("text.xlsx").write_text("no spreadsheet")
+    refused("rating", "euro_ncap_rating", *typed.split(), message=(message,))
+    assert not Path("new.xlsx").exists()

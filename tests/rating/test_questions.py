@@ -4,7 +4,6 @@ process.
 
 from __future__ import annotations
 
-from io import StringIO
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,12 +11,10 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures, summarise_failures
-from safevar_sumo.analysis.explain.sentences import print_explained
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
@@ -100,9 +97,6 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     assert failure.points
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
-    console = Console(record=True, width=120, file=StringIO())
-    print_explained(console, "it", result, full=True)
-    assert "The colour is worse at " in console.export_text()
     lines = summarise_failures(case, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)

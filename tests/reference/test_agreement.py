@@ -12,7 +12,7 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference.agreement import measure_agreement, rank_correlation
-from safevar_sumo.reference.rows import ReferenceData, package_filter, read_reference
+from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.made_up import made_up_evaluations
@@ -147,16 +147,6 @@ def test_both_published_formats_are_read(
     for undefined in (data.collided, np.isnan(data.metrics["tet"]), np.isnan(data.metrics["tit"])):
         assert undefined.tolist() == [False, True, False]
     assert data.skipped == 1
-
-
-def test_the_packages_filter_compares_a_rounded_share_with_at_least() -> None:
-    """Mass: 660 kg wide, beta 0.02. 0.0196 of it rounds to 0.02 and stays; the paper's own filter puts it back."""
-    settings = np.repeat(SUN.original[np.newaxis], 2, axis=0)
-    settings[:, SUN.names.index("mass")] += np.array([0.0196, 0.0194]) * 660
-    kept, reset = package_filter(SUN, settings)
-    assert np.array_equal(kept, settings[0])
-    assert np.array_equal(SUN.filter(settings)[0], SUN.original)
-    assert np.array_equal(reset, SUN.original)
 
 
 @pytest.mark.parametrize(

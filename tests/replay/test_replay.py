@@ -127,12 +127,6 @@ def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -
             end = comparison.film.last_samples[row] + 1
             assert list(line.get_xdata()) == list(trace.time[:end])
             assert list(line.get_ydata()) == list(values[:end, row])
-    assert [axis.get_ylabel() for axis in figure.axes] == [
-        "speed [m/s]",
-        "gap to the obstacle [m]",
-        "brake     |     throttle",
-        "time to collision [s]",
-    ]
     words = " ".join(text.get_text() for text in figure.legends[0].get_texts())
     assert comparison.verdict(0) in words
     assert comparison.verdict(1) in words
@@ -267,13 +261,6 @@ def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
         assert np.allclose(shown["x"], body.x, atol=0.0051)
     assert [drive["end"] for drive in data["drives"]] == crash.film.last_samples.tolist()
-
-
-def test_text_of_a_study_stays_text(crash: Comparison) -> None:
-    page = animation_page(lay_out_scene(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
-    assert "<script>alert" not in page
-    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
-    assert "http" not in page.replace("http-equiv", ""), "nothing is fetched from elsewhere"
 
 
 def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

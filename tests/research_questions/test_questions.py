@@ -32,7 +32,6 @@ from safevar_sumo.analysis.research_questions.comparisons import (
     significance_change_line,
     summary_lines,
 )
-from safevar_sumo.analysis.research_questions.figures import draw_critical_differences
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples, correct_by_holm
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import MetricsTable
@@ -76,15 +75,6 @@ def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
     assert only(rq2(case), metric="tet")["effect_size"] == 1
 
 
-def test_rq1_says_which_values_are_undefined() -> None:
-    result = answer_questions([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
-    assert only(result.frame, metric="tet")["n1"] == 1
-    assert only(result.frame, metric="tit")["p_value"] is None
-    notes = "".join(result.notes)
-    assert "tet is undefined in 1 of 2 solutions" in notes
-    assert "the original vehicle's tit is undefined" in notes
-
-
 def test_rq2_is_high_where_nsga2_is_better() -> None:
     rows = [
         *(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
@@ -95,25 +85,6 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
     assert frame["effect_size"].tolist() == [1] * 7
     exchanged = [{**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows]
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
-
-
-def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
-    rows = (row(), row(), row(run=1), row("rs"), row("rs", run=1), row("rs", run=1), row("rs", run=1))
-    sizes = {metric: (n1, n2) for metric, n1, n2 in rq2(made_up(*rows))[["metric", "n1", "n2"]].to_numpy()}
-    assert (sizes["igd"], sizes["tet"]) == ((2, 2), (3, 4))
-    (imported,) = answer_questions([made_up(*rows, has_runs=False)], "rq2")
-    assert only(imported.frame, metric="igd")["p_value"] is None
-    assert only(imported.frame, metric="tet")["n1"] == 3
-    assert any("need runs" in note for note in imported.notes)
-
-
-@pytest.mark.parametrize(
-    ("case", "expected"),
-    [(made_up(row("rs")), "no finished run of nsga2"), (made_up(row()), "only nsga2"), (made_up(), "no finished run")],
-)
-def test_rq2_without_an_algorithm_is_refused(case: Case, expected: str) -> None:
-    with pytest.raises(InputError, match=expected):
-        answer_questions([case], "rq2")
 
 
 def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
@@ -141,20 +112,6 @@ def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
     assert part["mean_rank"].sum() == pytest.approx(6)
     by_metric = frame.drop_duplicates("metric")
     assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"].tolist())
-
-
-def test_what_cannot_be_asked_says_why() -> None:
-    """The largest difference of three mean ranks is 2; with two runs the critical difference is 2.9."""
-    degrees = {"nsga2": 1.0, "rs": 1.5, "mocell": 2.0}
-    two_runs = made_up(*(row(name, run, sd=sd) for name, sd in degrees.items() for run in (0, 1)))
-    for question, case, problem in (
-        (rank_algorithms, made_up(row("nsga2"), row("rs")), "of 2 algorithms"),
-        (compare_pairs, made_up(row("nsga2")), "of 1 algorithm"),
-        (compare_pairs, made_up(row("nsga2"), row("rs"), has_runs=False), "imported"),
-        (draw_critical_differences, two_runs, "too few for a figure of critical diff"),
-    ):
-        with pytest.raises(UnanswerableError, match=problem):
-            question(case)
 
 
 def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:

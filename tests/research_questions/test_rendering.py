@@ -13,7 +13,7 @@ import pytest
 
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.research_questions.tables import as_json, as_latex, as_markdown, as_text, escaped_for_latex
+from safevar_sumo.analysis.research_questions.tables import as_json, as_latex, as_markdown, as_text
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import made_up, made_up_study, row
 from tests.research_questions.test_questions import three_algorithms
@@ -79,25 +79,6 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout[-2000:]
-
-
-@pytest.mark.parametrize(
-    ("plain", "latex_form"),
-    [
-        ("a_b", r"a\_b"),
-        ("50 %", r"50 \%"),
-        ("m/s^2", r"m/s\textsuperscript{2}"),
-        ("^", r"\textasciicircum{}"),
-        ("[x]", "{[}x{]}"),
-        ("-0.5", r"\textminus{}0.5"),
-        ("2-3", "2-3"),
-        ("s^-1", r"s\textsuperscript{\textminus{}1}"),
-        ("NSGA-2", "NSGA-2"),
-        ("\\", r"\textbackslash{}"),
-    ],
-)
-def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
-    assert escaped_for_latex(plain) == latex_form
 
 
 @pytest.mark.parametrize(

@@ -203,22 +203,6 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
     other.communicate()
 
 
-def test_a_reason_is_stored_with_its_setting_and_adds_nothing_to_other_batches(tmp_path: Path) -> None:
-    failed = batch(0)
-    result = dataclasses.replace(failed, reasons={failed.settings[2].tobytes(): "SUMO failed: it said so"})
-    sizes = []
-    for name, one in (("without", failed), ("with", result)):
-        journal = Journal(tmp_path / name, HEAD)
-        journal.append(places(0), one)
-        journal.close()
-        sizes.append((tmp_path / name).stat().st_size)
-    content = read_journal(tmp_path / "with", HEAD)
-    assert content.evaluations is not None
-    assert content.evaluations.reason(2) == "SUMO failed: it said so"
-    assert "reason" not in (tmp_path / "without").read_text()
-    assert sizes[1] > sizes[0]
-
-
 def test_evaluations_after_a_failure_are_spare_after_a_retry(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     write(path, batches=2)

@@ -8,7 +8,6 @@ import pytest
 from safevar_sumo.records import Trace
 from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
-from safevar_sumo.scenarios.target import EncounterConstants, Target, scene_of
 from tests.made_up import made_up_runs
 
 STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
@@ -95,19 +94,6 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
             turns.append(k)
             world.turned_at = None
     assert turns == [7], "0.63 m; 0.72 m would be beyond"
-
-
-@pytest.mark.parametrize(("faster", "avoids"), [(0.4, False), (0.6, True)])
-def test_a_vehicle_has_avoided_a_target_ahead_once_it_has_approached_at_half_a_metre_a_second_and_is_no_longer_faster(
-    faster: float, avoids: bool
-) -> None:
-    target, approached, over = Target(np.array([30.0]), np.zeros(1), speed=5.0), np.zeros(1, dtype=bool), []
-    for speed in (5.0, 5.0 + faster, 5.1, 5.0):
-        scene, approached = scene_of(
-            EncounterConstants(follows=True), target, np.zeros(1), np.array([speed]), approached
-        )
-        over.append(bool(scene.over[0]))
-    assert over == [False, False, False, avoids], "who keeps its distance from the start has not avoided anything"
 
 
 def trace(gap: list[float], speed: list[float], lateral: list[float], lateral_speed: list[float]) -> Trace:

@@ -170,11 +170,6 @@ def test_a_generation_improves_if_its_best_beats_the_worst_of_the_fifty_best() -
     assert not _improves(window([[60, 50]], [55.0]), earlier)
 
 
-@pytest.mark.parametrize(("population", "sides"), [(50, (5, 10)), (36, (6, 6)), (7, (1, 7)), (2, (1, 2))])
-def test_a_grid_is_as_near_to_a_square_as_the_population_allows(population: int, sides: tuple[int, int]) -> None:
-    assert MoCell().grid_sides(population) == sides
-
-
 def test_a_grid_closes_on_itself() -> None:
     around = MoCell(grid=(3, 4))._neighbours(12)
     assert sorted(around[0]) == [0, 1, 3, 4, 5, 7, 8, 9, 11], "the corner's neighbours are on all sides"

@@ -5,6 +5,7 @@ refused.
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -145,59 +146,50 @@ def constrained(*constraints: Mapping[str, Any]) -> Study:
     return load_study("smoke", constraints=list(constraints))
 
 
-MASS = {"sum": {"mass": 1.0}}
+MASS, HEAD = "sum = { mass = 1 }\n", "[[constraints]]\n"
+ALL_FIXED = HEAD.join(
+    f"sum = {{ {name} = 1 }}\nat_least = {value}\nat_most = {value}\n"
+    for name, value in zip(SUN.names, SUN.original, strict=True)
+)
 
 
 @pytest.mark.parametrize(
-    ("constraints", "problem"),
+    ("text", "problem"),
     [
+        (f"{MASS}at_least = 2500", "the original vehicle: violates a constraint: mass = 2404 kg (mass = 2404 kg)"),
         (
-            [{**MASS, "at_least": 2500.0}],
-            "the original vehicle: violates a constraint: mass = 2404 kg (mass = 2404 kg)",
-        ),
-        (
-            [{"sum": {"mass": 1.0, "maxBrakeTorque": -1.0}, "unit": "kg", "at_most": 900.0}],
+            "sum = { mass = 1, maxBrakeTorque = -1 }\nunit = 'kg'\nat_most = 900",
             "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected: at most 900 kg",
         ),
-        ([{**MASS, "at_least": 3000.0}], "no setting in the domains satisfies all of them: mass at least 3000 kg"),
+        (f"{MASS}at_least = 3000", "no setting in the domains satisfies all of them: mass at least 3000 kg"),
         (
-            [{**MASS, "at_least": 2404.0}, {"sum": {"mass": 2.0, "tireFric": 1.0}, "unit": "kg", "at_most": 4800.0}],
+            f"{MASS}at_least = 2404\n{HEAD}sum = {{ mass = 2, tireFric = 1 }}\nunit = 'kg'\nat_most = 4800",
             "no setting in the domains satisfies all of them: mass at least 2404 kg; 2 mass + tireFric at most 4800 kg",
         ),
+        (ALL_FIXED, "leave only the original vehicle"),
+        (f"{MASS}upper = 1", "constraints[0].upper: there is no such key\nexpected: one of at_least"),
         (
-            [
-                {"sum": {name: 1.0}, "at_least": float(value), "at_most": float(value)}
-                for name, value in zip(SUN.names, SUN.original, strict=True)
-            ],
-            "leave only the original vehicle",
-        ),
-        (
-            [{"sum": {"mass": 1.0}, "upper": 1.0}],
-            "constraints[0].upper: there is no such key\nexpected: one of at_least",
-        ),
-        ([{"sum": {"mass": 1.0}, "name": "x"}], "constraints[0].name: there is no such key\nexpected: one of at_least"),
-        (
-            [{"sum": {"mas": 1.0}, "at_least": 1.0}],
+            "sum = { mas = 1 }\nat_least = 1",
             "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?",
         ),
         (
-            [{**MASS, "at_least": 1.0, "unit": "t"}],
+            f"{MASS}at_least = 1\nunit = 't'",
             "constraints[0]: unit = 't' for the sum of mass [kg]\nexpected: one of -, kg",
         ),
         (
-            [{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}],
+            "sum = { mass = 1, radius = 1 }\nat_least = 1",
             "constraints[0]: unit = None for the sum of mass [kg], radius [cm]",
         ),
-        ([{**MASS}], "neither at_least nor at_most"),
-        ([{**MASS, "at_least": 2.0, "at_most": 1.0}], "at_least = 2 and at_most = 1"),
-        ([{"at_least": 2.0}], "neither sum nor function"),
-        ([{**MASS, "function": "a:b", "at_most": 2.0}], "both sum and function"),
-        ([{"function": "no_such_module:f", "at_most": 2.0}], "constraints[0].function = 'no_such_module:f'"),
+        (MASS, "neither at_least nor at_most"),
+        (f"{MASS}at_least = 2\nat_most = 1", "at_least = 2 and at_most = 1"),
+        ("at_least = 2", "neither sum nor function"),
+        (f"{MASS}function = 'a:b'\nat_most = 2", "both sum and function"),
+        ("function = 'no_such_module:f'\nat_most = 2", "constraints[0].function = 'no_such_module:f'"),
     ],
 )
-def test_constraints_that_cannot_be_used_are_refused(constraints: list[dict[str, Any]], problem: str) -> None:
+def test_constraints_that_cannot_be_used_are_refused(text: str, problem: str) -> None:
     with pytest.raises(InputError) as refused:
-        region_of(constrained(*constraints))
+        region_of(load_study("smoke", **tomllib.loads(HEAD + text)))
     assert problem in str(refused.value)
 
 

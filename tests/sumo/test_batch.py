@@ -68,16 +68,6 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(any_s
     assert np.all(run.trace.speed.max(axis=0) > 1.0)
 
 
-def test_sumo_moves_the_vehicle_at_the_speeds_of_the_vehicle_model(any_system: System) -> None:
-    """SUMO's position is the integral of the commanded speeds: in each step the mean of both speeds, by the ballistic
-    method.
-    """
-    trace = simulate(any_system, drawn(any_system, 3, 11)).trace
-    travelled = np.add.accumulate((trace.speed[1:] + trace.speed[:-1]) / 2 * trace.step, axis=0)
-    until = trace.active[1:]
-    assert np.allclose((trace.position[1:] - trace.position[0])[until], travelled[until], atol=1e-6)
-
-
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
     """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision
     speed).

@@ -251,27 +251,3 @@ def test_the_vehicle_model_limits_a_commanded_acceleration(tmp_path: Path, monke
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
     assert 7 < hardest < 9.0
     assert run.outcome[0] == Outcome.STOPPED
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nexpected: package.module:Name$"),
-        (
-            {"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}},
-            r"^mine: ads.model = .* does not take ads.parameters",
-        ),
-        (
-            {"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}},
-            r"^mine: ads.model = .* does not take ads.parameters",
-        ),
-        ({"model": "my_controller:step"}, r'not a class\nexpected: .*; or with ads.kind = "traci" a function step\('),
-    ],
-)
-def test_a_wrong_ads_table_raises_an_error_before_the_simulation(
-    table: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "my_controller.py").write_text(SCRIPT)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=message):
-        assemble(msgspec.structs.replace(load_study("native"), ads=msgspec.convert(table, ModelTable)), "mine")
