@@ -90,9 +90,20 @@ class SearchRace:
         )
 
     def run(self, searches: Sequence[CmaSearch]) -> None:
-        """Spend all trials left, in equal parts, on searches one after the other."""
-        for number, search in enumerate(searches):
-            search.advance(self.trials_left // (len(searches) - number))
+        """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
+
+        All rounds have the same number of trials. Half of the searches reach the next round; the last search gets the
+        remaining trials.
+        """
+        competitors = list(searches)
+        rounds = 1 + (len(competitors) - 1).bit_length()
+        trials_per_round = self.trials_left // rounds
+        for _ in range(rounds):
+            trials = trials_per_round // len(competitors)
+            for search in competitors:
+                search.advance(trials - trials % search.population if trials > search.population else trials)
+            competitors = sorted(competitors, key=lambda search: search.lowest_loss)[: (len(competitors) + 1) // 2]
+        competitors[0].advance(self.trials_left)
 
 
 class CmaSearch:

@@ -218,11 +218,11 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reported, not fitted. Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well:
     they become the study's `spread`.
 
-    `trials` sets of parameters are tried, in generations of `population`, in equal parts by a search from the study's
-    own values and by searches from `starts` random places in the bounds. With an `ensemble` of 2 or more, each random
-    start is an ensemble Kalman inversion of so many places, and the search begins at its best place and in its
-    covariance; all inversions have half the trials at most. A search around known values has a third of the
-    `population`. `seed` is the seed of all random numbers.
+    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own
+    values and from `starts` random places in the bounds; the worse half gives up after every round. With an `ensemble`
+    of 2 or more, each random start is an ensemble Kalman inversion of so many places, and the search begins at its best
+    place and in its covariance; all inversions have half the trials at most. A search around known values has a third
+    of the `population`. `seed` is the seed of all random numbers.
     """
 
     trials: PositiveInt = 1200

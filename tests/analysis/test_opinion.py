@@ -267,6 +267,21 @@ def test_no_rim_is_much_faster_than_the_car(study: str) -> None:
     point = max(system.points, key=lambda one: getattr(one.scenario, "test_speed", None) or 0.0)
     simulate(replace(system.at(point), vehicle=spy), np.stack(extremes))
     assert -0.5 < spy.largest < 1.0
+    assert not spy.spinning
+
+
+@pytest.mark.slow
+def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at
+    8 m/s.
+    """
+    cause = CauseToJudge("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
+    (calm,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
+    monkeypatch.setattr("safevar_sumo.analysis.opinion.multi_body.TRACTION_SHARE", np.inf)
+    (spinning,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
+    assert (spinning.opinion, spinning.there.outcome) == ("outside", "collision")
+    assert "spin" in spinning.because
+    assert (calm.there.safety_degree or 0.0) > -4 > -7 > (spinning.there.safety_degree or 0.0)
 
 
 @pytest.mark.slow

@@ -157,6 +157,23 @@ def race_in(bowl: Bowl, population: int, trials: int) -> tuple[SearchRace, list[
     return SearchRace(bowl.misfits_at, population, trials, lambda loss, best: losses.append(loss)), losses
 
 
+def test_the_worse_half_gives_up_after_every_round() -> None:
+    class Runner:
+        """Has found what it has found, and counts its trials."""
+
+        def __init__(self, lowest: float) -> None:
+            self.lowest_loss, self.population, self.rounds = lowest, 1, list[int]()
+
+        def advance(self, trials: int) -> None:
+            self.rounds.append(trials)
+
+    runners = [Runner(lowest) for lowest in (5.0, 1.0, 4.0, 2.0, 3.0)]
+    race_in(Bowl(), 1, 300)[0].run(runners)  # type: ignore[arg-type]
+    # Rounds of 5, 3, 2 and 1 searches with 75 trials each; the winner gets what remains, which these runners never
+    # take.
+    assert [runner.rounds for runner in runners] == [[15], [15, 25, 37, 75, 300], [15], [15, 25, 37], [15, 25]]
+
+
 def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     """Above a bottom of one, within 4 % of it is what is 0.2 from the bottom."""
     race, _ = race_in(Bowl(bottom=1.0), 8, 800)

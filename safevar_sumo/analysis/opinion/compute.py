@@ -18,7 +18,7 @@ from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.robustness import draw_neighbours, is_borderline, robustness_in_words
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
-from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
+from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of
 from safevar_sumo.campaign.pool import Pool
@@ -240,6 +240,8 @@ def judge_causes(
             because = f"the original vehicle itself is not safe with the second model: {original_there}"
         elif not theirs.valid[row]:
             because = f"it could not be simulated with the second model: {there}"
+        elif settings[row].tobytes() in vehicle.spinning:
+            because = f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
         else:
             verdict = "contradicted"
             because = f"safe with the second model: {there}; the original vehicle: {original_there}"

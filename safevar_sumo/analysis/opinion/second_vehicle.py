@@ -157,6 +157,8 @@ MAPPING_TABLES: Mapping[str, MappingTable] = {
 }
 """Tables by the names of shipped vehicles."""
 
+SPIN_LIMIT = 1.0
+"""Speed of a rim above the car's from which the wheels spin [m/s]: such a simulation confirms nothing."""
 CREEP_SPEED = 0.01
 """Speed above which the original vehicle's wheel speed is scaled with its speed [m/s]."""
 
@@ -172,6 +174,7 @@ class Prepared(NamedTuple):
     plant: Plant
     engine_mass: FloatArray
     engine_radius: FloatArray
+    settings: FloatArray
     slope: Slope
     step: float
 
@@ -198,6 +201,8 @@ class SecondVehicle(Vehicle):
     ----------
     name, table
         The shipped vehicle that the study's vehicle is or resembles, and its mapping.
+    spinning
+        The settings, as bytes, of the vehicles whose wheels spun in a simulation.
 
     Raises
     ------
@@ -206,7 +211,7 @@ class SecondVehicle(Vehicle):
     """
 
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
-        self._vehicle, self.UNITS = vehicle, vehicle.UNITS
+        self._vehicle, self.UNITS, self.spinning = vehicle, vehicle.UNITS, set[bytes]()
         model: Any = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
         rows = study.vehicle.characteristics
         for name, cls in VEHICLES.items():
@@ -245,8 +250,8 @@ class SecondVehicle(Vehicle):
         slope: Slope = LEVEL,
         wet: bool | BoolArray = False,
     ) -> Prepared:
-        road, count = Road(road_friction, slope, wet), len(next(iter(characteristics.values())))
-        original = {name: np.full(count, value) for name, value in self._original.items()}
+        road, settings = Road(road_friction, slope, wet), np.stack([*characteristics.values()], axis=1)
+        original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
         plant, own = (self.table.represent(self._engine, c, self._original, road) for c in (represented, original))
         return Prepared(
@@ -255,6 +260,7 @@ class SecondVehicle(Vehicle):
             plant=plant,
             engine_mass=own.mass + WHEEL_COUNT * own.wheel_inertia / own.radius**2,
             engine_radius=own.radius,
+            settings=settings,
             slope=slope,
             step=step,
         )
@@ -294,6 +300,8 @@ class SecondVehicle(Vehicle):
             change = np.maximum((demand - brake) * lag_share, -plant.brake_fall * step)
             brake = brake + np.minimum(change, plant.brake_rise * step)
             body = advance(plant, body, brake, drive_torque, step)
+        spins = np.max(body.wheel_speeds * plant.radius, axis=0) > body.speed + SPIN_LIMIT
+        self.spinning.update(setting.tobytes() for setting in prepared.settings[spins])
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
     def _advance_engine(self, prepared: Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
