@@ -224,7 +224,7 @@ def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_g
 
 SETTINGS = 200
 SIMULATIONS = 2_000
-MOST_MEMORY = 8e6
+MOST_MEMORY = 20e6
 """Largest growth of the memory of all processes over these simulations [bytes]."""
 
 
