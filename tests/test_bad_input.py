@@ -36,7 +36,7 @@ TYPED = [
     ("study sun --algorithms nsga3", "'nsga3'"),
     ("study sun --batch many", "many"),
     ("study sun --out /proc/nowhere", "--out: cannot write to /proc/nowhere"),
-    ("study smoke --out link", "--out: cannot write to link: File exists"),
+    ("study smoke --out link", "--out: cannot write to link: it is a link whose target does not exist"),
     ("study smoke --out file", "--out"),
     ("study sun --seed", "see python -m safevar_sumo study --help"),
     ("study", "Missing argument 'STUDY'"),

@@ -133,6 +133,10 @@ def main() -> None:
         _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except OSError as error:
         _exit_with_error(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
+    except ValueError:
+        if not sys.stdout.closed:
+            raise
+        _exit_with_error("user code has closed standard output", 1)
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -101,9 +101,9 @@ def make_directory(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise InputError(
-            "out", f"cannot write to {path}: {error.strerror}", "a directory that can be written"
-        ) from None
+        is_dangling = path.is_symlink() and not path.exists()
+        problem = "it is a link whose target does not exist" if is_dangling else error.strerror
+        raise InputError("out", f"cannot write to {path}: {problem}", "a directory that can be written") from None
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, reduce
 from itertools import islice
+from operator import getitem
 from typing import Any, TypeVar
 
 import msgspec
@@ -59,7 +60,7 @@ def json_schema(table: type) -> dict[str, Any]:
     return msgspec.json.schema(table)
 
 
-def schema_mistakes(source: object, raw: object, table: type, prefix: str = "") -> Iterator[InputError]:
+def schema_mistakes(source: object, raw: Any, table: type, prefix: str = "") -> Iterator[InputError]:
     """All mistakes in `raw` by the JSON schema of `table`, in jsonschema's words; one for each unknown key."""
     import jsonschema  # here, as it takes longer to load than a study
 
@@ -84,7 +85,11 @@ def schema_mistakes(source: object, raw: object, table: type, prefix: str = "") 
         else:
             message = error.message.removeprefix(repr(value)).strip()
             quoted = f" = {short_text(value)}" if message != error.message else ":"
-            yield InputError(source, f"{_path_text(path)}{quoted} {message}".removeprefix(": "))
+            hint = ""
+            if error.validator == "required" and error.absolute_path:  # a table with a mistyped name is a new one
+                *parents, name = error.absolute_path
+                hint = did_you_mean(name, {*reduce(getitem, parents, raw)} - {name})
+            yield InputError(source, f"{_path_text(path)}{quoted} {message}".removeprefix(": ") + hint)
 
 
 def _leaves(error: Any) -> list[Any]:
@@ -100,13 +105,19 @@ def _leaves(error: Any) -> list[Any]:
 
 
 def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str]) -> InputError:
-    """The error for an unknown key: it suggests tables of a study that have this key, else the nearest known key."""
-    homes = [
-        f"{field.name}.{key}"
+    """The error for an unknown key: it suggests tables of a study that have this key; then, outside of tables, also the
+    nearest key of a table, else the nearest known key.
+    """
+    keys = [
+        (field.name, inner)
         for field in msgspec.structs.fields(Study)
-        if key in getattr(field.type, "__struct_fields__", ())
+        for inner in getattr(field.type, "__struct_fields__", ())
     ]
-    hint = f"; did you mean {' or '.join(homes)}?" if homes and "[" not in key_path else did_you_mean(key, names)
+    homes = [f"{table}.{inner}" for table, inner in keys if inner == key]
+    hint = did_you_mean(key, [*names, *(inner for _, inner in keys if key_path == key)])
+    homes = homes or [f"{table}.{inner}" for table, inner in keys if repr(inner) in hint and inner not in names]
+    if homes and "[" not in key_path:
+        hint = f"; did you mean {' or '.join(homes)}?"
     return InputError(source, f"{key_path}: there is no such key{hint}", one_of(names))
 
 

@@ -326,3 +326,16 @@ def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: M
     message = failing(mine(scenario(method, body), SCENARIO))
     assert expected in message
     assert "scenario.model = 'mine:Mine'" in message
+
+
+def test_an_ads_that_closes_standard_output_ends_in_one_line(in_tmp: Path) -> None:
+    Path("my_ads.py").write_text(
+        "import sys\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
+        "    def drive(self, seen):\n        sys.stdout.close()\n        return 0.5, 0.0\n"
+    )
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
+    command = [sys.executable, "-m", "safevar_sumo", "simulate", "mine.toml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines()[-1] == "safevar-sumo: user code has closed standard output"
+    assert "Traceback" not in done.stderr
