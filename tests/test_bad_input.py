@@ -113,6 +113,7 @@ TYPED = [
     ("calibrate name.toml --trials 1 --out x.toml", "weather.name"),
     ("calibrate friction.toml --trials 1 --out x.toml", "lower = -3"),
     ("calibrate sun mine.csv --trials 1 --out mine.csv", "mine.csv"),
+    ("calibrate name.toml --trials 1 --out name.toml", "--out: name.toml is an input of the command"),
 ]
 
 

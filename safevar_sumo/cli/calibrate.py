@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,9 @@ from safevar_sumo.reference.calibration import Calibration, FitSubject, calibrat
 from safevar_sumo.study import FITTED_TABLES, Study, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
+
+SECONDS_BETWEEN_SAVES = 60.0
+"""Least time between two study files with the best values so far, which remain if the process is killed [s]."""
 
 
 @commands.command(name="calibrate")
@@ -74,6 +78,8 @@ def calibrate_command(
     targets = _choose_targets(studies, out)
     for target in targets:
         check_output(target, "--out", (".toml",))
+        if target.exists() and any(target.samefile(file) for item in studies for file in item.origin.files):
+            raise InputError("--out", f"{target} is an input of the command", "another file")
     subjects = [
         FitSubject(
             item, {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner == index}
@@ -99,14 +105,24 @@ def calibrate_command(
 def _fit(
     subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: bool, jobs: int | None
 ) -> list[Calibration]:
-    """Fit the studies with progress; if it is interrupted, write the best so far, without the spread before the fit."""
+    """Fit the studies with progress; now and then, and if it is interrupted, write the best so far, without the spread
+    before the fit.
+    """
     studies = [subject.study for subject in subjects]
-    fit, done, lowest_loss, best = studies[0].fit, 0, 0.0, list(studies)
+    fit, done, lowest_loss, best, last_save = studies[0].fit, 0, 0.0, list(studies), time.monotonic()
+
+    def save_best(ending: str) -> None:
+        comment = f"Best of {done} of {fit.trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
+        found = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
+        _write_studies(targets, studies, found, [comment] * len(studies))
 
     def after_trial(loss: float, best_studies: tuple[Study, ...]) -> None:
-        nonlocal done, lowest_loss, best
+        nonlocal done, lowest_loss, best, last_save
         done, lowest_loss, best = done + 1, loss, list(best_studies)
         show_progress(f"trials, lowest loss {loss:.4f}", done, fit.trials)
+        if time.monotonic() - last_save > SECONDS_BETWEEN_SAVES:
+            save_best("while more are tried")
+            last_save = time.monotonic()
 
     try:
         with (
@@ -118,11 +134,7 @@ def _fit(
             return calibrate(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if done:
-            comment = (
-                f"Best of {done} of {fit.trials} trials, then interrupted (seed {fit.seed}). Loss {lowest_loss:.4f}."
-            )
-            found = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
-            _write_studies(targets, studies, found, [comment] * len(studies))
+            save_best("then interrupted")
             click.echo(f"interrupted: the best of {done} trials is in {', '.join(map(str, targets))}", err=True)
         raise
 

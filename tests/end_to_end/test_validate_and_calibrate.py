@@ -116,3 +116,17 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
     assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
+
+
+def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(
+        subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *, from_scratch: bool
+    ) -> None:
+        done(1.0, (with_values(subjects[0].study, {"ads.parameters.brake_gap": 5.5}),))
+        raise SystemExit
+
+    monkeypatch.setattr(calibrate, "calibrate", killed)
+    monkeypatch.setattr(calibrate, "SECONDS_BETWEEN_SAVES", 0.0)
+    CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
+    assert "Best of 1 of 9 trials, while more are tried" in Path("best.toml").read_text()
+    assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
