@@ -82,6 +82,8 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str = "") -> 
                 None, (choice.get("type", "object") for choice in schema["anyOf"])
             )
             yield InputError(source, f"{_path_text(path)} = {short_text(value)}", one_of(choices))
+        elif error.validator == "pattern":
+            yield InputError(source, f"{_path_text(path)} = {short_text(value)}", schema["description"])
         else:
             message = error.message.removeprefix(repr(value)).strip()
             quoted = f" = {short_text(value)}" if message != error.message else ":"

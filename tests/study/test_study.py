@@ -55,7 +55,7 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
             "vehicle.characteristics.dampRateFullT.original = 0",
         ),
         ("[ads]", "[ads", "cannot be read as TOML"),
-        ('name = "sun"', 'name = "../sun"', "name = '../sun' does not match"),
+        ('name = "sun"', 'name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
         ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
     ],
 )
