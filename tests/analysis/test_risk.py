@@ -88,6 +88,8 @@ def test_words_of_a_risk_claim_nothing_that_is_not_there() -> None:
     result = replace(result, probability=0.009)
     printed = " ".join(map(str, result.sentences()))
     assert "They vary as the study specifies: a normal; b normal." in printed
+    without = " ".join(map(str, replace(result, study=made_up_study(2)).sentences()))
+    assert "They vary uniformly over the whole domain." in without
     assert "at least one is unsafe with probability above 0.99." in printed
     assert "with 99.9 % confidence" in printed
 

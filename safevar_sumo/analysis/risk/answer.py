@@ -247,4 +247,5 @@ def _how_vehicles_vary(study: Study) -> str:
     if len(parts) < len(study.vehicle.characteristics):
         parts.append("the others uniformly" if parts else "uniformly over the whole domain")
     pairs = ", ".join(f"{' with '.join(pair.between)} {pair.value:g}" for pair in study.correlations)
-    return f"They vary as the study specifies: {'; '.join(parts)}{f', correlated: {pairs}' if pairs else ''}."
+    manner = "as the study specifies: " if study.variation else ""
+    return f"They vary {manner}{'; '.join(parts)}{f', correlated: {pairs}' if pairs else ''}."
