@@ -221,12 +221,14 @@ def make_report(
         studies = [rated_study_data(data, jobs, progress) for data in inputs]
         return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=studies)
     cases = [data.case for data in inputs] if "questions" in sections else []
+    data_of_studies = [_study_data(data, sections, jobs, progress) for data in inputs]
+    progress("tables and figures", 0, 1)
     questions = [command for name, command in COMMAND_OF_SECTION.items() if name in sections]
     return _render(
         "report.html.j2",
         title=f"Safety report: {names}",
         sections=sections,
-        studies=[_study_data(data, sections, jobs, progress) for data in inputs],
+        studies=data_of_studies,
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
         commands=commands_to_reproduce(inputs, questions) if "reproduce" in sections else [],

@@ -86,6 +86,7 @@ def page(slippery: Path, explained: Explained) -> str:
         shows: list[tuple[str, int, int]] = []
         page = make_report([slippery], jobs=1, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
+        assert shows[-1] == ("tables and figures", 0, 1)
         assert all(done <= total for _, done, total in shows)
         return page
 
