@@ -18,6 +18,8 @@ from safevar_sumo.study.schema import FMU_KEYS, Study
 T = TypeVar("T")
 MAX_MISTAKES = 8
 """Largest number of mistakes of a file that an error lists."""
+MAX_MAGNITUDE = 1e12
+"""Largest magnitude of a characteristic."""
 FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may be fitted."""
 
@@ -188,7 +190,10 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
 
 
 def _characteristic_mistakes(source: object, key: str, row: CharacteristicTable) -> Iterator[InputError]:
-    if row.lower >= row.upper:
+    if max(abs(row.original), abs(row.lower), abs(row.upper)) > MAX_MAGNITUDE:
+        problem = f"{key}: {row.original} in [{row.lower}, {row.upper}]"
+        yield InputError(source, problem, f"numbers up to {MAX_MAGNITUDE:g}")
+    elif row.lower >= row.upper:
         yield InputError(source, f"{key}: lower = {row.lower} and upper = {row.upper}", "lower < upper")
     elif not row.lower <= row.original <= row.upper:
         yield InputError(source, f"{key}.original = {row.original}", f"a value in [{row.lower}, {row.upper}]")

@@ -94,6 +94,7 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
             "[vehicle.characteristics.masss]\noriginal = 9",
             "vehicle.characteristics.masss: 'unit' is a required property; did you mean 'mass'?",
         ),
+        ("[vehicle.characteristics.mass]\nupper = 1e300", "1e+300]\nexpected: numbers up to 1e+12"),
         ("[search]\nevaluatons = 5", "search.evaluatons: there is no such key; did you mean 'evaluations'?"),
         ("evaluatons = 5", "evaluatons: there is no such key; did you mean search.evaluations?"),
         ("\n".join(f"x{i} = 1" for i in range(20_000)), "more than 8 mistakes: x0: there is no such key"),

@@ -246,7 +246,7 @@ def sentence(comparison: BrakingComparison) -> str:
             attribute, unit, costs, gains = PART_PHRASES[name]
             here, there = (getattr(run.braking, attribute) for run in (changed, original))
             phrase = costs if part > 0 else gains
-            phrases.append(f"{part:.2f} m because {phrase} ({here:.4g} instead of {there:.4g} {unit})")
+            phrases.append(f"{part:.2f} m because {phrase} ({here:.2f} instead of {there:.2f} {unit})")
     if abs(comparison.parts["remainder"]) > MAX_OMITTED_REMAINDER:
         phrases.append(f"{comparison.parts['remainder']:.2f} m unexplained")
     lost = f"{endings} Its margin, the gap at the brake command less the distance needed to stop, is "
