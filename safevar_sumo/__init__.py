@@ -13,9 +13,8 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib.metadata import (
-            version,
-        )  # here, as it imports modules that a file of the working directory could replace
+        # Here, as it imports modules that a file of the working directory could replace.
+        from importlib.metadata import version
 
         return version(__name__)
     return _load(name)

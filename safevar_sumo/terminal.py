@@ -122,12 +122,6 @@ def constraints_in_words(study: Study) -> list[str]:
     return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
 
 
-def print_constraints(console: Console, study: Study) -> None:
-    """Print the constraints that all settings satisfy, if the study has any."""
-    for sentence in constraints_in_words(study):
-        print_text(console, sentence)
-
-
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
     """Print a table of names."""
     table = WholeTable(*heads, title=title)

@@ -27,9 +27,8 @@ collect_ignore = [] if os.name == "posix" else ["campaign/test_local_pool.py", "
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
-os.environ.pop(
-    "PYTHONDONTWRITEBYTECODE", None
-)  # so that programs started by tests need not compile the package each time
+# Programs that tests start need not compile the package each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 WORKER_PROCESSES = local.LocalPool
 SLIPPERY = """
 extends = "smoke"

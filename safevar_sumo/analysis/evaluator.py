@@ -201,9 +201,8 @@ class Evaluator:
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
-        metrics = msgspec.structs.replace(
-            self.study.metrics, sampling_interval=None
-        )  # the interval may be no multiple of this step
+        # The interval may be no multiple of this step.
+        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)
         return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
     def for_study(self, study: Study) -> Evaluator:

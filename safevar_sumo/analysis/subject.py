@@ -114,10 +114,8 @@ def study_or_case(
         a study.
     """
     if isinstance(source, str | Path):
-        is_directory, is_study = (
-            os.path.isdir(source),
-            str(source) in study_names(),
-        )  # `os.path` accepts any text, unlike paths
+        # `os.path` accepts any text, unlike paths.
+        is_directory, is_study = (os.path.isdir(source), str(source) in study_names())
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
             raise InputError(
                 source, "is a study and has no solutions", "a directory that the command `study` has written"

@@ -126,9 +126,8 @@ def source_digests(study: Study, pool: Pool) -> Files:
     if user_code_names(study):
         work = pack_study(study, {}, afresh=True)
         key = work, os.getcwd()
-        files_read = _files_read.get(
-            key, {"": "never read"}
-        )  # without an entry, a file that does not exist: its digest differs
+        # Without an entry, a file that does not exist: its digest differs.
+        files_read = _files_read.get(key, {"": "never read"})
         if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
             _files_read[key] = dict(

@@ -24,9 +24,10 @@ RANDOM_SAMPLES = 10
 """Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the
 evaluations with a probability of 1 - 0.99^300 = 95 %.
 """
+# Numpy compares enums slowly.
 SIMULATOR_ERROR, COLLISION, INVALID_TEST = (
     outcome.value for outcome in (Outcome.SIMULATOR_ERROR, Outcome.COLLISION, Outcome.INVALID_TEST)
-)  # numpy compares enums slowly
+)
 
 
 def all_runs(study: Study) -> list[RunKey]:

@@ -127,9 +127,8 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
     """Complete `NAME=` for each characteristic of the study named earlier in the command line, with its domain as
     help.
     """
-    study = str(
-        ctx.params.get("study") or next(iter(ctx.args), "")
-    )  # while --set is incomplete, click has not parsed the rest
+    # While --set is incomplete, click has not parsed the rest.
+    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))
     if not study or Path(study).is_dir():
         return []
     try:

@@ -196,9 +196,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     """
     from safevar_sumo.analysis.explain.compute import summarise_failures
     from safevar_sumo.analysis.research_questions.case import build_case
-    from safevar_sumo.analysis.research_questions.comparisons import (
-        summary_lines,
-    )  # loads more slowly than all other modules
+
+    # Loads more slowly than all other modules.
+    from safevar_sumo.analysis.research_questions.comparisons import summary_lines
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())

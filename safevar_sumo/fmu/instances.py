@@ -244,10 +244,8 @@ class Instances:
                     for port in self._outputs
                 ]
         except Exception as error:  # any error of FMPy about an FMU
-            self._free, self.generation = (
-                [],
-                self.generation + 1,
-            )  # any further call of an instance that failed is undefined
+            # Any further call of an instance that failed is undefined.
+            self._free, self.generation = ([], self.generation + 1)
             messages, self._messages[:] = self._messages[-1:], []
             reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
             raise FmuError(f"{': '.join([reason, *messages])} while it {activity}") from error

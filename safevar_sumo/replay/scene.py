@@ -28,8 +28,6 @@ MAX_DISTANCE = 30.0
 """Distance to the vehicle under test beyond which actors are not shown [m]."""
 MARK_DISTANCE = 10
 """Distance between two marks beside the road [m]."""
-MAX_OFFSET = 0.05
-"""Distance below which two copies of an actor are drawn as one [m]."""
 
 
 class FlatBody(NamedTuple):

@@ -251,9 +251,8 @@ class RecordedWorld:
         cosine, sine = np.abs(others.along @ direction), np.abs(other_normals @ direction)
         min_overlap = np.where(persons | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
         max_distance = (length + others.length * cosine + others.width * sine) / 2 - min_overlap
-        front_targets = others.middle + direction * (
-            length / 2
-        )  # where a vehicle's front is if its middle is the other body's middle
+        # Where a vehicle's front is if its middle is the other body's middle.
+        front_targets = others.middle + direction * (length / 2)
         candidates = is_open.reshape(-1, self._size)[scene_numbers]
         if only_persons:
             candidates = candidates & persons[:, np.newaxis]

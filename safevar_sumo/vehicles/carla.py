@@ -26,9 +26,8 @@ RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = map(np.array, (400.0, 500.0, 400.0))  # N m
-PEAK_SPEED, END_SPEED = map(
-    np.array, (1890 / 5800, 5730 / 5800)
-)  # relative to the maximum engine speed; the falling line extends to 1
+# Relative to the maximum engine speed; the falling line extends to 1.
+PEAK_SPEED, END_SPEED = map(np.array, (1890 / 5800, 5730 / 5800))
 TORQUE_RISE = np.array((TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED)
 TORQUE_FALL = np.array((TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED))
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017

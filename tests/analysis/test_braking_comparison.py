@@ -52,9 +52,9 @@ SAME = (10.0, 15.0, 0.2, 6.0)
         ((10.0, 15.0, 0.2, 5.0), "deceleration", 100 / 10 - 100 / 12),
         ((11.0, 15.0, 0.2, 6.0), "speed", 1 * 0.2 + (121 - 100) / 12),
         ((10.0, 15.0, 0.2, 3.5), "deceleration", 100 / 7 - 100 / 12),  # which hits
-        ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12),
+        ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12),  # which gains
     ],
-)  # which gains
+)
 def test_one_difference_is_one_part(other: tuple[float, float, float, float], part: str, lost: float) -> None:
     comparison = compared(SAME, other)
     assert comparison.parts[part] == pytest.approx(lost, abs=0.05)

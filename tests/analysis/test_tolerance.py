@@ -88,9 +88,9 @@ def test_a_plane_with_a_box_in_its_corner() -> None:
         (two_islands, 3, 0.3),
         (nowhere, 4, 1.0),
         (everywhere, 2, 0.0),
-        (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6),
+        (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6),  # a corner of all four, which no pair reaches
     ],
-)  # a corner of all four, which no pair reaches
+)
 def test_the_joint_factor_ends_before_what_is_unsafe(region: Region, n: int, factor: float) -> None:
     result = of(n, region).joint
     assert result.factor == pytest.approx(factor, rel=0.02)

@@ -59,9 +59,10 @@ def test_the_original_vehicle_of_every_shipped_study_drives_to_the_encounter(nam
             "The original vehicle brakes without an obstacle: no verdict.",
         ),
         (lambda seen: (seen.speed < 5, seen.speed > 5), ""),  # a cruise control with the pedals' full strokes
+        # Stands on its brake, but only because of the pedestrian.
         (lambda seen: (0.9, np.isfinite(seen.gap)), ""),
     ],
-)  # stands on its brake, but only because of the pedestrian
+)
 def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
     pedals: Callable[[Observation], tuple[FloatArray, FloatArray]], expected: str
 ) -> None:

@@ -36,9 +36,8 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
 
 
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
-    vehicle = replace(
-        SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0
-    )  # the values of sun are fitted
+    # The values of sun are fitted.
+    vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
     p = vehicle.prepare(
         {member.name: np.full(1, float(member.original)) for member in SYSTEMS["carla"].characteristics}, 1.0, STEP
     )

@@ -107,6 +107,5 @@ def risk(
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_question(
-        estimate_risk, study_or_case(study, as_it_is_now=as_it_is_now), RiskOptions, locals()
-    )  # the arguments
+    # `locals()` holds the arguments.
+    return answer_question(estimate_risk, study_or_case(study, as_it_is_now=as_it_is_now), RiskOptions, locals())

@@ -56,6 +56,5 @@ def rules(
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_question(
-        find_rules, study_or_case(study, as_it_is_now=as_it_is_now), RulesOptions, locals()
-    )  # the arguments
+    # `locals()` holds the arguments.
+    return answer_question(find_rules, study_or_case(study, as_it_is_now=as_it_is_now), RulesOptions, locals())
