@@ -270,6 +270,7 @@ def _draw_matrix(axis: Axes, rating: Rating, matrix: CellMatrix) -> None:
     sns.heatmap(
         frame, annot=letters, fmt="", cmap=palette, vmin=-1, vmax=len(COLOURS) - 1, cbar=False, linewidths=0.6, ax=axis
     )
+    axis.grid(False)
     axis.tick_params(labelsize=FONT - 2, length=0, rotation=0)
     totals = " / ".join(
         f"{test.total:.2f}" for vehicle in rating.vehicles for test in vehicle.tests if test.matrix is matrix
@@ -283,7 +284,7 @@ def summarise_rated_solutions(
     """Summarise the solutions of a rated study in lines, the last with commands for the next steps.
 
     `directory` is the results directory in these commands; the other parameters are those of
-    `safevar_sumo.analysis.explain.summary.summarise_failures`, which calls this function for rated studies.
+    `safevar_sumo.analysis.explain.compute.summarise_failures`, which calls this function for rated studies.
     """
     original_points, points_column = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
     unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
