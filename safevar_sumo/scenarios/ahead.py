@@ -20,7 +20,6 @@ from safevar_sumo.scenarios.euro_ncap import (
     JUNCTION_LANE,
     KMH,
     SAME_DIRECTION,
-    TARGET,
     VUT_LANE,
     VUT_LENGTH,
     VUT_WIDTH,
@@ -33,7 +32,15 @@ from safevar_sumo.scenarios.euro_ncap import (
     lateral_offset,
     target_type,
 )
-from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, Times, value_at
+from safevar_sumo.scenarios.target import (
+    EncounterConstants,
+    Target,
+    TargetMotion,
+    TargetTest,
+    Times,
+    VehicleMover,
+    value_at,
+)
 
 ROAD_LANE = "road_0"
 START_POSITION = 50.0
@@ -118,10 +125,16 @@ class TargetAhead(NamedTuple):
             },
         }
 
-    def motion(self, world: World) -> _MotionAhead:
+    def motion(self, world: World) -> TargetMotion:
         """The motion of the target in a run."""
-        frame = Frame.of(world.lane(VUT_LANE if self._is_rotated else ROAD_LANE))
-        return _MotionAhead(frame, EncounterConstants(follows=True), self, self._depth)
+        frame, depth = Frame.of(world.lane(VUT_LANE if self._is_rotated else ROAD_LANE)), self._depth
+
+        def target(positions: FloatArray, times: Times) -> Target:
+            along = frame.along(positions)
+            return Target(along - depth, np.full_like(along, self.offset), speed=value_at(times, self.speed_at))
+
+        mover = VehicleMover(self.target, self.direction, self.speed_at)
+        return TargetMotion(frame, EncounterConstants(follows=True), mover, target)
 
     @property
     def _is_rotated(self) -> bool:
@@ -141,37 +154,6 @@ class TargetAhead(NamedTuple):
         rear = 0.0, -self.offset
         corners = [(x - sign * left * half, y + sign * along * half) for x, y in (rear, front) for sign in (1, -1)]
         return front[0] - _first_contact_position([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
-
-
-class _MotionAhead(NamedTuple):
-    """The motion of a target whose first point of contact is `depth` metres behind its front; see `TargetMotion`."""
-
-    frame: Frame
-    constants: EncounterConstants
-    target_ahead: TargetAhead
-    depth: float
-
-    def begin(self, world: World) -> float:
-        speed = self.target_ahead.speed_at(0.0)
-        world.drive(TARGET, speed)
-        return speed
-
-    def positions(self, world: World) -> FloatArray:
-        return world.vehicle_positions(TARGET)
-
-    def target(self, positions: FloatArray, times: Times) -> Target:
-        along = self.frame.along(positions)
-        return Target(
-            along - self.depth,
-            np.full_like(along, self.target_ahead.offset),
-            speed=value_at(times, self.target_ahead.speed_at),
-        )
-
-    def next_speed(self, sample: int, step: float) -> float:
-        return self.target_ahead.speed_at((sample + 1) * step)
-
-    def set_speed(self, world: World, speed: float) -> None:
-        world.drive(TARGET, speed)
 
 
 REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
@@ -223,7 +205,7 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
         """The vehicle at its speed, and the target."""
         return self._target_ahead.actors(self.test_speed, roads)
 
-    def _motion(self, world: World) -> _MotionAhead:
+    def _motion(self, world: World) -> TargetMotion:
         return self._target_ahead.motion(world)
 
     def encounter(self, trace: Trace) -> Encounter:

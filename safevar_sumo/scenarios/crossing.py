@@ -36,6 +36,7 @@ from safevar_sumo.scenarios.target import (
     EncounterConstants,
     PersonMover,
     Target,
+    TargetMotion,
     TargetTest,
     Times,
     VehicleMover,
@@ -145,45 +146,12 @@ class _Start(NamedTuple):
                 max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP)
             )
             profile = SpeedProfile.with_arrival(distance, time, speed, run_up)
-        mover = PersonMover(target, sign, -lateral_start) if test.is_on_foot else VehicleMover(target, direction)
-        return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, profile)
-
-
-class _CrossingMotion(NamedTuple):
-    """The motion of a target that crosses the lane; `impact_position` is its middle's position along the lane at the
-    impact [m].
-    """
-
-    frame: Frame
-    constants: EncounterConstants
-    impact_position: float
-    start: _Start
-    vut_width: float
-
-    def begin(self, world: World) -> float:
-        return self.start.mover.begin(world, self.start.profile)
-
-    def positions(self, world: World) -> FloatArray:
-        return self.start.mover.positions(world)
-
-    def target(self, positions: FloatArray, times: Times) -> Target:
-        direction, extent, profile = self.start.direction, self.start.extent, self.start.profile
-        along, left = self.start.mover.middle(self.frame, positions)
-        lateral = left if direction.left > 0 else -left
-        ahead = np.zeros_like(left) if along is None else along - self.impact_position
-        return Target(
-            self.impact_position - extent.length / 2 + ahead,
-            lateral,
-            is_clear=lateral > (self.vut_width + extent.width) / 2,
-            speed=value_at(times, lambda time: direction.along * profile.speed_at(time)) if direction.along else 0.0,
-            ahead=ahead,
+        mover = (
+            PersonMover(target, sign, -lateral_start, profile)
+            if test.is_on_foot
+            else VehicleMover(target, direction, profile.speed_at)
         )
-
-    def next_speed(self, sample: int, step: float) -> float:
-        return self.start.mover.next_speed(self.start.profile, sample, step)
-
-    def set_speed(self, world: World, speed: float) -> None:
-        self.start.mover.set_speed(world, speed)
+        return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, profile)
 
 
 class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -300,7 +268,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
-            **start.mover.actors(frame, roads, start.impact_left, start.distance_to_impact, start.profile),
+            **start.mover.actors(frame, roads, start.impact_left, start.distance_to_impact),
             **self._parked_cars(frame, impact_position, roads),
         }
 
@@ -317,7 +285,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
             end -= length + PARKED_GAP
         return changes
 
-    def _motion(self, world: World) -> _CrossingMotion:
+    def _motion(self, world: World) -> TargetMotion:
         frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
         constants = EncounterConstants(passed_gap=-start.extent.length - self.vut_length)
         if self.parameter("hidden"):
@@ -327,9 +295,24 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
                 setback=self.sensor_setback,
                 parked_offset=-self._parked_edge,
             )
-        return _CrossingMotion(
-            frame, constants, start.mover.impact_position(frame, world, start.impact_left), start, self.vut_width
-        )
+        direction, extent, profile = start.direction, start.extent, start.profile
+        impact_position = start.mover.impact_position(frame, world, start.impact_left)
+
+        def target(positions: FloatArray, times: Times) -> Target:
+            along, left = start.mover.middle(frame, positions)
+            lateral = left if direction.left > 0 else -left
+            ahead = np.zeros_like(left) if along is None else along - impact_position
+            return Target(
+                impact_position - extent.length / 2 + ahead,
+                lateral,
+                is_clear=lateral > (self.vut_width + extent.width) / 2,
+                speed=value_at(times, lambda time: direction.along * profile.speed_at(time))
+                if direction.along
+                else 0.0,
+                ahead=ahead,
+            )
+
+        return TargetMotion(frame, constants, start.mover, target)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of

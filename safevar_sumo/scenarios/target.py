@@ -7,7 +7,7 @@ thousands of vehicles.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -75,33 +75,26 @@ class EncounterConstants(NamedTuple):
     parked_offset: Any = 0.0
 
 
-class TargetMotion(Protocol):
-    """The motion of a target in a run, relative to the vehicles' lane."""
+class TargetMotion(NamedTuple):
+    """The motion of a target in a run, relative to the vehicles' lane.
 
-    @property
-    def frame(self) -> Frame:
-        """Frame of the vehicles' lane."""
-
-    @property
-    def constants(self) -> EncounterConstants:
-        """The constants of the encounter with this target."""
-
-    def begin(self, world: World) -> float:
-        """Set the target's initial speed; returns this speed [m/s]."""
-
-    def positions(self, world: World) -> FloatArray:
-        """Positions of the target's front in SUMO; shape (N, 2) [m]."""
-
-    def target(self, positions: FloatArray, times: Times) -> Target:
-        """The target with its front at `positions`, shape (M, 2) [m], at one time or at M times; without its lateral
+    Attributes
+    ----------
+    frame
+        Frame of the vehicles' lane.
+    constants
+        The constants of the encounter with this target.
+    mover
+        How SUMO moves the target.
+    target
+        Returns the target with its front at positions, shape (M, 2) [m], at one time or at M times; without its lateral
         speed.
-        """
+    """
 
-    def next_speed(self, sample: int, step: float) -> float:
-        """The target's speed in the step after a sample [m/s]."""
-
-    def set_speed(self, world: World, speed: float) -> None:
-        """Set the target's speed [m/s]."""
+    frame: Frame
+    constants: EncounterConstants
+    mover: PersonMover | VehicleMover
+    target: Callable[[FloatArray, Times], Target]
 
 
 class Memory(NamedTuple):
@@ -123,15 +116,15 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def begin(self, world: World) -> Memory:
         motion = self._motion(world)
-        initial_speed = motion.begin(world)
-        lateral = motion.target(motion.positions(world), 0.0).lateral
+        initial_speed = motion.mover.begin(world)
+        lateral = motion.target(motion.mover.positions(world), 0.0).lateral
         return Memory(
             motion, lateral, sample=0, last_speed=initial_speed, approached=np.zeros(len(lateral), dtype=bool)
         )
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
         motion = memory.motion
-        target = motion.target(motion.positions(world), memory.sample * step)
+        target = motion.target(motion.mover.positions(world), memory.sample * step)
         target = target._replace(lateral_speed=(target.lateral - memory.last_lateral) / step)
         front = motion.frame.along(world.vehicle_positions(VUT))
         scene, approached = scene_of(motion.constants, target, front, world.speeds(), memory.approached)
@@ -139,9 +132,10 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def move(self, world: World, step: float, memory: Memory) -> Memory:
         """Set the target's next speed, as `observe` does, without computing the scene."""
-        speed = memory.motion.next_speed(memory.sample, step)
+        mover = memory.motion.mover
+        speed = mover.next_speed(memory.sample, step)
         if speed != memory.last_speed:
-            memory.motion.set_speed(world, speed)
+            mover.set_speed(world, speed)
         return memory._replace(sample=memory.sample + 1, last_speed=speed)
 
     def at_all_samples(self, world: World, sampled_world: World, step: float) -> tuple[TargetMotion, Target]:
@@ -149,7 +143,7 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         `sampled_world`.
         """
         motion = self._motion(world)
-        positions = motion.positions(sampled_world)
+        positions = motion.mover.positions(sampled_world)
         target = motion.target(positions, [sample * step for sample in range(len(positions))])
         last_lateral = np.concatenate([target.lateral[:1], target.lateral[:-1]])
         return motion, target._replace(lateral_speed=(target.lateral - last_lateral) / step)
@@ -209,6 +203,7 @@ class PersonMover(NamedTuple):
     target: str
     sign: float
     start: float
+    profile: SpeedProfile
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
         """No changes: the pedestrian uses the network's footpath."""
@@ -220,9 +215,7 @@ class PersonMover(NamedTuple):
         """
         return frame.lane_coordinates(roads.lane(CROSSING_LANE).start)[0]
 
-    def actors(
-        self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile
-    ) -> XmlChanges:
+    def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float) -> XmlChanges:
         """The pedestrian beside the lane, `distance` metres before the impact."""
         edges = WALK_EDGES[self.sign]
         for lane in (CROSSING_LANE, *(f"{edge}_0" for edge in edges)):
@@ -244,10 +237,14 @@ class PersonMover(NamedTuple):
                 f"a number in [{nearest:.2f}, {farthest:.2f}] m",
             )
         person = {"type": self.target, "departPos": repr(abs(start_position - edge_start))}
-        walk = {"edges": " ".join(edges), "speed": repr(profile.speed), "arrivalPos": "-1" if self.sign > 0 else "1"}
+        walk = {
+            "edges": " ".join(edges),
+            "speed": repr(self.profile.speed),
+            "arrivalPos": "-1" if self.sign > 0 else "1",
+        }
         return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
 
-    def begin(self, world: World, profile: SpeedProfile) -> float:
+    def begin(self, world: World) -> float:
         """Make the pedestrian stand; returns 0, the initial speed [m/s]."""
         world.walk(PEDESTRIAN, 0.0)
         return 0.0
@@ -262,10 +259,10 @@ class PersonMover(NamedTuple):
         """
         return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
 
-    def next_speed(self, profile: SpeedProfile, sample: int, step: float) -> float:
+    def next_speed(self, sample: int, step: float) -> float:
         """Mean speed in the coming step [m/s]."""
         walking_distance = STOP_DISTANCE - self.start
-        walked, next_walked = (min(profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
+        walked, next_walked = (min(self.profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
         return (next_walked - walked) / step
 
     def set_speed(self, world: World, speed: float) -> None:
@@ -273,10 +270,11 @@ class PersonMover(NamedTuple):
 
 
 class VehicleMover(NamedTuple):
-    """A target that drives across the junction on lanes that lead in its direction."""
+    """A target that drives on lanes that lead in its direction; `speed_at` maps a time [s] to its speed [m/s]."""
 
     target: str
     direction: Direction
+    speed_at: Callable[[float], float]
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
         """Changes that rotate the target's lanes around their crossing with the vehicle's lane; none for a target from
@@ -297,9 +295,7 @@ class VehicleMover(NamedTuple):
         along, left = frame.lane_coordinates(roads.lane(ENTRY_LANE).end)
         return along + (impact_left - left) * self.direction.along / self.direction.left
 
-    def actors(
-        self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile
-    ) -> XmlChanges:
+    def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float) -> XmlChanges:
         """The target on its lane, `distance` metres before the impact."""
         lane, (forward, left) = roads.lane(ENTRY_LANE), self.direction
         lane_start = self._along(frame, lane.start)
@@ -317,7 +313,7 @@ class VehicleMover(NamedTuple):
             "vehicle[@id='target']": {
                 "type": self.target,
                 "departPos": repr(front),
-                "departSpeed": repr(profile.speed_at(0.0)),
+                "departSpeed": repr(self.speed_at(0.0)),
             },
         }
 
@@ -326,10 +322,10 @@ class VehicleMover(NamedTuple):
         along, left = frame.lane_coordinates(point)
         return along * self.direction.along + left * self.direction.left
 
-    def begin(self, world: World, profile: SpeedProfile) -> float:
+    def begin(self, world: World) -> float:
         """Set the target's initial speed; returns this speed [m/s]."""
-        world.drive(TARGET, profile.speed_at(0.0))
-        return profile.speed_at(0.0)
+        world.drive(TARGET, self.speed_at(0.0))
+        return self.speed_at(0.0)
 
     def positions(self, world: World) -> FloatArray:
         """Position of the target's front in SUMO; shape (N, 2) [m]."""
@@ -342,9 +338,9 @@ class VehicleMover(NamedTuple):
             positions
         ) - self.direction.left * half_length
 
-    def next_speed(self, profile: SpeedProfile, sample: int, step: float) -> float:
+    def next_speed(self, sample: int, step: float) -> float:
         """Speed at the end of the coming step [m/s]."""
-        return profile.speed_at((sample + 1) * step)
+        return self.speed_at((sample + 1) * step)
 
     def set_speed(self, world: World, speed: float) -> None:
         world.drive(TARGET, speed)
