@@ -328,6 +328,6 @@ def _drop_failures(positions: Sequence[int], evaluations: Evaluations) -> tuple[
     """Positions and evaluations that a run keeps when its failed settings are simulated again."""
     has_succeeded = ~evaluations.failed
     pairs = list(zip(positions, has_succeeded, strict=True))
-    first_failure = min((position for position, success in pairs if not success), default=max(positions) + 1)
+    first_failure = min(position for position, success in pairs if not success)
     new_positions = [position if position < first_failure else SPARE_POSITION for position, success in pairs if success]
     return new_positions, evaluations.take(has_succeeded)
