@@ -194,7 +194,10 @@ def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(
     line: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
-    runs = system("step", tmp_path, monkeypatch, script)
+    folder = tmp_path / "site-packages"  # as an installed controller
+    folder.mkdir()
+    monkeypatch.delitem(sys.modules, "my_controller", raising=False)
+    runs = system("step", folder, monkeypatch, script)
     with pytest.raises(InputError) as caught:
         simulate(runs, changed(runs))
     assert problem in str(caught.value)
