@@ -124,51 +124,17 @@ def run_campaign(
     SafevarError
         If a journal cannot be written, or the study is at fault.
     """
-    retrying_pool, work, batch = (
-        RetryingPool(pool, study),
-        pack_study(study, results.inputs, engine=engine),
-        batch or MAX_COPIES,
-    )
-    check_code(study, results.inputs, retrying_pool)
-    original = _evaluate_original(study, work, results, retrying_pool, observer)
-    if not original.valid[0]:
-        raise InputError(
-            study.source,
-            "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
-            "so there is no baseline",
-            "tests whose speed the vehicle can hold",
-        )
-    if original.collided[0] and not is_rated(study):
-        observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
+    work, batch = pack_study(study, results.inputs, engine=engine), batch or MAX_COPIES
+    original = _baseline(study, work, results, RetryingPool(pool, study), observer)
     results.begin(original)
     sumo_work, recorded_work = works_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
-    share = Share(
-        work,
-        sumo_work,
-        recorded_work,
-        batch,
-        (),
-        results.path.absolute(),
-        results.head("").study,
-        original,
-        retry_failed,
-    )
+    directory, identity = results.path.absolute(), results.head("").study
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch / study.search.population), MAX_RUNS)
     shares = [
-        share._replace(keys=tuple(keys_of_share)) for keys_of_share in deal(list(keys), pool.workers, runs_at_once)
+        Share(work, sumo_work, recorded_work, batch, tuple(dealt), directory, identity, original, retry_failed)
+        for dealt in deal(list(keys), pool.workers, runs_at_once)
     ]
-    run_results, busy = dict[RunKey, RunResult](), list[RunKey]()
-    with closing(_carry_out(shares, pool)) as messages:
-        for message in messages:
-            if isinstance(message, RunResult):
-                run_results[message.progress.key] = message
-                observer.finished(message.progress)
-            elif isinstance(message, RunKey):
-                busy.append(message)
-            elif isinstance(message, str):
-                observer.warned(message)
-            elif isinstance(message, list):
-                observer.progressed(message)
+    run_results, busy = _collect(shares, pool, observer)
     runs = [(key, run_results[key]) for key in sorted(run_results)]
     return Campaign(
         original=original,
@@ -179,6 +145,24 @@ def run_campaign(
         collisions={key: run.progress.collisions for key, run in runs},
         invalid_tests={key: run.invalid_tests for key, run in runs},
     )
+
+
+def _baseline(
+    study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer
+) -> Evaluations:
+    """Check the study's user code, and evaluate the original vehicle; raises an error if the runs need another one."""
+    check_code(study, results.inputs, pool)
+    original = _evaluate_original(study, work, results, pool, observer)
+    if not original.valid[0]:
+        raise InputError(
+            study.source,
+            "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
+            "so there is no baseline",
+            "tests whose speed the vehicle can hold",
+        )
+    if original.collided[0] and not is_rated(study):
+        observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
+    return original
 
 
 def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
@@ -259,6 +243,23 @@ def _carry_out(shares: Iterable[Share], pool: Pool) -> Generator[Message]:
                 raise error
     finally:
         is_over = True
+
+
+def _collect(shares: Iterable[Share], pool: Pool, observer: Observer) -> tuple[dict[RunKey, RunResult], list[RunKey]]:
+    """Carry out shares; returns the finished runs, and the runs that another process carries out."""
+    run_results, busy = dict[RunKey, RunResult](), list[RunKey]()
+    with closing(_carry_out(shares, pool)) as messages:
+        for message in messages:
+            if isinstance(message, RunResult):
+                run_results[message.progress.key] = message
+                observer.finished(message.progress)
+            elif isinstance(message, RunKey):
+                busy.append(message)
+            elif isinstance(message, str):
+                observer.warned(message)
+            elif isinstance(message, list):
+                observer.progressed(message)
+    return run_results, busy
 
 
 def _evaluate_original(

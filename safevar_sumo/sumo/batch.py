@@ -17,6 +17,7 @@ from safevar_sumo.records import (
     STANDSTILL,
     TIME_DECIMALS,
     BoolArray,
+    Command,
     Evaluations,
     FloatArray,
     Observation,
@@ -24,7 +25,7 @@ from safevar_sumo.records import (
     SimulationRuns,
     Trace,
 )
-from safevar_sumo.scenarios import VUT, Lane, Point
+from safevar_sumo.scenarios import VUT, Lane, Point, Scene
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
@@ -145,19 +146,10 @@ def _simulate(
     listen: Listener | None,
 ) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
-    characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, *_roads(system.points, n, step))
-    types = vehicle.sumo_type(prepared)
-    world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
-    world.depart()
-    world.set_decelerations(types.decel)
+    prepared = _insert_vehicles(system, settings, world)
     vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
-
     state = vehicle.at_start(prepared, world.speeds())
-    if isinstance(system.ads, TraciController):  # other ADSs get observations instead of reading the world
-        world.sensors = _sensors_in_weather(system, prepared, n)
-    ads_memory = system.ads.start(n, system.nominal, step)
-    batch = PointBatch(system.points, world, n)
+    ads_memory, batch = system.ads.start(n, system.nominal, step), PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
@@ -175,23 +167,16 @@ def _simulate(
         if listen is not None:
             listen(observation)
         command, ads_memory = system.ads.drive(observation, ads_memory)
-        if (warned := system.ads.warns(ads_memory)) is not None:
-            closing_speed = speed - scene.obstacle_speed  # true, not sensed
-            is_first = warned & outcomes.is_open & np.isnan(warning_ttc) & (closing_speed > 0)
-            np.copyto(warning_ttc, scene.gap / closing_speed, where=is_first)
+        _note_warnings(warning_ttc, system.ads.warns(ads_memory), outcomes.is_open, speed, scene)
         command, state = robot.drive(command, state, outcomes.is_open)
         log.write(
             sample,
-            position=world.vehicle_positions(VUT),
+            world.vehicle_positions(VUT),
+            scene,
+            command,
             speed=speed,
-            gap=scene.gap,
-            lateral=scene.lateral,
-            lateral_speed=scene.lateral_speed,
-            throttle=command.throttle,
-            brake=command.brake,
             gear=state.gear,
             active=active,
-            obstacle_speed=scene.obstacle_speed,
             pedal=state.brake,
         )
         if not np.count_nonzero(outcomes.is_open):
@@ -212,6 +197,30 @@ def _simulate(
         test_speed_error=robot.error,
         warning_ttc=warning_ttc,
     )
+
+
+def _insert_vehicles(system: System, settings: FloatArray, world: Any) -> Any:
+    """Put the vehicles onto the roads; returns their constants."""
+    vehicle, n = system.vehicle, len(settings)
+    characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
+    types = vehicle.sumo_type(prepared)
+    world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
+    world.depart()
+    world.set_decelerations(types.decel)
+    if isinstance(system.ads, TraciController):  # other ADSs get observations instead of reading the world
+        world.sensors = _sensors_in_weather(system, prepared, n)
+    return prepared
+
+
+def _note_warnings(
+    warning_ttc: FloatArray, warns: BoolArray | None, is_open: BoolArray, speed: FloatArray, scene: Scene
+) -> None:
+    """Note the true, not sensed, time to collision of each open run's first warning [s]."""
+    if warns is not None:
+        closing_speed = speed - scene.obstacle_speed
+        is_first = warns & is_open & np.isnan(warning_ttc) & (closing_speed > 0)
+        np.copyto(warning_ttc, scene.gap / closing_speed, where=is_first)
 
 
 def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
@@ -260,10 +269,13 @@ class _Log:
         )
         self._columns = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in names}
 
-    def write(self, sample: int, position: FloatArray, **columns: FloatArray | BoolArray) -> None:
+    def write(
+        self, sample: int, position: FloatArray, scene: Scene, command: Command, **others: FloatArray | BoolArray
+    ) -> None:
         self._positions[sample] = position
-        for name, values in columns.items():
-            self._columns[name][sample] = values
+        values = {**scene._asdict(), **command._asdict(), **others}
+        for name, column in self._columns.items():
+            column[sample] = values[name]
 
     def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
         columns = {name: values[:length] for name, values in self._columns.items()}
