@@ -9,8 +9,16 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
-from safevar_sumo.ads.driver import Trim, is_in_the_way, pedals_for, time_to_reach, trim_at
+from safevar_sumo.ads.base import (
+    Ads,
+    NonNegativeParameter,
+    PositiveParameter,
+    Trim,
+    is_in_the_way,
+    pedals_for,
+    time_to_reach,
+    trim_at,
+)
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5

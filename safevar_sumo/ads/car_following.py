@@ -11,8 +11,16 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
-from safevar_sumo.ads.driver import LARGEST_GAP, Trim, is_in_the_way, pedals_for, trim_at
+from safevar_sumo.ads.base import (
+    LARGEST_GAP,
+    Ads,
+    NonNegativeParameter,
+    PositiveParameter,
+    Trim,
+    is_in_the_way,
+    pedals_for,
+    trim_at,
+)
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 # Gains of the modes of MSCFModel_ACC [1/s for speeds, 1/s^2 for gaps] and its thresholds: defaults.

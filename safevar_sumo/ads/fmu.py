@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.base import Ads
-from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
+from safevar_sumo.ads.base import Ads, Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError
 from safevar_sumo.fmu import Description, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard

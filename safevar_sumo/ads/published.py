@@ -9,8 +9,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Ads
-from safevar_sumo.ads.driver import DelayLine, interpolate_tables
+from safevar_sumo.ads.base import Ads, DelayLine, interpolate_tables
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]

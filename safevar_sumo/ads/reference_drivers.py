@@ -11,9 +11,17 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.base import (
+    Ads,
+    NonNegativeParameter,
+    PositiveParameter,
+    Trim,
+    is_in_the_way,
+    pedals_for,
+    time_to_reach,
+    trim_at,
+)
 from safevar_sumo.ads.car_following import KEEPING_GAINS
-from safevar_sumo.ads.driver import Trim, is_in_the_way, pedals_for, time_to_reach, trim_at
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 HARDEST_BRAKING = 0.774 * GRAVITY

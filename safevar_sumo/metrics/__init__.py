@@ -1,8 +1,17 @@
 """Metrics by name: the safety metrics of method section 4, and metrics of comfort."""
 
 from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, guard_metric
-from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
-from safevar_sumo.metrics.safety import AVE_DECE, RATING_POINTS, SAFETY_DEGREE_METRIC, TET, TIT, time_to_collision
+from safevar_sumo.metrics.measures import (
+    AVE_DECE,
+    BRAKE_HARSHNESS,
+    MAX_JERK,
+    RATING_POINTS,
+    RMS_ACCELERATION,
+    SAFETY_DEGREE_METRIC,
+    TET,
+    TIT,
+    time_to_collision,
+)
 from safevar_sumo.metrics.unsafe import Criterion, Unsafe
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}

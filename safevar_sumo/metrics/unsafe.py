@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
-from safevar_sumo.metrics.safety import RATING_POINTS
+from safevar_sumo.metrics.measures import RATING_POINTS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE
 

@@ -1,8 +1,13 @@
-"""Scenarios by name."""
+"""Scenarios by name; and the weathers that a study can name: weather.toml beside this module, and their words."""
 
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from safevar_sumo.errors import unknown_name
 from safevar_sumo.scenarios.ahead import Along
 from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION,
@@ -21,7 +26,7 @@ from safevar_sumo.scenarios.base import (
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
-from safevar_sumo.scenarios.weather import WEATHERS, equals_clear, weather_in_words, weather_of
+from safevar_sumo.study import Weather
 
 SCENARIOS: Mapping[str, type[Any]] = {
     "pedestrian_crossing": PedestrianCrossing,
@@ -30,6 +35,11 @@ SCENARIOS: Mapping[str, type[Any]] = {
     "crossing": Crossing,
     "lead_vehicle_stopped": LeadVehicleStopped,
 }
+
+_TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
+_PHRASES: dict[str, str] = {name: table.pop("phrase") for name, table in _TABLES.items()}
+WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
+"""Weathers by name."""
 
 __all__ = [
     "LOCATION_DIMENSION",
@@ -50,3 +60,36 @@ __all__ = [
     "weather_in_words",
     "weather_of",
 ]
+
+
+def weather_of(choice: str | Weather, source: object) -> Weather:
+    """The weather that a study names or defines.
+
+    Raises
+    ------
+    InputError
+        If there is no weather of that name.
+    """
+    if isinstance(choice, Weather):
+        return choice
+    if choice not in WEATHERS:
+        fields = ", ".join(Weather.__struct_fields__)
+        raise unknown_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+    return WEATHERS[choice]
+
+
+def equals_clear(weather: Weather) -> bool:
+    """Whether a weather has the effects of clear weather under another name."""
+    clear = WEATHERS["clear"]
+    return (
+        weather.name != clear.name
+        and weather.light == clear.light
+        and msgspec.structs.replace(weather, name=clear.name) == clear
+    )
+
+
+def weather_in_words(weather: Weather) -> str:
+    """The beginning of a sentence: the phrase of a weather of weather.toml; any other weather, of the same name too, is
+    named.
+    """
+    return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"

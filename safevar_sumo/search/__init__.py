@@ -9,9 +9,8 @@ from safevar_sumo.search.base import (
     Search as Search,
 )
 from safevar_sumo.search.baselines import RandomSearch, SafeFuzzer
-from safevar_sumo.search.elitist import Nsga2, Spea2
+from safevar_sumo.search.genetic import MoCell as MoCell, Nsga2, Spea2
 from safevar_sumo.search.map_elites import MapElites as MapElites
-from safevar_sumo.search.mocell import MoCell as MoCell
 
 ALGORITHMS: Mapping[str, type[Algorithm]] = {
     "nsga2": Nsga2,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from safevar_sumo.ads.driver import STEP_DECIMALS, DelayLine
+from safevar_sumo.ads.base import STEP_DECIMALS, DelayLine
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import VUT, Point, Scenario, Scene
 from safevar_sumo.scenarios.base import Frame

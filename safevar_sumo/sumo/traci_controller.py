@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.ads import Ads
-from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
+from safevar_sumo.ads.base import Trim, pedals_for, trim_at
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import (
     Unsafe,
     time_to_collision,
 )
-from safevar_sumo.metrics.comfort import weight_acceleration
+from safevar_sumo.metrics.measures import weight_acceleration
 from safevar_sumo.records import Encounter, SimulationRuns
 from safevar_sumo.study import MetricsTable, load_study
 from safevar_sumo.sumo.system import assemble

@@ -16,9 +16,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
 from safevar_sumo.search.baselines import _improves, _Ranges, _scores
-from safevar_sumo.search.elitist import select_survivors
 from safevar_sumo.search.evolution import Individual, fitness_class, run_tournament
-from safevar_sumo.search.mocell import choose_survivor
+from safevar_sumo.search.genetic import choose_survivor, select_survivors
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import POPULATION, SUN, evaluated, searched, sphere

@@ -28,8 +28,8 @@ from pymoo.optimize import minimize
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations
 from safevar_sumo.search import ALGORITHMS, Problem
-from safevar_sumo.search.elitist import select_archive
 from safevar_sumo.search.evolution import Individual, fitness_class
+from safevar_sumo.search.genetic import select_archive
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import evaluated
 

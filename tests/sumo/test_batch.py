@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.ads import Ads
-from safevar_sumo.ads.driver import DelayLine
+from safevar_sumo.ads.base import DelayLine
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study

@@ -1,0 +1,243 @@
+"""The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), and a rating's points.
+
+Below them metrics of longitudinal comfort, which a study has only if it names them: jerk, weighted acceleration, harsh
+braking.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.metrics.base import Metric, mask_collisions, sampling_stride, sum_in_order
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, FloatArray, SimulationRuns
+from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
+
+
+def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].
+
+    Shape (N,); NaN where there was neither an encounter nor a collision.
+    """
+    is_counted = runs.trace.active & runs.encounter.in_conflict
+    least_separation = np.min(np.where(is_counted, runs.encounter.separation, np.inf), axis=0)
+    least_separation = np.where(np.isfinite(least_separation), least_separation, np.nan)
+    return np.where(np.isnan(runs.collision_speed), least_separation, -runs.collision_speed)
+
+
+SAFETY_DEGREE_METRIC = Metric(
+    name=SAFETY_DEGREE,
+    title="SD",
+    unit="m, or -m/s",
+    head="SD",
+    more_is_unsafe=False,
+    function=safety_degree,
+    description="Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].",
+)
+
+
+def time_to_collision(runs: SimulationRuns) -> FloatArray:
+    """TTC(t) = L_s / v_L, the projected distance divided by the closing speed [s]; shape (T, N).
+
+    Infinite while the distance does not shrink, outside the encounter, and once the vehicle has stopped after moving.
+    """
+    has_moved = np.logical_or.accumulate(runs.trace.speed > STANDSTILL, axis=0)
+    has_stopped = np.logical_or.accumulate(has_moved & (runs.trace.speed <= STANDSTILL), axis=0)
+    closing_speed, distance = runs.encounter.closing_speed, runs.encounter.distance
+    is_counted = runs.trace.active & runs.encounter.in_conflict & ~has_stopped & (closing_speed > 0) & (distance >= 0)
+    return np.divide(distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted)
+
+
+def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
+    critical_ttc, interval = _critical_ttc(runs, thresholds)
+    return mask_collisions(
+        runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS)
+    )
+
+
+def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2]; shape (N,), NaN on a collision."""
+    critical_ttc, interval = _critical_ttc(runs, thresholds)
+    deficit = np.where(np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0)
+    return mask_collisions(runs, sum_in_order(deficit) * interval)
+
+
+def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
+    """TTC at every sample, infinite where it is not critical; and the time between two samples [s]."""
+    stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
+    ttc = time_to_collision(runs)[::stride]
+    return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step
+
+
+TET = Metric(
+    name="tet",
+    title="TET",
+    unit="s",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=time_exposed,
+    description="TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].",
+)
+TIT = Metric(
+    name="tit",
+    title="TIT",
+    unit="s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=time_integrated,
+    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2].",
+)
+
+
+def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Mean deceleration over the samples in which the brake is commanded and the vehicle moves [m/s^2].
+
+    Positive for a loss of speed; shape (N,); NaN for a vehicle that never braked.
+    """
+    stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
+    interval = stride * runs.trace.step
+    speed, active = runs.trace.speed[::stride], runs.trace.active[::stride]
+    is_braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
+    decelerations = (speed[:-1] - speed[1:]) / interval
+    is_counted = is_braking[1:]
+    sample_count = np.count_nonzero(is_counted, axis=0)
+    deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
+    return np.asarray(
+        np.divide(deceleration_sum, sample_count, out=np.full_like(deceleration_sum, np.nan), where=sample_count > 0)
+    )
+
+
+AVE_DECE = Metric(
+    name="ave_dece",
+    title="aveDece",
+    unit="m/s^2",
+    more_is_unsafe=False,
+    function=average_deceleration,
+    description="Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.",
+)
+
+
+def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """NaN, shape (N,): a single cell has no points; the rater computes them from all cells of the matrix."""
+    return np.full(len(runs.outcome), np.nan)
+
+
+RATING_POINTS = Metric(
+    name="rating_points",
+    title="points kept",
+    unit="points",
+    more_is_unsafe=False,
+    function=_undefined_points,
+    description="Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are simulated.",
+)
+
+
+JERK_TIME = 1.0
+"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s.
+"""
+BRAKING_TIME = 0.5
+"""Time over which a deceleration is averaged [s], as for accelerations in UN R79."""
+HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
+"""W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
+
+
+def _filter(
+    samples: FloatArray, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float
+) -> FloatArray:
+    """Samples after a second-order filter along the first axis, from rest, sample by sample: no result depends on N.
+
+    The filter is a transfer function in s, with coefficients from the highest power, by Tustin's rule.
+    """
+    k, (a, b, c) = 2 / step, denominator
+    leading = a * k * k + b * k + c
+    gains = [
+        value / leading
+        for a, b, c in (numerator, denominator)
+        for value in (a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c)
+    ]
+    b0, b1, b2, _, a1, a2 = gains
+    result = np.zeros_like(samples)
+    x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])
+    for i, x in enumerate(samples):
+        result[i] = b0 * x + b1 * x1 + b2 * x2 - a1 * y1 - a2 * y2
+        x1, x2, y1, y2 = x, x1, result[i], y1
+    return result
+
+
+def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
+    """Acceleration along the vehicle, weighted with W_d of ISO 2631-1 [m/s^2], shape (T, N).
+
+    The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling
+    rate.
+    """
+    high_pass_rate, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
+    butterworth = 1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate
+    passed = _filter(acceleration, (1.0, 0.0, 0.0), butterworth, step)
+    band_limit = 1.0, transition / TRANSITION_QUALITY, transition * transition
+    return _filter(passed, (0.0, transition, transition * transition), band_limit, step)
+
+
+def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Largest magnitude of the jerk over a second [m/s^3]; shape (N,), NaN on a collision."""
+    accelerations, is_counted = _accelerations(runs)
+    steps = _step_count(JERK_TIME, runs.trace.step, largest_count=len(accelerations) - 1)
+    jerk = np.abs(accelerations[steps:] - accelerations[:-steps]) / (steps * runs.trace.step)
+    return mask_collisions(runs, np.max(np.where(is_counted[steps:], jerk, 0.0), axis=0, initial=0.0))
+
+
+def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
+    accelerations, is_counted = _accelerations(runs)
+    squares = (
+        np.where(is_counted, weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step), 0.0) ** 2
+    )
+    return mask_collisions(runs, np.sqrt(sum_in_order(squares) / np.maximum(np.count_nonzero(is_counted, axis=0), 1)))
+
+
+def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Largest deceleration over half a second [m/s^2]; shape (N,), NaN on a collision."""
+    speed, active = runs.trace.speed, runs.trace.active
+    steps = _step_count(BRAKING_TIME, runs.trace.step, largest_count=len(speed) - 1)
+    decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
+    return mask_collisions(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
+
+
+def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
+    """Acceleration between two of the T samples [m/s^2], and whether both samples count; shape (T - 1, N) each."""
+    return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
+
+
+def _step_count(time: float, step: float, largest_count: int) -> int:
+    """Number of steps of `step` [s] in a time [s], from 1 to `largest_count`."""
+    return max(1, min(round(time / step), largest_count))
+
+
+MAX_JERK = Metric(
+    name="max_jerk",
+    title="jerk",
+    unit="m/s^3",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=max_jerk,
+    description="Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision.",
+)
+RMS_ACCELERATION = Metric(
+    name="rms_acceleration",
+    title="RMS a_w",
+    unit="m/s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=rms_acceleration,
+    description=(
+        "Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision."
+    ),
+)
+BRAKE_HARSHNESS = Metric(
+    name="brake_harshness",
+    title="harshness",
+    unit="m/s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=brake_harshness,
+    description="Largest deceleration, averaged over half a second; without a collision.",
+)
