@@ -21,7 +21,7 @@ from safevar_sumo.metrics import (
     time_to_collision,
 )
 from safevar_sumo.metrics.measures import weight_acceleration
-from safevar_sumo.records import Encounter, SimulationRuns
+from safevar_sumo.records import Encounter, Evaluations, SimulationRuns
 from safevar_sumo.study import MetricsTable, load_study
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import made_up_evaluations, made_up_runs
@@ -179,11 +179,16 @@ def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     ) == pytest.approx(5.0)
 
 
-def test_a_vehicle_with_exactly_the_points_of_the_limit_is_unsafe() -> None:
-    """The original has 40 points: a vehicle is unsafe from a loss of one point on."""
-    unsafe = Unsafe.default({"rating_points": 40.0, "safety_degree": np.nan}, np.array(["stopped"]))
-    points = {"safety_degree": np.full(4, np.nan), "rating_points": np.array([40.0, 39.25, 39.0, 38.5])}
-    assert unsafe.of(made_up_evaluations(np.full(4, np.nan), metrics=points)).tolist() == [False, False, True, True]
+def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_must_have() -> None:
+    def earning(*points: float) -> Evaluations:
+        undefined = np.full(len(points), np.nan)
+        return made_up_evaluations(undefined, metrics={"safety_degree": undefined, "rating_points": np.array(points)})
+
+    changed = earning(40.0, 39.25, 39.0, 38.5)
+    assert Unsafe.default_among(changed, earning(40.0)).of(changed).tolist() == [False, False, True, True]
+    assert Unsafe.default_among(changed, earning(1.5)).points == 0.5
+    with pytest.raises(InputError, match=r"earns 0\.5 points and has none to lose"):
+        Unsafe.default_among(changed, earning(0.5))
 
 
 SAMPLED = 0.05

@@ -19,6 +19,22 @@ NOT_SIMULATED = ("CCFhos", "CCFhol", "CCFtap", "CMFtap", "CPTA", "CBTA")
 MASK = {matrix_processing.TestRange.STANDARD: "S", matrix_processing.TestRange.EXTENDED: "E"}
 
 
+HEADER = """\
+# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers.
+# Derived by tests/rating/derive.py from euroncap-rating-2026 {0} (PyPI, Apache-2.0):
+# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. \
+Do not edit.
+# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer chooses AEB or FCW.
+
+calculator = "{0}\""""
+BANDS = """
+# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the \
+last
+# row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals.
+[mitigation]"""
+BEST_FIRST = ["green", "yellow", "orange", "brown", "red"]
+
+
 def number(text: object) -> float:
     value = float(str(text).removesuffix(" km/h"))
     return int(value) if value.is_integer() else value
@@ -36,17 +52,10 @@ def block(sheet, frame, name: str) -> list[str]:
     top, left, n_rows, n_columns = extent["start_row"] + 2, extent["start_col"] + 1, extent["n_rows"], extent["n_cols"]
     headings = {sheet.cell(top - 2, column).value: column for column in range(2, left + 1)}
     test, _, light = name.partition(" ")
-    column_key = (
-        "impact_location"
-        if "Impact location" in [sheet.cell(top - 2, c).value for c in range(1, left + 1)]
-        else "target_speed"
-    )
-    columns = [sheet.cell(top - 1, left + k).value for k in range(n_columns)]
-    columns = (
-        [round(100 * value) for value in columns]
-        if column_key == "impact_location"
-        else [number(value) for value in columns]
-    )
+    column_key, convert = "target_speed", number
+    if "Impact location" in headings:
+        column_key, convert = "impact_location", lambda share: round(100 * share)
+    columns = [convert(sheet.cell(top - 1, left + k).value) for k in range(n_columns)]
     points = {(p.row, p.col): p for p in matrix_processing.get_test_matrix(frame, name, KEY)}
     rows = []
     for k in range(n_rows):
@@ -98,46 +107,19 @@ def bands(test: str, attributes: dict[str, str], colours: list[str]) -> str:
 def main() -> None:
     path = files("data").joinpath("ca_template.xlsx")
     book, frames = openpyxl.load_workbook(str(path)), common.read_excel_file_to_dfs(str(path))
-    print(
-        "# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and "
-        "robustness layers."
-    )
-    print(
-        f"# Derived by tests/rating/derive.py from euroncap-rating-2026 {version('euroncap-rating-2026')} "
-        "(PyPI, Apache-2.0):"
-    )
-    print(
-        "# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, "
-        "robustness_layer. Do not edit."
-    )
-    print(
-        "# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer "
-        "chooses AEB or FCW."
-    )
-    print(f'\ncalculator = "{version("euroncap-rating-2026")}"')
+    print(HEADER.format(version("euroncap-rating-2026")))
     colours = {
         colour.value: "".join(f"{round(255 * part):02X}" for part in rgb)
         for colour, rgb in common.PREDICTION_COLOR_MAP.items()
     }
-    print(
-        "colours = { "
-        + ", ".join(f'{name} = "{colours[name]}"' for name in ("green", "yellow", "orange", "brown", "red"))
-        + " }"
-    )
-    best_first = ["green", "yellow", "orange", "brown", "red"]
-    print(
-        "\n# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle "
-        "under test [km/h], the last"
-        "\n# row for all faster ones; and from which time to collision at the warning [s]. Measured values "
-        "have two decimals."
-    )
-    print("[mitigation]")
+    print("colours = { " + ", ".join(f'{name} = "{colours[name]}"' for name in BEST_FIRST) + " }")
+    print(BANDS)
     for vut in (10, 20, 30, 40, 50):
-        print(f"{vut} = {bands('CCRs', {'VUT speed': f'{vut} km/h'}, best_first)}")
-    assert bands("CCRs", {"VUT speed": "130 km/h"}, best_first) == bands("CCRs", {"VUT speed": "50 km/h"}, best_first)
+        print(f"{vut} = {bands('CCRs', {'VUT speed': f'{vut} km/h'}, BEST_FIRST)}")
+    assert bands("CCRs", {"VUT speed": "130 km/h"}, BEST_FIRST) == bands("CCRs", {"VUT speed": "50 km/h"}, BEST_FIRST)
     print("[criteria]")
-    print(f"avoidance = {bands('CCCscp', {'VUT speed': '50 km/h'}, best_first)}")
-    print(f"warning = {bands('CBLA', {'VUT speed': '50 km/h', 'Function': 'FCW'}, best_first[::-1])}")
+    print(f"avoidance = {bands('CCCscp', {'VUT speed': '50 km/h'}, BEST_FIRST)}")
+    print(f"warning = {bands('CBLA', {'VUT speed': '50 km/h', 'Function': 'FCW'}, BEST_FIRST[::-1])}")
     lines = ["", "# Points of every test of the stage: standard, extended, robustness.", "[scenarios]"]
     scenario: dict[str, list[float]] = {}
     for row in book["Scenario Scores"].iter_rows(min_row=2, values_only=True):
@@ -146,36 +128,41 @@ def main() -> None:
     lines += [
         f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]' for name, points in scenario.items()
     ]
-    tests_by_part = data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"]
     simulated_tests = []
-    for part, names in tests_by_part.items():
+    for part, names in data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"].items():
         for name in names:
             test = data_model.SUBTEST_TO_TEST_DICT.get(name, name)
             if test not in NOT_SIMULATED:
                 lines += block(book[f"FC - {part} pred."], frames[f"FC - {part} pred."], name)
                 simulated_tests.append((test, part))
     for test, part in dict.fromkeys(simulated_tests):
-        sheet = book[f"FC - {part} robust. pred."]
-        column = next(cell.column for cell in sheet[1] if cell.value == test)
-        for row in range(2, sheet.max_row + 1):
-            cell, layer = sheet.cell(row, column), sheet.cell(row, 2).value
-            if cell.fill.fill_type and cell.fill.fgColor.tint:
-                conditions_by_layer = robustness_layer.ROBUSTNESS_LAYER_TO_VERIFICATION_CONDITION
-                pairs = next(
-                    (conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), []
-                )
-                pairs = [pairs] if isinstance(pairs, tuple) else pairs
-                conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
-                lines += [
-                    "",
-                    "[[layers]]",
-                    f'test = "{test}"',
-                    f'layer = "{layer}"',
-                    f'sheet = "{sheet.title}"',
-                    f'cell = "{cell.coordinate}"',
-                    f"conditions = [{', '.join(conditions)}]",
-                ]
+        lines += layers(book[f"FC - {part} robust. pred."], test)
     print("\n".join(lines))
+
+
+def layers(sheet, test: str) -> list[str]:
+    """The robustness layers of a test as TOML."""
+    lines = []
+    column = next(cell.column for cell in sheet[1] if cell.value == test)
+    conditions_by_layer = robustness_layer.ROBUSTNESS_LAYER_TO_VERIFICATION_CONDITION
+    for row in range(2, sheet.max_row + 1):
+        cell, layer = sheet.cell(row, column), sheet.cell(row, 2).value
+        if cell.fill.fill_type and cell.fill.fgColor.tint:
+            pairs = next(
+                (conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), []
+            )
+            pairs = [pairs] if isinstance(pairs, tuple) else pairs
+            conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
+            lines += [
+                "",
+                "[[layers]]",
+                f'test = "{test}"',
+                f'layer = "{layer}"',
+                f'sheet = "{sheet.title}"',
+                f'cell = "{cell.coordinate}"',
+                f"conditions = [{', '.join(conditions)}]",
+            ]
+    return lines
 
 
 if __name__ == "__main__":

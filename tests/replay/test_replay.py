@@ -90,10 +90,15 @@ def test_a_film_shows_what_is_simulated(study: str) -> None:
         assert not result.runs.trace.active[end + 1 :, row].any()
 
 
-def test_moments_of_a_drive(case: Case) -> None:
-    comparison = compare_setting(
+@pytest.fixture(scope="module")
+def comparison(slippery: Path) -> Comparison:
+    (case,) = load_cases([slippery])
+    return compare_setting(
         case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
     )
+
+
+def test_moments_of_a_drive(comparison: Comparison) -> None:
     runs = comparison.film.runs
     trace, original, hit = runs.trace, find_moments(runs, 0), find_moments(runs, 1)
     assert original.braking_start is not None
@@ -107,14 +112,6 @@ def test_moments_of_a_drive(case: Case) -> None:
     assert apart is not None
     assert abs(trace.speed[apart, 0] - trace.speed[apart, 1]) > 0.1
     assert np.all(np.abs(trace.speed[:apart, 0] - trace.speed[:apart, 1]) <= 0.1)
-
-
-@pytest.fixture(scope="module")
-def comparison(slippery: Path) -> Comparison:
-    (case,) = load_cases([slippery])
-    return compare_setting(
-        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
-    )
 
 
 def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -> None:
@@ -176,11 +173,7 @@ def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarra
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("screen")
-def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, tmp_path: Path) -> None:
-    (case,) = load_cases([slippery])
-    comparison = compare_setting(
-        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
-    )
+def test_both_vehicles_are_in_the_window_at_the_nearest_moment(comparison: Comparison, tmp_path: Path) -> None:
     show_in_gui(comparison, slower=0.01, rest=0.0, pictures=tmp_path)
     first, second = (find_moments(comparison.film.runs, row) for row in comparison.rows)
     assert {path.stem for path in tmp_path.iterdir()} == {
@@ -194,14 +187,6 @@ def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, t
     assert original[:, 0].max() < changed[:, 0].min(), "the original's road is above"
     assert original[:, 1].max() < changed[:, 1].max(), "the original keeps its distance"
     assert len(of_colour(picture, 255, 51, 0)) > 20, "the changed vehicle's brake lights"
-
-
-@pytest.fixture(scope="module")
-def crash(slippery: Path) -> Comparison:
-    (case,) = load_cases([slippery])
-    return compare_setting(
-        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
-    )
 
 
 def frame(scene: FlatScene, sample: int) -> np.ndarray:
@@ -220,8 +205,8 @@ def where(picture: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
     return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
 
 
-def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) -> None:
-    scene = lay_out_scene(crash)
+def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Comparison) -> None:
+    scene = lay_out_scene(comparison)
     picture = frame(scene, 0)  # the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
     rows, columns = where(picture, COLOURS[0])
@@ -236,9 +221,9 @@ def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gif", "html", pytest.param("mp4", marks=pytest.mark.slow)])
-def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> None:
+def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        animate(crash, tmp_path / f"{name}.{kind}")
+        animate(comparison, tmp_path / f"{name}.{kind}")
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
     assert (tmp_path / f"a.{kind}").stat().st_size < 1_000_000
     if kind == "gif":
@@ -247,20 +232,20 @@ def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> N
             for frame in range(image.n_frames):
                 image.seek(frame)
                 durations.append(image.info["duration"])
-        seconds = lay_out_scene(crash).sample_count * crash.film.runs.trace.step
+        seconds = lay_out_scene(comparison).sample_count * comparison.film.runs.trace.step
         assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
     if kind == "mp4":
         assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 
 
-def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None:
-    page, scene = animation_page(lay_out_scene(crash)), lay_out_scene(crash)
+def test_the_page_holds_every_place_to_the_centimetre(comparison: Comparison) -> None:
+    page, scene = animation_page(lay_out_scene(comparison)), lay_out_scene(comparison)
     data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
     assert data["step"] == scene.step
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
         assert np.allclose(shown["x"], body.x, atol=0.0051)
-    assert [drive["end"] for drive in data["drives"]] == crash.film.last_samples.tolist()
+    assert [drive["end"] for drive in data["drives"]] == comparison.film.last_samples.tolist()
 
 
 def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

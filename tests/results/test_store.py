@@ -290,6 +290,9 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     assert [run.state for run in result.runs] == ["begun", "waiting"]
     assert 0 < result.runs[0].simulated < 60
     assert 0 < result.share < 0.5
+    nsga2.write_bytes(nsga2.read_bytes().partition(b"\n")[0] + b"\n")
+    assert [(run.state, run.simulated) for run in status(tmp_path / "it").runs] == [("begun", 0), ("waiting", 0)]
+    assert load_cases([tmp_path / "it"])[0].evaluations.empty
     lines = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["status", str(tmp_path / "it")]).output.splitlines()
     assert max(map(len, lines)) <= 80
     assert "collisions" in "".join(lines), "no word is cut in two"

@@ -223,23 +223,29 @@ def test_options_change_what_a_search_asks_for(name: str, options: dict[str, obj
     assert len(solutions) <= options.get("archive", len(solutions))
 
 
-def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
-    """Every setting with more than three changes collides."""
+@pytest.mark.parametrize(("characteristics", "most"), [(SUN, 3), (TWO, 0)])
+def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes(
+    characteristics: CharacteristicSet, most: int
+) -> None:
+    """Every setting with more changes than `most` collides."""
 
     def colliding(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
         good = sphere(characteristics, settings)
-        outcome = np.where(good.f_num_diff > 3, Outcome.COLLISION.value, good.outcome).astype("U16")
+        outcome = np.where(good.f_num_diff > most, Outcome.COLLISION.value, good.outcome).astype("U16")
         return dataclasses.replace(good, outcome=outcome)
 
-    solutions, asked = searched("map_elites", 1, 400, evaluate=colliding)
-    everything = colliding(SUN, np.concatenate(asked))
+    solutions, asked = searched("map_elites", 1, 400, characteristics, colliding)
+    everything = colliding(characteristics, np.concatenate(asked))
     smallest: dict[bytes, float] = {}
     for changed, size in zip(
-        SUN.changed(everything.settings)[everything.collided], everything.f_diff[everything.collided], strict=True
+        characteristics.changed(everything.settings)[everything.collided],
+        everything.f_diff[everything.collided],
+        strict=True,
     ):
         smallest[changed.tobytes()] = min(size, smallest.get(changed.tobytes(), np.inf))
     assert {
-        changed.tobytes(): size for changed, size in zip(SUN.changed(solutions.settings), solutions.f_diff, strict=True)
+        changed.tobytes(): size
+        for changed, size in zip(characteristics.changed(solutions.settings), solutions.f_diff, strict=True)
     } == smallest
 
 
