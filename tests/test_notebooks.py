@@ -74,15 +74,18 @@ def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
     return notebook
 
 
+def _outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+
+
 def _texts(notebook: nbformat.NotebookNode) -> list[str]:
     """Everything that a notebook's cells print or return, as text."""
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    return [output.get("text") or output.get("data", {}).get("text/plain", "") for output in outputs]
+    return [output.get("text") or output.get("data", {}).get("text/plain", "") for output in _outputs(notebook)]
 
 
 def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
     """Number of tables and of pictures that a notebook shows; refuses outputs on stderr."""
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    outputs = _outputs(notebook)
     assert not [output for output in outputs if output.get("name") == "stderr" or output.output_type == "error"]
     tables = [output.data["text/markdown"] for output in outputs if "text/markdown" in output.get("data", {})]
     assert all("| :--- |" in table or "no critical solution" in table for table in tables)
@@ -92,7 +95,7 @@ def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
 @pytest.mark.slow
 def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> None:
     notebook = _executed("answers", tmp_path, timeout=900)
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    outputs = _outputs(notebook)
     shown = [output.get("data", {}) for output in outputs]
     assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 3)
     printed = "".join(

@@ -101,8 +101,7 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     """
     size = _batch_size(system, engine)
     batches = [settings[start : start + size] for start in range(0, len(settings), size)] or [settings]
-    evaluations = [_evaluate_batch(system, batch, engine) for batch in batches]
-    return evaluations[0] if len(evaluations) == 1 else Evaluations.concatenate(evaluations)
+    return Evaluations.concatenate([_evaluate_batch(system, batch, engine) for batch in batches])
 
 
 def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Evaluations:

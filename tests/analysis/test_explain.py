@@ -151,6 +151,10 @@ def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explain
         f"decides every 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s"
         in full
     )
+    changes = [abs(int(text)) for text in re.findall(r" ([+-]\d+) %", short[1])][:4]
+    assert changes == sorted(changes, reverse=True), "of the first failure"
+    alone = replace(explained, explanations=explained.explanations[:1])
+    assert "Accuracy: " in printed(alone, full=True)
     assert re.search(r"max_rpm 5800 -> \d+ r/min", full), "28 r/min are no change at all: no decimals"
     assert not re.search(r"max_rpm 5800 -> \d+\.", full)
 

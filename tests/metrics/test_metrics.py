@@ -39,12 +39,15 @@ def braking_run(speed: float, deceleration: float, gap: float, collision_speed: 
     return made_up_runs(STEP, v, gap - way, collision_speed, position=way, brake=np.ones_like(v))
 
 
+RUN = braking_run(10, 5, 12)
+
+
 def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS) -> float:
     return float(METRICS[name](run, thresholds)[0])
 
 
 def test_safety_degree_is_the_distance_at_standstill() -> None:
-    assert value("safety_degree", braking_run(10, 5, 12)) == pytest.approx(2.0)
+    assert value("safety_degree", RUN) == pytest.approx(2.0)
 
 
 def test_safety_degree_of_a_collision_is_minus_its_speed() -> None:
@@ -55,13 +58,12 @@ def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
     """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is
     undefined.
     """
-    run = braking_run(10, 5, 12)
-    while_it_lasts = run.encounter._replace(in_conflict=run.trace.time[:, np.newaxis] < 1.0)
-    assert value("safety_degree", dataclasses.replace(run, encounter=while_it_lasts)) == pytest.approx(
+    while_it_lasts = RUN.encounter._replace(in_conflict=RUN.trace.time[:, np.newaxis] < 1.0)
+    assert value("safety_degree", dataclasses.replace(RUN, encounter=while_it_lasts)) == pytest.approx(
         4.5, abs=10 * STEP
     )
-    never = run.encounter._replace(in_conflict=run.trace.gap < 0)
-    assert np.isnan(value("safety_degree", dataclasses.replace(run, encounter=never)))
+    never = RUN.encounter._replace(in_conflict=RUN.trace.gap < 0)
+    assert np.isnan(value("safety_degree", dataclasses.replace(RUN, encounter=never)))
 
 
 def test_exposed_and_integrated_time_of_even_approach() -> None:
@@ -75,9 +77,8 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
 
 
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
-    run = braking_run(10, 5, 12)
-    fine = value("tet", run)
-    coarse = value("tet", run, MetricsTable(ttc_threshold=2.0, sampling_interval=0.2))
+    fine = value("tet", RUN)
+    coarse = value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=0.2))
     assert coarse == pytest.approx(fine, abs=0.2)
     assert coarse / 0.2 == pytest.approx(round(coarse / 0.2))
 
@@ -89,35 +90,32 @@ def test_exposure_is_undefined_on_a_collision() -> None:
 
 
 def test_time_to_collision_ends_with_the_first_standstill() -> None:
-    run = braking_run(10, 5, 12)
     still = Encounter(
-        run.encounter.separation,
-        run.encounter.distance,
-        np.ones_like(run.encounter.distance),
-        run.encounter.in_conflict,
+        RUN.encounter.separation,
+        RUN.encounter.distance,
+        np.ones_like(RUN.encounter.distance),
+        RUN.encounter.in_conflict,
     )
     ttc = time_to_collision(
-        SimulationRuns(trace=run.trace, encounter=still, outcome=run.outcome, collision_speed=run.collision_speed)
+        SimulationRuns(trace=RUN.trace, encounter=still, outcome=RUN.outcome, collision_speed=RUN.collision_speed)
     )
-    assert np.all(np.isinf(ttc[run.trace.time > 2.0]))
+    assert np.all(np.isinf(ttc[RUN.trace.time > 2.0]))
 
 
 def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> None:
-    run = braking_run(10, 5, 12)
-    speed = np.where(run.trace.time[:, np.newaxis] < 1.0, 0.0, 2.0)
+    speed = np.where(RUN.trace.time[:, np.newaxis] < 1.0, 0.0, 2.0)
     gap = 20.0 + 0 * speed
     later = dataclasses.replace(
-        run, trace=dataclasses.replace(run.trace, speed=speed), encounter=Encounter(gap, gap, speed, gap > 0)
+        RUN, trace=dataclasses.replace(RUN.trace, speed=speed), encounter=Encounter(gap, gap, speed, gap > 0)
     )
     ttc = time_to_collision(later)[:, 0]
-    assert np.isinf(ttc[run.trace.time < 1.0]).all()
-    assert ttc[run.trace.time >= 1.0] == pytest.approx(10.0)
+    assert np.isinf(ttc[RUN.trace.time < 1.0]).all()
+    assert ttc[RUN.trace.time >= 1.0] == pytest.approx(10.0)
 
 
 def test_a_vehicle_that_never_brakes_has_no_average_deceleration() -> None:
-    run = braking_run(10, 5, 12)
-    coasting = dataclasses.replace(run.trace, brake=run.trace.throttle)
-    assert np.isnan(value("ave_dece", dataclasses.replace(run, trace=coasting)))
+    coasting = dataclasses.replace(RUN.trace, brake=RUN.trace.throttle)
+    assert np.isnan(value("ave_dece", dataclasses.replace(RUN, trace=coasting)))
 
 
 def with_end(run: SimulationRuns, after: float) -> SimulationRuns:
@@ -127,17 +125,15 @@ def with_end(run: SimulationRuns, after: float) -> SimulationRuns:
 
 @pytest.mark.parametrize("name", ["tet", "tit", "ave_dece"])
 def test_samples_that_are_not_active_do_not_count(name: str) -> None:
-    run = braking_run(10, 5, 12)
     slower = dataclasses.replace(
-        run.trace, speed=np.where(run.trace.time[:, np.newaxis] < 1.0, run.trace.speed, run.trace.speed / 2)
+        RUN.trace, speed=np.where(RUN.trace.time[:, np.newaxis] < 1.0, RUN.trace.speed, RUN.trace.speed / 2)
     )
-    assert value(name, with_end(run, 0.5)) != value(name, run) or name == "ave_dece"
-    assert value(name, with_end(run, 1.0)) == value(name, with_end(dataclasses.replace(run, trace=slower), 1.0))
+    assert value(name, with_end(RUN, 0.5)) != value(name, RUN) or name == "ave_dece"
+    assert value(name, with_end(RUN, 1.0)) == value(name, with_end(dataclasses.replace(RUN, trace=slower), 1.0))
 
 
 def test_a_distance_below_zero_is_no_time_to_collision() -> None:
-    run = braking_run(10, 5, 12)
-    behind = dataclasses.replace(run, encounter=run.encounter._replace(distance=run.encounter.distance - 20))
+    behind = dataclasses.replace(RUN, encounter=RUN.encounter._replace(distance=RUN.encounter.distance - 20))
     assert np.isinf(time_to_collision(behind)).all()
     assert value("tit", behind) == 0
 
@@ -145,21 +141,19 @@ def test_a_distance_below_zero_is_no_time_to_collision() -> None:
 @pytest.mark.parametrize("interval", [STEP / 2, 1.5 * STEP, STEP / 1000, 1e-7])
 def test_a_sampling_interval_between_steps_is_refused(interval: float) -> None:
     with pytest.raises(InputError, match="whole multiple"):
-        value("tet", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2.0, sampling_interval=interval))
+        value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=interval))
 
 
 def test_time_to_collision_is_distance_over_closing_speed_and_infinite_while_opening() -> None:
-    run = braking_run(10, 5, 12)
-    assert time_to_collision(run)[0, 0] == pytest.approx(1.2)
-    opening = dataclasses.replace(run, encounter=run.encounter._replace(closing_speed=-run.encounter.closing_speed))
+    assert time_to_collision(RUN)[0, 0] == pytest.approx(1.2)
+    opening = dataclasses.replace(RUN, encounter=RUN.encounter._replace(closing_speed=-RUN.encounter.closing_speed))
     assert np.isinf(time_to_collision(opening)).all()
     assert value("tet", opening) == 0
 
 
 def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
-    run = braking_run(10, 5, 12)
-    level = dataclasses.replace(run, encounter=run.encounter._replace(distance=2.0 * run.encounter.closing_speed))
-    moving = np.count_nonzero(run.encounter.closing_speed[:, 0] > 0)
+    level = dataclasses.replace(RUN, encounter=RUN.encounter._replace(distance=2.0 * RUN.encounter.closing_speed))
+    moving = np.count_nonzero(RUN.encounter.closing_speed[:, 0] > 0)
     assert value("tet", level) == pytest.approx(moving * STEP, abs=2 * STEP)
     assert value("tit", level) == pytest.approx(0.0, abs=1e-12)
 
@@ -173,10 +167,8 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
 
 
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
-    assert value("ave_dece", braking_run(10, 5, 12)) == pytest.approx(5.0, rel=1e-9)
-    assert value(
-        "ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)
-    ) == pytest.approx(5.0)
+    assert value("ave_dece", RUN) == pytest.approx(5.0, rel=1e-9)
+    assert value("ave_dece", RUN, MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)
 
 
 def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_must_have() -> None:

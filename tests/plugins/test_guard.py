@@ -218,6 +218,15 @@ def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) 
     assert expected in failing(mine(ARRAYS + f"        {body}\n"))
 
 
+def delegated(method: str, body: str, **arguments_of: str) -> str:
+    """Methods that call those of the inner model; `method` does more: `body`."""
+    return "".join(
+        f"    def {name}(self, {arguments}):\n        result = self.inner.{name}({arguments})\n"
+        f"        {body if name == method else 'pass'}\n        return result\n\n"
+        for name, arguments in arguments_of.items()
+    )
+
+
 def vehicle(method: str, body: str) -> str:
     return (
         "import numpy as np\nfrom safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Mine:\n    UNITS "
@@ -225,15 +234,13 @@ def vehicle(method: str, body: str) -> str:
         "    def __init__(self):\n        self.inner = SumoVehicle(reference_mass=1500)\n\n"
         "    def prepare(self, characteristics, road_friction, step):\n"
         "        return self.inner.prepare(characteristics, road_friction, step)\n\n"
-        + "".join(
-            f"    def {name}(self, {arguments}):\n        result = self.inner.{name}({arguments})\n"
-            f"        {body if name == method else 'pass'}\n        return result\n\n"
-            for name, arguments in (
-                ("sumo_type", "prepared"),
-                ("at_rest", "prepared"),
-                ("sense", "prepared, state, seen"),
-                ("advance", "prepared, state, command"),
-            )
+        + delegated(
+            method,
+            body,
+            sumo_type="prepared",
+            at_rest="prepared",
+            sense="prepared, state, seen",
+            advance="prepared, state, command",
         )
     )
 
@@ -285,11 +292,7 @@ def scenario(method: str, body: str) -> str:
         "import numpy as np\nfrom safevar_sumo.scenarios import PedestrianCrossing\n\n\nclass Mine:\n"
         "    network, duration = 'pedestrian_crossing', 2.0\n\n    def __init__(self):\n        self.inner = "
         "PedestrianCrossing()\n\n"
-        + "".join(
-            f"    def {name}(self, {arguments}):\n        result = self.inner.{name}({arguments})\n"
-            f"        {body if name == method else 'pass'}\n        return result\n\n"
-            for name, arguments in (("begin", "world"), ("observe", "world, step, memory"), ("encounter", "trace"))
-        )
+        + delegated(method, body, begin="world", observe="world, step, memory", encounter="trace")
     )
 
 

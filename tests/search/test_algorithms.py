@@ -92,10 +92,7 @@ def test_the_result_is_the_fifty_best_scores() -> None:
 
 
 TWO = CharacteristicSet(
-    (
-        Characteristic(name="a", unit="-", original=50.0, lower=0.0, upper=100.0),
-        Characteristic(name="b", unit="-", original=50.0, lower=0.0, upper=100.0),
-    )
+    tuple(Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0) for name in "ab")
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -15,6 +15,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.traci_module import CommandedSpeed
 from tests.in_process import run
 
 SCRIPT = """
@@ -246,6 +247,14 @@ def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str,
     assert (
         "as a function step(traci, vehicle_id)" in error or "a function step(traci, vehicle_id) with the body" in error
     )
+
+
+@pytest.mark.parametrize(("mode", "acceleration"), [(0, 20.0), (1, 16.0), (2, 2.0), (4, 20.0)])
+def test_each_bit_of_a_speed_mode_is_one_limit(mode: int, acceleration: float) -> None:
+    commands = CommandedSpeed(SimpleNamespace(accel=2.0, decel=5.0), step=0.5)
+    commands.command("setSpeedMode", 0.0, 10.0, (mode,))
+    commands.command("setSpeed", 0.0, 10.0, (20,))
+    assert commands.acceleration(10.0, 0.0, sumo_speed=18.0) == acceleration
 
 
 def test_the_vehicle_model_limits_a_commanded_acceleration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
