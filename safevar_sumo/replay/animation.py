@@ -6,7 +6,6 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
-from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, crossing_stripes, lay_out_scene, strip_corners
+from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, lane_outlines, lay_out_scene
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -38,22 +37,7 @@ LAST_FRAME_DURATION = 2.0
 """Duration of the last frame [s]."""
 MAX_GIF_SIZE = 1_000_000
 """Size above which a gif gets fewer frames [bytes]."""
-EXACT = [
-    "-threads",
-    "1",
-    "-pix_fmt",
-    "yuv420p",
-    "-crf",
-    "26",
-    "-movflags",
-    "+faststart",
-    "-fflags",
-    "+bitexact",
-    "-flags:v",
-    "+bitexact",
-    "-map_metadata",
-    "-1",
-]
+EXACT = "-threads 1 -pix_fmt yuv420p -crf 26 -movflags +faststart -fflags +bitexact -flags:v +bitexact -map_metadata -1"
 """Options of ffmpeg for small files of the same bytes each time."""
 
 
@@ -120,7 +104,7 @@ def _write_mp4(scene: FlatScene, path: Path) -> None:
     from matplotlib.animation import FFMpegWriter
 
     with matplotlib.rc_context({"animation.ffmpeg_path": find_ffmpeg()}):
-        _save(scene, 1, path, FFMpegWriter(fps=round(1 / scene.step), codec="libx264", extra_args=EXACT))
+        _save(scene, 1, path, FFMpegWriter(fps=round(1 / scene.step), codec="libx264", extra_args=EXACT.split()))
 
 
 def _save(scene: FlatScene, stride: int, path: Path, writer: AbstractMovieWriter) -> None:
@@ -138,20 +122,18 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
-    view = scene.view
-    height = round(WIDTH * view.height / view.width / 2) * 2
+    height = round(WIDTH * scene.height / scene.width / 2) * 2
     figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
     axis = figure.add_axes(
         (0, 0, 1, height / (PANEL_HEIGHT + height)),
         facecolor=GROUND_COLOUR,
         xticks=[],
         yticks=[],
-        ylim=(view.bottom, view.bottom + view.height),
+        ylim=(scene.bottom, scene.bottom + scene.height),
     )
     axis.spines[:].set_visible(False)
     _draw_road(axis, scene)
-    in_order = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
-    bodies = [(body, *_draw_body(axis, body, scene)) for body in in_order]
+    bodies = [(body, *_draw_body(axis, body, scene)) for body in scene.bodies]
     clock = figure.text(0.014, 0.98, "", fontsize=18, color=TEXT_COLOUR, va="top")
     texts = [
         figure.text(
@@ -167,7 +149,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     ]
 
     def show(sample: int) -> list[Patch]:
-        axis.set_xlim(view.left_ends[sample], view.left_ends[sample] + view.width)
+        axis.set_xlim(scene.left_ends[sample], scene.left_ends[sample] + scene.width)
         for body, patches, lights in bodies:
             pose = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample])
             for patch in [*patches, *lights]:
@@ -186,29 +168,24 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
     """Draw lanes, crossings, and a mark every ten metres from the start of the front bumper."""
     from matplotlib.patches import Polygon
 
-    for kind in ("area", "path", "road", "crossing"):
-        for lane in (lane for lane in scene.road if lane.kind == kind):
-            if kind == "area":
-                axis.add_patch(Polygon(lane.line, color=PATH_COLOUR, linewidth=0))
-            elif kind == "crossing":
-                for stripe in crossing_stripes(lane):
-                    axis.add_patch(Polygon(stripe, color="white", linewidth=0))
-            else:
-                road = [(lane.width, SEAM_COLOUR), (lane.width - SEAM_WIDTH, ROAD_COLOUR)]
-                for width, colour in road if kind == "road" else [(lane.width, PATH_COLOUR)]:
-                    for start, end in pairwise(lane.line):
-                        axis.add_patch(Polygon(strip_corners(start, end, width), color=colour, linewidth=0))
+    for lane in scene.road:
+        layers = [(lane.width, "white" if lane.kind == "crossing" else PATH_COLOUR)]
+        if lane.kind == "road":
+            layers = [(lane.width, SEAM_COLOUR), (lane.width - SEAM_WIDTH, ROAD_COLOUR)]
+        for width, colour in layers:
+            for outline in lane_outlines(lane, width):
+                axis.add_patch(Polygon(outline, color=colour, linewidth=0))
     for mark in scene.all_marks:
         axis.annotate(
             f" {mark} m",
-            (mark, scene.view.bottom),
+            (mark, scene.bottom),
             (0, 2),
             textcoords="offset points",
             color=PALE_TEXT_COLOUR,
             fontsize=8,
             annotation_clip=True,
         )
-        axis.vlines(mark, scene.view.bottom, scene.view.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
+        axis.vlines(mark, scene.bottom, scene.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
 
 
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
@@ -223,7 +200,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
             axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white", zorder=3))
         ], []
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
-    alpha = 0.6 if body.is_vut and body.row == ORIGINAL and len(scene.moments) > 1 else 0.9
+    alpha = 0.6 if body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1 else 0.9
     corner = (-length, -width / 2)
     window = (-0.44 * length, -0.42 * width), 0.16 * length, 0.84 * width
     patches = [
@@ -236,7 +213,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
         for side in (-width / 2, 0.2 * width)
         if body.is_vut
     ]
-    return [axis.add_patch(patch) for patch in patches], [axis.add_patch(light) for light in lights]
+    return list(map(axis.add_patch, patches)), list(map(axis.add_patch, lights))
 
 
 @cache
@@ -273,59 +250,58 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
     """The data of the template `player`: the still picture, and under `played` the data of the script. y points
     down.
     """
-    view, key_sample = scene.view, scene.key_sample
-    drives = [_drive_data(scene, row) for row in scene.comparison.rows]
-    bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
-    left_ends = _rounded_or_constant(view.left_ends)
-    box = {
-        "left": left_ends,
-        "top": round(-view.bottom - view.height, DECIMALS),
-        "width": round(view.width, DECIMALS),
-        "height": round(view.height, DECIMALS),
-    }
-    common_data = {"step": scene.step, "length": scene.sample_count, "key": key_sample, "view": box, "drives": drives}
-    return {
-        **common_data,
-        "description": _describe_scene(scene),
-        "moments": _list_jumps(scene),
-        "bottom": round(-view.bottom, DECIMALS),
-        "letters": round(view.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
-        "road": [
-            _lane_data(lane)
-            for kind in ("area", "path", "road", "crossing")
-            for lane in scene.road
-            if lane.kind == kind
-        ],
-        "ticks": scene.all_marks,
-        "bodies": [_still_body_data(body, scene) for body in bodies],
-        "played": {**common_data, "bodies": [_moving_body_data(body) for body in bodies]},
-    }
-
-
-def _describe_scene(scene: FlatScene) -> str:
-    """Describe the still picture in words."""
     comparison = scene.comparison
     vehicles = " and ".join(
         f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows
     )
-    return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}"
+    common_data = {
+        "step": scene.step,
+        "length": scene.sample_count,
+        "key": scene.key_sample,
+        "view": {
+            "left": _rounded_or_constant(scene.left_ends),
+            "top": round(-scene.bottom - scene.height, DECIMALS),
+            "width": round(scene.width, DECIMALS),
+            "height": round(scene.height, DECIMALS),
+        },
+        "drives": [_drive_data(scene, row) for row in comparison.rows],
+    }
+    return {
+        **common_data,
+        "description": f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}",
+        "moments": _list_jumps(scene),
+        "bottom": round(-scene.bottom, DECIMALS),
+        "letters": round(scene.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
+        "road": [
+            {
+                "kind": lane.kind,
+                "width": round(lane.width, 3),
+                "inside": round(lane.width - SEAM_WIDTH, 3),
+                "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist()),
+            }
+            for lane in scene.road
+        ],
+        "ticks": scene.all_marks,
+        "bodies": [_still_body_data(body, scene) for body in scene.bodies],
+        "played": {**common_data, "bodies": [_moving_body_data(body) for body in scene.bodies]},
+    }
 
 
 def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
     """The moments that the player's buttons jump to, in order of time."""
     jumps = []
-    for row, moments in enumerate(scene.moments):
+    for row, moments in enumerate(scene.comparison.moments):
         name = scene.comparison.name(row)
         if moments.braking_start is not None:
             jumps.append({"name": f"{name} brakes", "sample": moments.braking_start})
         if moments.nearest is not None:
-            is_impact = not np.isnan(scene.comparison.film.runs.collision_speed[row])
+            is_impact = not np.isnan(scene.comparison.runs.collision_speed[row])
             jumps.append({"name": f"{name} {'collides' if is_impact else 'is nearest'}", "sample": moments.nearest})
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
 def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
-    trace, moments = scene.comparison.film.runs.trace, scene.moments[row]
+    trace, moments = scene.comparison.runs.trace, scene.comparison.moments[row]
     samples = slice(0, moments.end + 1)
     return {
         "name": scene.comparison.name(row),
@@ -335,15 +311,6 @@ def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
         "speed": _rounded_list(trace.speed[samples, row]),
         "gap": _rounded_list(trace.gap[samples, row]),
         "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
-    }
-
-
-def _lane_data(lane: Any) -> dict[str, Any]:
-    return {
-        "kind": lane.kind,
-        "width": round(lane.width, 3),
-        "inside": round(lane.width - SEAM_WIDTH, 3),
-        "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist()),
     }
 
 

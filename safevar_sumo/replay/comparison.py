@@ -6,6 +6,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.copies import copy_and_name
 from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
 from safevar_sumo.sumo.network import Network, built_network, stage_network
-from safevar_sumo.sumo.system import Measuring, System
+from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -53,82 +54,36 @@ class ActorTrack(NamedTuple):
     angle: FloatArray
 
 
-@dataclass(frozen=True, kw_only=True)
-class Film:
-    """N simulations seen from above.
+def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, ActorTrack]]:
+    """Simulate N settings, shape (N, n), and record the tracks of all actors by name, in alphabetical order."""
+    frames, sizes = list[dict[str, tuple[float, float, float]]](), dict[str, tuple[bool, float, float]]()
 
-    `tracks` holds the tracks of actors by name; `last_samples` holds the last sample of every simulation, shape (N,):
-    later samples are meaningless, as SUMO continues with the rest of the batch.
-    """
+    def record(world: SumoWorld) -> None:
+        frames.append(world.actor_poses())
+        sizes.update({actor: world.actor_size(actor) for actor in frames[-1].keys() - sizes.keys()})
 
-    runs: SimulationRuns
-    tracks: Mapping[str, ActorTrack]
-    road: tuple[LaneLine, ...]
-
-    @property
-    def last_samples(self) -> np.ndarray:
-        active = self.runs.trace.active
-        return np.asarray(len(active) - 1 - np.argmax(active[::-1], axis=0))
-
-
-def record_film(system: System, settings: FloatArray) -> Film:
-    """Simulate N settings of n characteristics, shape (N, n), and record the positions of all actors.
-
-    In a matrix all settings are simulated at the worst point of the last setting.
-
-    Raises
-    ------
-    SimulationError, InputError
-        If `simulate` raises it.
-    """
-    camera, system = _Camera(len(settings)), system_at_worst_point(system, settings)
-    runs = simulate(system, settings, watch=camera.record)
-    return Film(runs=runs, tracks=camera.tracks(), road=read_road(stage_network(system.scenario)))
-
-
-class _Camera:
-    """Records the position of every actor in all copies at every sample."""
-
-    def __init__(self, copy_count: int) -> None:
-        self._copy_count = copy_count
-        self._frames: list[dict[str, tuple[float, float, float]]] = []
-        self._sizes: dict[str, tuple[bool, float, float]] = {}
-
-    def record(self, world: SumoWorld) -> None:
-        frame = world.actor_poses()
-        for name in frame.keys() - self._sizes.keys():
-            self._sizes[name] = world.actor_size(name)
-        self._frames.append(frame)
-
-    def tracks(self) -> dict[str, ActorTrack]:
-        """The recorded tracks, in alphabetical order."""
-        by_name: dict[str, ActorTrack] = {}
-        for actor in sorted(self._sizes):
-            copy, name = copy_and_name(actor)
-            if name not in by_name:
-                by_name[name] = ActorTrack(
-                    *self._sizes[actor], *(np.full((len(self._frames), self._copy_count), np.nan) for _ in range(3))
-                )
-            for sample, frame in enumerate(self._frames):
-                if actor in frame:
-                    for array, value in zip(by_name[name][3:], frame[actor], strict=True):
-                        array[sample, copy] = value
-        return by_name
+    runs, tracks = simulate(system, settings, watch=record), dict[str, ActorTrack]()
+    for actor in sorted(sizes):
+        copy, name = copy_and_name(actor)
+        absent = np.full((3, len(frames), len(settings)), np.nan)
+        track = tracks.setdefault(name, ActorTrack(*sizes[actor], *absent))
+        for sample, frame in enumerate(frames):
+            if actor in frame:
+                track.x[sample, copy], track.y[sample, copy], track.angle[sample, copy] = frame[actor]
+    return runs, tracks
 
 
 def read_road(network: Network) -> tuple[LaneLine, ...]:
     """Read the lanes of one copy of a network, as netconvert built it."""
-    root = ElementTree.parse(built_network(network)).getroot()
-    return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
-
-
-def _lane(function: str, lane: ElementTree.Element) -> LaneLine:
-    line = np.array([[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()])
-    if function == "walkingarea":
-        return LaneLine("area", line, width=0.0)
-    for_persons = lane.get("allow", "").split() == ["pedestrian"]
-    kind = "crossing" if function == "crossing" else "path" if for_persons else "road"
-    return LaneLine(kind, line, width=float(lane.get("width", 3.2)))  # SUMO's default width
+    lanes = []
+    for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
+        for lane in edge.iter("lane"):
+            line = [[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()]
+            kind = {"walkingarea": "area", "crossing": "crossing"}.get(edge.get("function", ""))
+            for_persons = lane.get("allow", "").split() == ["pedestrian"]
+            width = 0.0 if kind == "area" else float(lane.get("width", 3.2))  # SUMO's default width
+            lanes.append(LaneLine(kind or ("path" if for_persons else "road"), np.array(line), width))
+    return tuple(lanes)
 
 
 class Moments(NamedTuple):
@@ -144,15 +99,6 @@ class Moments(NamedTuple):
     end: int
 
 
-def find_moments(runs: SimulationRuns, row: int) -> Moments:
-    """Find the moments of one of N runs."""
-    return Moments(
-        braking_start=brake_onset(runs, row),
-        nearest=runs.nearest(row),
-        end=int(np.flatnonzero(runs.trace.active[:, row])[-1]),
-    )
-
-
 ORIGINAL, CHANGED = 0, 1
 """Rows of a comparison."""
 COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
@@ -164,22 +110,37 @@ class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
     `title` is the study's title and the `point` of its matrix, `network` the scenario's network with the lanes that the
-    scenario's parameters define; `evaluations` and `film` have one row for each vehicle. `objectives` are metrics that
-    the study optimises besides the paper's metrics.
+    scenario's parameters define, `road` the lanes; `evaluations` and `runs` have one row for each vehicle. `tracks`
+    holds the tracks of actors by name: their samples after the end of a run are meaningless, as SUMO continues with the
+    other run. `objectives` are metrics that the study optimises besides the paper's metrics.
     """
 
     title: str
     characteristics: CharacteristicSet
     ttc_threshold: float
     network: Network
+    road: tuple[LaneLine, ...]
     evaluations: Evaluations
-    film: Film
+    runs: SimulationRuns
+    tracks: Mapping[str, ActorTrack]
     objectives: tuple[MetricFacts, ...] = ()
     point: str = ""
 
     @property
     def rows(self) -> range:
         return range(len(self.evaluations))
+
+    @cached_property
+    def moments(self) -> list[Moments]:
+        """The moments of each run."""
+        return [
+            Moments(
+                braking_start=brake_onset(self.runs, row),
+                nearest=self.runs.nearest(row),
+                end=int(np.flatnonzero(self.runs.trace.active[:, row])[-1]),
+            )
+            for row in self.rows
+        ]
 
     def name(self, row: int) -> str:
         return "original" if row == ORIGINAL else "changed"
@@ -193,10 +154,9 @@ class Comparison:
 
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
-        runs = self.film.runs
+        runs, nearest = self.runs, self.moments[row].nearest
         if not math.isnan(runs.collision_speed[row]):
             return f"collides at {runs.collision_speed[row]:.1f} m/s"
-        nearest = find_moments(runs, row).nearest
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
@@ -279,26 +239,21 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
         ),
         "",
     )
-    recording = record_film(worst_system, settings)
+    network, scoring = stage_network(worst_system.scenario), worst_system.measuring.scoring
+    runs, tracks = _film(worst_system, settings)
+    objectives = {objective.name for objective in scoring.objectives} - {*METRICS, RATING_POINTS.name}
     return Comparison(
         title=f"{study.title} ({point})" if point else study.title,
         point=point,
         characteristics=system.characteristics,
         ttc_threshold=system.metrics_table.ttc_threshold,
-        network=stage_network(worst_system.scenario),
-        evaluations=score(worst_system, settings, recording.runs),
-        film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
-        objectives=_further_objectives(worst_system.measuring),
-    )
-
-
-def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
-    """Objectives of one run besides the paper's; the points of a rating are none, as they belong to all cells
-    together.
-    """
-    objectives = {objective.name for objective in measuring.scoring.objectives}
-    return tuple(
-        metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name}
+        network=network,
+        road=read_road(network),
+        evaluations=score(worst_system, settings, runs),
+        runs=_with_pedals_before_impacts(runs),
+        tracks=tracks,
+        # The points of a rating belong to all cells together.
+        objectives=tuple(metric for metric in scoring.metrics if metric.name in objectives),
     )
 
 
@@ -309,7 +264,7 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
-        end = find_moments(runs, row).end
+        end = int(np.flatnonzero(trace.active[:, row])[-1])
         for pedal in (throttle, brake):
             pedal[end, row] = pedal[max(end - 1, 0), row]
     return replace(runs, trace=replace(trace, throttle=throttle, brake=brake))

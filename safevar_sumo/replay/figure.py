@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import STANDSTILL, SimulationRuns
-from safevar_sumo.replay.comparison import COLOURS, Comparison, find_moments
+from safevar_sumo.replay.comparison import COLOURS, Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +34,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
-    runs, divergence = comparison.film.runs, find_divergence(comparison.film.runs)
+    runs, divergence = comparison.runs, find_divergence(comparison.runs)
     trace, ttc = runs.trace, time_to_collision(runs)
     divergence_time = None if divergence is None else float(trace.time[divergence])
     quantities = {
@@ -46,7 +46,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     for axis, (label, values) in zip(axes, quantities.items(), strict=True):
         axis.set_ylabel(label)
         for row in comparison.rows:
-            end = find_moments(runs, row).end + 1
+            end = comparison.moments[row].end + 1
             axis.plot(
                 trace.time[:end],
                 values[:end, row],
@@ -59,7 +59,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
             axis.axvline(divergence_time, color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
     speed_axis, gap_axis, pedal_axis, ttc_axis = axes
     for row in comparison.rows:
-        _mark_moments(speed_axis, gap_axis, runs, row)
+        _mark_moments(speed_axis, gap_axis, comparison, row)
     speed_axis.margins(y=0.1)
     gap_axis.axhline(0, color="black", linewidth=0.8)
     gap_axis.set_ylim(-0.22 * gap_axis.get_ylim()[1], None)
@@ -72,9 +72,10 @@ def draw_comparison(comparison: Comparison) -> Figure:
     return figure
 
 
-def _mark_moments(speed_axis: Axes, gap_axis: Axes, runs: SimulationRuns, row: int) -> None:
+def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int) -> None:
     """Mark where a vehicle begins to brake, is nearest, and collides."""
-    trace, moments, impact_speed = runs.trace, find_moments(runs, row), float(runs.collision_speed[row])
+    trace, moments = comparison.runs.trace, comparison.moments[row]
+    impact_speed = float(comparison.runs.collision_speed[row])
     has_impact = not np.isnan(impact_speed)
     if moments.braking_start is not None:
         _draw_mark(
@@ -130,9 +131,9 @@ def _draw_mark(
 
 def _end_time(comparison: Comparison) -> float:
     """The later of the times at which the vehicles are nearest and at rest [s]."""
-    runs = comparison.film.runs
+    runs = comparison.runs
     last_moving = np.flatnonzero((runs.trace.active & (runs.trace.speed > STANDSTILL)).any(axis=1)).max(initial=0)
-    last_sample = max(last_moving, *(find_moments(runs, row).nearest or 0 for row in comparison.rows))
+    last_sample = max(last_moving, *(moments.nearest or 0 for moments in comparison.moments))
     return float(runs.trace.time[min(last_sample + 1, len(runs.trace.time) - 1)])
 
 
@@ -140,38 +141,25 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     """Draw the legend: vehicles, marks, and lines."""
     from matplotlib.lines import Line2D
 
-    has_impact = bool(np.isfinite(comparison.film.runs.collision_speed).any())
-    marks = {
-        "begins to brake": BRAKING_MARK,
-        "nearest": NEAREST_MARK,
-        **({"impact": IMPACT_MARK} if has_impact else {}),
-    }
+    def entry(label: str, **style: Any) -> Line2D:
+        return Line2D([], [], label=label, **style)
+
+    marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK}
+    if np.isfinite(comparison.runs.collision_speed).any():
+        marks["impact"] = IMPACT_MARK
     entries = [
-        Line2D(
-            [],
-            [],
+        entry(
+            f"{comparison.name(row)} vehicle: {comparison.verdict(row)}",
             color=COLOURS[row],
             linestyle="--" if row else "-",
-            label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}",
         )
         for row in comparison.rows
     ]
-    entries += [
-        Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label)
-        for label, mark in marks.items()
-    ]
+    entries += [entry(label, color="0.35", marker=mark, linestyle="", markersize=7) for label, mark in marks.items()]
     if divergence_time is not None:
-        entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="speeds diverge (by 0.1 m/s)"))
-    entries.append(
-        Line2D(
-            [],
-            [],
-            color="0.4",
-            linestyle=":",
-            linewidth=0.9,
-            label=f"TTC* = {comparison.ttc_threshold:g} s: critical below",
-        )
-    )
+        entries.append(entry("speeds diverge (by 0.1 m/s)", color="0.35", linestyle="-.", linewidth=0.9))
+    threshold = f"TTC* = {comparison.ttc_threshold:g} s: critical below"
+    entries.append(entry(threshold, color="0.4", linestyle=":", linewidth=0.9))
     figure.legend(handles=entries, loc="outside lower center", ncols=3, frameon=False)
 
 

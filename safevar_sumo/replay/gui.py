@@ -8,7 +8,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.replay.animation import ACTOR_COLOUR, PATH_COLOUR, PERSON_COLOUR, ROAD_COLOUR
 from safevar_sumo.replay.comparison import COLOURS, Comparison
-from safevar_sumo.replay.scene import FlatBody, FlatScene, crossing_stripes, lay_out_scene, strip_corners
+from safevar_sumo.replay.scene import LANE_KINDS, FlatBody, FlatScene, lane_outlines, lay_out_scene
 from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
 from safevar_sumo.sumo.network import Network, copied_network
 
@@ -84,7 +83,7 @@ def show_in_gui(
         for row in comparison.rows:
             _paint_road(api, scene, row)
             api.poi.add(f"legend.{row}", 0, 0, (0, 0, 0, 0), layer=200)
-        pauses = {moments.nearest for moments in scene.moments} | {scene.sample_count - 1}
+        pauses = {moments.nearest for moments in comparison.moments} | {scene.sample_count - 1}
         start = time.monotonic()
         for sample in range(scene.sample_count):
             _show_sample(api, scene, sample)
@@ -136,7 +135,7 @@ def _open_window(network: Network, step: float) -> Iterator[Any]:
 
 def _road_origin(scene: FlatScene, row: int) -> tuple[float, float]:
     """Where the origin of a row's road is in the window [m]."""
-    return ORIGIN, ORIGIN - row * (scene.view.height + ROAD_SPACING)
+    return ORIGIN, ORIGIN - row * (scene.height + ROAD_SPACING)
 
 
 def _add_actor(api: Any, body: FlatBody) -> None:
@@ -157,32 +156,28 @@ def _add_actor(api: Any, body: FlatBody) -> None:
 
 def _paint_road(api: Any, scene: FlatScene, row: int) -> None:
     for i, lane in enumerate(scene.road):
-        strips = [strip_corners(start, end, lane.width - 0.1) for start, end in pairwise(lane.line)]
-        outlines = {"area": [lane.line], "crossing": list(crossing_stripes(lane))}.get(lane.kind, strips)
         colour = _rgba({"road": ROAD_COLOUR, "crossing": "#ffffff"}.get(lane.kind, PATH_COLOUR))
-        for j, outline in enumerate(outlines):
+        for j, outline in enumerate(lane_outlines(lane, lane.width - 0.1)):
             points = [tuple(point) for point in (outline + _road_origin(scene, row)).tolist()]
-            layer = ("area", "path", "road", "crossing").index(lane.kind)
-            api.polygon.add(f"lane.{row}.{i}.{j}", points, colour, fill=True, layer=layer)
+            api.polygon.add(f"lane.{row}.{i}.{j}", points, colour, fill=True, layer=LANE_KINDS.index(lane.kind))
 
 
 def _show_sample(api: Any, scene: FlatScene, sample: int) -> None:
     """Show the actors, the camera and the legend at one sample."""
-    comparison, view = scene.comparison, scene.view
+    comparison, left = scene.comparison, scene.left_ends[sample]
     for body in scene.bodies:
         x, y, angle = body.x[sample], body.y[sample], 90 - np.rad2deg(body.heading[sample])
         if not np.isnan(x):
             name, (right, up) = f"{body.row}.{body.name}", _road_origin(scene, body.row)
             api.vehicle.moveToXY(name, "", 0, x + right, y + up, angle, keepRoute=ANY_POSITION)
             api.vehicle.setSignals(name, BRAKE_LIGHT if scene.brakes(body, sample) else 0)
-    left = view.left_ends[sample]
     for row in comparison.rows:
         right, up = _road_origin(scene, row)
         words = f"{comparison.name(row)} ({('blue', 'orange')[row]}): {scene.reading(row, sample)}"
-        api.poi.setPosition(f"legend.{row}", right + left + view.width / 2, up + view.bottom + LEGEND_HEIGHT)
+        api.poi.setPosition(f"legend.{row}", right + left + scene.width / 2, up + scene.bottom + LEGEND_HEIGHT)
         api.poi.setParameter(f"legend.{row}", "words", words)
-    top = ORIGIN + view.bottom + view.height  # `up` is the last road's
-    api.gui.setBoundary(VIEW_NAME, ORIGIN + left, up + view.bottom, ORIGIN + left + view.width, top)
+    top = ORIGIN + scene.bottom + scene.height  # `up` is the last road's
+    api.gui.setBoundary(VIEW_NAME, ORIGIN + left, up + scene.bottom, ORIGIN + left + scene.width, top)
     api.simulationStep()
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.replay.comparison import Comparison, Film, LaneLine, Moments, find_moments
+from safevar_sumo.replay.comparison import Comparison, LaneLine
 from safevar_sumo.scenarios import VUT
 
 SEAM_WIDTH = 0.12
@@ -28,6 +28,10 @@ MAX_DISTANCE = 30.0
 """Distance to the vehicle under test beyond which actors are not shown [m]."""
 MARK_DISTANCE = 10
 """Distance between two marks beside the road [m]."""
+STRIPE_LENGTH = 0.5
+"""Length of a crossing's stripes, and of the space between them [m]."""
+LANE_KINDS = ("area", "path", "road", "crossing")
+"""Kinds of lanes in the order in which they are drawn."""
 
 
 class FlatBody(NamedTuple):
@@ -46,43 +50,40 @@ class FlatBody(NamedTuple):
     heading: FloatArray
 
 
-class View(NamedTuple):
-    """The part of the road that is shown: its left end at every sample, shape (T,), its lower end, and its size [m]."""
-
-    left_ends: FloatArray
-    bottom: float
-    width: float
-    height: float
-
-
 @dataclass(frozen=True)
 class FlatScene:
-    """A comparison laid out for drawing; `sample_count` samples, `step` seconds apart."""
+    """A comparison laid out for drawing; `sample_count` samples, `step` seconds apart.
+
+    The lanes and bodies are in the order in which they are drawn. The part of the road that is shown has its left end
+    at `left_ends`, shape (T,), its lower end at `bottom`, and the size `width` by `height` [m].
+    """
 
     comparison: Comparison
     step: float
     sample_count: int
     road: tuple[LaneLine, ...]
     bodies: tuple[FlatBody, ...]
-    moments: tuple[Moments, ...]
-    view: View
+    left_ends: FloatArray
+    bottom: float
+    width: float
+    height: float
 
     @property
     def key_sample(self) -> int:
         """The sample that a still picture shows: the moment at which the changed vehicle, or else the original, is
         nearest.
         """
-        last = self.moments[-1]
+        last = self.comparison.moments[-1]
         return last.nearest if last.nearest is not None else last.end
 
     def brakes(self, body: FlatBody, sample: int) -> bool:
         """Whether an actor is the vehicle under test and brakes; after the end of its run, whether it braked then."""
-        now = min(sample, self.moments[body.row].end)
-        return body.is_vut and bool(self.comparison.film.runs.trace.brake[now, body.row] > 0)
+        now = min(sample, self.comparison.moments[body.row].end)
+        return body.is_vut and bool(self.comparison.runs.trace.brake[now, body.row] > 0)
 
     def reading(self, row: int, sample: int) -> str:
         """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run ends."""
-        trace, moments = self.comparison.film.runs.trace, self.moments[row]
+        trace, moments = self.comparison.runs.trace, self.comparison.moments[row]
         now = min(sample, moments.end)
         is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
         ending = self.comparison.verdict(row) if is_finished else "brakes" if trace.brake[now, row] > 0 else ""
@@ -92,42 +93,39 @@ class FlatScene:
     @property
     def all_marks(self) -> list[int]:
         """The marks that ever come into view, by their distance from the start [m]."""
-        left, right = float(self.view.left_ends.min()), float(self.view.left_ends.max()) + self.view.width
+        left, right = float(self.left_ends.min()), float(self.left_ends.max()) + self.width
         return list(range(math.floor(left / MARK_DISTANCE) * MARK_DISTANCE, int(right) + MARK_DISTANCE, MARK_DISTANCE))
 
 
 def lay_out_scene(comparison: Comparison) -> FlatScene:
-    """Lay out a comparison for drawing."""
-    film = comparison.film
-    vut = film.tracks[VUT]
+    """Lay out a comparison for drawing, with the actors that ever come near the vehicle under test."""
+    vut = comparison.tracks[VUT]
     turn = np.deg2rad(90 - vut.angle[0, 0])
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
-    all_moments = tuple(find_moments(film.runs, row) for row in comparison.rows)
-    sample_count = max(run_moments.end for run_moments in all_moments) + 1
+    sample_count = max(moments.end for moments in comparison.moments) + 1
     bodies = []
-    for name, track in film.tracks.items():
-        for row in comparison.rows:
-            if _is_near(film, name, row):
-                samples = np.minimum(np.arange(sample_count), all_moments[row].end)  # then the actor stays in place
-                x, y = rotation @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
+    for name, track in comparison.tracks.items():
+        for row, moments in enumerate(comparison.moments):
+            samples = np.minimum(np.arange(sample_count), moments.end)  # then the actor stays in place
+            track_x, track_y = track.x[samples, row], track.y[samples, row]
+            distance = np.hypot(track_x - vut.x[samples, row], track_y - vut.y[samples, row])
+            if np.any(distance < MAX_DISTANCE + track.length):
+                x, y = rotation @ (np.stack([track_x, track_y]) - start[:, np.newaxis])
                 heading = np.deg2rad(90 - track.angle[samples, row]) - turn
                 body = FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y, heading)
                 bodies.append(body)
-    road = tuple(lane._replace(line=(lane.line - start) @ rotation.T) for lane in film.road)
+    lanes = (lane._replace(line=(lane.line - start) @ rotation.T) for lane in comparison.road)
+    road = sorted(lanes, key=lambda lane: LANE_KINDS.index(lane.kind))
     view = _choose_view(bodies, sample_count)
-    return FlatScene(comparison, film.runs.trace.step, sample_count, road, tuple(bodies), all_moments, view)
+    bodies.sort(key=lambda body: (body.is_vut, body.row))
+    return FlatScene(comparison, comparison.runs.trace.step, sample_count, tuple(road), tuple(bodies), *view)
 
 
-def _is_near(film: Film, name: str, row: int) -> bool:
-    """Whether an actor ever comes near the vehicle under test."""
-    track, vut, end = film.tracks[name], film.tracks[VUT], film.last_samples[row] + 1
-    distance = np.hypot(track.x[:end, row] - vut.x[:end, row], track.y[:end, row] - vut.y[:end, row])
-    return bool(np.any(distance < MAX_DISTANCE + track.length))
-
-
-def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> View:
-    """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
+def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> tuple[FloatArray, float, float, float]:
+    """The whole road or, in a long scene, what a camera that follows the vehicles shows: left ends, bottom, width,
+    height.
+    """
     left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
     edges = [
@@ -135,15 +133,11 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> View:
     ]
     bottom, top = float(min(edges)) - MARGIN / 2, float(max(edges)) + MARGIN / 2
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
-    if right_end - left_end <= MAX_LENGTH:
-        return View(np.full(sample_count, left_end), bottom - padding, right_end - left_end, top - bottom + 2 * padding)
-    front = np.mean([body.x for body in bodies if body.is_vut], axis=0)
-    left = np.clip(front - CAMERA_LENGTH * 0.45, left_end, max(left_end, right_end - CAMERA_LENGTH))
-    return View(left, bottom - padding, CAMERA_LENGTH, top - bottom + 2 * padding)
-
-
-STRIPE_LENGTH = 0.5
-"""Length of a crossing's stripes, and of the space between them [m]."""
+    left_ends, width = np.full(sample_count, left_end), right_end - left_end
+    if width > MAX_LENGTH:
+        front, width = np.mean([body.x for body in bodies if body.is_vut], axis=0), CAMERA_LENGTH
+        left_ends = np.clip(front - width * 0.45, left_end, max(left_end, right_end - width))
+    return left_ends, bottom - padding, width, top - bottom + 2 * padding
 
 
 def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
@@ -153,9 +147,15 @@ def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArra
     return np.array([start + half_width, end + half_width, end - half_width, start - half_width])
 
 
-def crossing_stripes(lane: LaneLine) -> Iterator[FloatArray]:
-    """The stripes of a crossing, each of shape (4, 2)."""
+def lane_outlines(lane: LaneLine, width: float) -> Iterator[FloatArray]:
+    """Polygons that show a lane, shape (P, 2) each: an area, the stripes of a crossing, or strips of this width [m]."""
+    if lane.kind == "area":
+        yield lane.line
+        return
     for start, end in pairwise(lane.line):
+        if lane.kind != "crossing":
+            yield strip_corners(start, end, width)
+            continue
         direction = (end - start) / (np.hypot(*(end - start)) or 1.0)
         for distance in np.arange(STRIPE_LENGTH / 2, np.hypot(*(end - start)) - STRIPE_LENGTH, 2 * STRIPE_LENGTH):
             yield strip_corners(

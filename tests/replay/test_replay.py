@@ -24,14 +24,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene, find_ffmpeg
-from safevar_sumo.replay.comparison import (
-    COLOURS,
-    Comparison,
-    compare_setting,
-    find_moments,
-    list_differences,
-    record_film,
-)
+from safevar_sumo.replay.comparison import COLOURS, Comparison, compare_setting, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.scene import FlatScene, lay_out_scene
@@ -78,14 +71,14 @@ def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Ca
 def test_a_film_shows_what_is_simulated(study: str) -> None:
     system = assemble(load_study(study))
     settings = np.stack([system.characteristics.original, system.characteristics.lower])
-    result, plain = record_film(system, settings), simulate(system, settings)
-    for name, values in score(system, settings, plain).metrics.items():
-        assert np.array_equal(values, score(system, settings, result.runs).metrics[name], equal_nan=True)
+    result = compare_setting(load_study(study), system, system.characteristics.lower)
+    for name, values in score(system, settings, simulate(system, settings)).metrics.items():
+        assert np.array_equal(values, result.evaluations.metrics[name], equal_nan=True)
     vut = result.tracks["vut"]
     assert np.array_equal(vut.x, result.runs.trace.position)
     assert vut.length == result.runs.trace.vehicle_length
     assert not np.isnan(vut.y).any()
-    for row, end in enumerate(result.last_samples):
+    for row, (_, _, end) in enumerate(result.moments):
         assert result.runs.trace.active[end, row]
         assert not result.runs.trace.active[end + 1 :, row].any()
 
@@ -99,8 +92,8 @@ def comparison(slippery: Path) -> Comparison:
 
 
 def test_moments_of_a_drive(comparison: Comparison) -> None:
-    runs = comparison.film.runs
-    trace, original, hit = runs.trace, find_moments(runs, 0), find_moments(runs, 1)
+    runs = comparison.runs
+    trace, (original, hit) = runs.trace, comparison.moments
     assert original.braking_start is not None
     assert trace.brake[original.braking_start, 0] > 0
     assert not trace.brake[trace.time < trace.time[original.braking_start], 0].any()
@@ -116,12 +109,12 @@ def test_moments_of_a_drive(comparison: Comparison) -> None:
 
 def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -> None:
     figure = draw_comparison(comparison)
-    trace = comparison.film.runs.trace
+    trace = comparison.runs.trace
     for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
         for row, line in zip(
             comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False
         ):
-            end = comparison.film.last_samples[row] + 1
+            end = comparison.moments[row].end + 1
             assert list(line.get_xdata()) == list(trace.time[:end])
             assert list(line.get_ydata()) == list(values[:end, row])
     words = " ".join(text.get_text() for text in figure.legends[0].get_texts())
@@ -140,7 +133,7 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
         setting[system.characteristics.names.index(name)] = value
     shown, runs = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
-    trace, end = shown.film.runs.trace, shown.film.last_samples[-1]
+    trace, end = shown.runs.trace, shown.moments[-1].end
     assert shown.verdict(1).startswith("collides")
     assert runs.trace.brake[end, 0] == 0
     assert trace.brake[end, 1] == trace.brake[end - 1, 1] == runs.trace.brake[end - 1, 0] == 1
@@ -175,7 +168,7 @@ def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarra
 @pytest.mark.usefixtures("screen")
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(comparison: Comparison, tmp_path: Path) -> None:
     show_in_gui(comparison, slower=0.01, rest=0.0, pictures=tmp_path)
-    first, second = (find_moments(comparison.film.runs, row) for row in comparison.rows)
+    first, second = comparison.moments
     assert {path.stem for path in tmp_path.iterdir()} == {
         f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)
     }
@@ -208,7 +201,7 @@ def where(picture: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
 def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Comparison) -> None:
     scene = lay_out_scene(comparison)
     picture = frame(scene, 0)  # the changed vehicle stands on the original's place
-    scale = WIDTH / scene.view.width
+    scale = WIDTH / scene.width
     rows, columns = where(picture, COLOURS[0])
     vut = next(body for body in scene.bodies if body.is_vut)
     assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
@@ -216,7 +209,7 @@ def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Compari
     end = frame(scene, scene.sample_count - 1)
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
         _, columns = where(end, COLOURS[row])
-        assert columns.max() == pytest.approx((body.x[-1] - scene.view.left_ends[-1]) * scale, abs=4)
+        assert columns.max() == pytest.approx((body.x[-1] - scene.left_ends[-1]) * scale, abs=4)
 
 
 @pytest.mark.slow
@@ -232,7 +225,7 @@ def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path)
             for frame in range(image.n_frames):
                 image.seek(frame)
                 durations.append(image.info["duration"])
-        seconds = lay_out_scene(comparison).sample_count * comparison.film.runs.trace.step
+        seconds = lay_out_scene(comparison).sample_count * comparison.runs.trace.step
         assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
     if kind == "mp4":
         assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
@@ -245,7 +238,7 @@ def test_the_page_holds_every_place_to_the_centimetre(comparison: Comparison) ->
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
         assert np.allclose(shown["x"], body.x, atol=0.0051)
-    assert [drive["end"] for drive in data["drives"]] == comparison.film.last_samples.tolist()
+    assert [drive["end"] for drive in data["drives"]] == [moments.end for moments in comparison.moments]
 
 
 def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
