@@ -12,6 +12,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import Explained
@@ -97,4 +98,5 @@ def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def explained(slippery: Path) -> Explained:
     """Explanations of the failures in the results `slippery`."""
-    return explain_failures(load_cases([slippery])[0], ExplainOptions(top=3), pool=InlinePool())
+    (case,) = load_cases([slippery])
+    return explain_failures(case, ExplainOptions(top=3), Evaluator(case.study, InlinePool()))

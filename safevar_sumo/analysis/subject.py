@@ -13,13 +13,15 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.results import MANIFEST, input_differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
-from safevar_sumo.terminal import open_progress
+from safevar_sumo.terminal import Progress, open_progress
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from safevar_sumo.analysis.research_questions.case import Case
+    from safevar_sumo.campaign.pool import Pool
 
+Answer = TypeVar("Answer")
 MAX_CHANGES_NAMED = 3
 """Maximum number of changes that an error names."""
 
@@ -197,7 +199,9 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
     present = manifest_of(study, identity_of(study, system, sources))
     changes = [
-        change.text for change in input_differences(directory, manifest, present, study) if change.changes_simulations
+        text
+        for _, text, changes_simulations in input_differences(directory, manifest, present, study)
+        if changes_simulations
     ]
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
@@ -210,19 +214,32 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     return [f"{difference}; simulated as it is now" for difference in changes]
 
 
-Answer = TypeVar("Answer")
-
-
 def answer_question(
+    compute: Callable[..., Answer],
+    subject: Study | Case,
+    options: Options,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = True,
+) -> Answer:
+    """Compute the answer to a question about a subject, with an evaluator of its study."""
+    from safevar_sumo.analysis.evaluator import open_evaluator
+
+    with (
+        open_progress(progress) as show_progress,
+        open_evaluator(study_in(subject), pool, jobs, show_progress) as evaluator,
+    ):
+        return compute(subject, options, evaluator)
+
+
+def answer_call(
     compute: Callable[..., Answer], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]
 ) -> Answer:
-    """Compute the answer to a question; `arguments` are the arguments of the question's function, by name."""
+    """Answer a call of a question's function, whose `arguments` are given by name."""
     from safevar_sumo.metrics import Unsafe
 
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
-    with open_progress(arguments["progress"]) as show_progress:
-        return compute(
-            subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show_progress
-        )
+    common = {name: arguments[name] for name in ("pool", "jobs", "progress")}
+    return answer_question(compute, subject, options(**values), **common)

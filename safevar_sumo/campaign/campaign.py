@@ -128,7 +128,7 @@ def run_campaign(
     original = _baseline(study, work, results, RetryingPool(pool, study), observer)
     results.begin(original)
     sumo_work, recorded_work = works_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
-    directory, identity = results.path.absolute(), results.head("").study
+    directory, identity = results.path.absolute(), results.digest
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch / study.search.population), MAX_RUNS)
     shares = [
         Share(work, sumo_work, recorded_work, batch, tuple(dealt), directory, identity, original, retry_failed)
@@ -281,7 +281,7 @@ def _evaluate_original(
                 f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is "
                 "simulated again"
             )
-        if journal.content.evaluations is not None:
+        if journal.content.positions:
             return journal.content.evaluations
         evaluations = simulate()
         journal.append([0], evaluations, evaluations.files)

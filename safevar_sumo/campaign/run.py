@@ -153,14 +153,13 @@ class Run:
         self._has_simulated = False
         self._best: float | None = None
         self.result: Evaluations
-        if retry and journal.content.evaluations is not None and journal.content.evaluations.failed.any():
+        if retry and journal.content.evaluations.failed.any():
             journal.retry()
         stored_result = journal.content.results.get(budget)
-        if journal.content.evaluations is not None:
-            self._remember(journal.content.positions, journal.content.evaluations)
+        self._remember(journal.content.positions, journal.content.evaluations)
         if stored_result is not None:
-            self.result = journal.content.take_positions(stored_result.positions)
-            self._requested = self._replayed = stored_result.asked
+            positions, self._requested = stored_result
+            self.result, self._replayed = journal.content.take_positions(positions), self._requested
         self.is_finished = stored_result is not None
         """Whether the journal has the result."""
 

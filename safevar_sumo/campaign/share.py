@@ -20,7 +20,7 @@ from safevar_sumo.campaign.retrying import Retries, reproduction_command
 from safevar_sumo.campaign.run import Run, make_search, random_generator_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import MANIFEST, PATIENCE, Head, Journal, JournalBusyError, journal_file
+from safevar_sumo.results import MANIFEST, PATIENCE, Journal, JournalBusyError, journal_file, journal_head
 from safevar_sumo.search import Problem
 from safevar_sumo.study import user_code_names
 from safevar_sumo.sumo.matrix import MAX_COPIES
@@ -85,7 +85,9 @@ class _Carrier:
             for key in self._share.keys:
                 path = journal_file(self._share.directory, str(key))
                 try:
-                    journal = Journal(path, Head(self._share.identity, str(key), self._characteristics.names), deadline)
+                    journal = Journal(
+                        path, journal_head(self._share.identity, str(key), self._characteristics.names), deadline
+                    )
                 except JournalBusyError:
                     self._report(key)
                     continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import click
@@ -51,15 +51,15 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
                 "vehicle": study.vehicle.model,
                 "ads": study.ads.model,
                 "scenario": study.scenario.model,
-                "weather": _weather_name(study),
+                "weather": study.weather if isinstance(study.weather, str) else study.weather.name,
             }
             for study in studies
         ],
         "vehicles": [{"name": name, "characteristics": characteristics.get(name, [])} for name in VEHICLES],
-        "ads": [_name_and_description(name, cls) for name, cls in ADS.items()],
-        "scenarios": [_name_and_description(name, cls) for name, cls in SCENARIOS.items()],
+        "ads": _described(ADS),
+        "scenarios": _described(SCENARIOS),
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
-        "algorithms": [_name_and_description(name, cls) for name, cls in ALGORITHMS.items()],
+        "algorithms": _described(ALGORITHMS),
         "metrics": [
             {"name": name, "description": metric.description}
             for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
@@ -86,47 +86,48 @@ def _characteristics(studies: list[Study]) -> dict[str, CharacteristicSet]:
     return {study.vehicle.model: CharacteristicSet.of(study.vehicle.characteristics) for study in reversed(studies)}
 
 
-def _weather_name(study: Study) -> str:
-    return study.weather if isinstance(study.weather, str) else study.weather.name
-
-
-def _name_and_description(name: str, model: Callable[..., Any]) -> dict[str, str]:
-    """The name of a model, and the first line of its docstring."""
-    return {"name": name, "description": (model.__doc__ or "").strip().partition("\n")[0]}
+def _described(models: Mapping[str, Callable[..., Any]]) -> list[dict[str, str]]:
+    """The names of models, and the first lines of their docstrings."""
+    return [
+        {"name": name, "description": (model.__doc__ or "").strip().partition("\n")[0]}
+        for name, model in models.items()
+    ]
 
 
 def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[str]) -> None:
     catalogue = {key: rows if key in sections else [] for key, rows in _catalogue(studies).items()}
+
+    def show(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> None:
+        if rows:
+            print_names(console, title, rows, heads)
+
+    def texts(row: Mapping[str, Any], *keys: str) -> tuple[str, ...]:
+        return tuple(f"{row[key]:g}" for key in keys)
+
     study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]
-    if study_rows:
-        print_names(console, "Studies", study_rows, ("name", "title", "vehicle, ADS, scenario, weather"))
-    sets_by_vehicle = _characteristics(studies)
+    show("Studies", study_rows, "name", "title", "vehicle, ADS, scenario, weather")
     for vehicle in catalogue["vehicles"]:
-        rows = [
-            (row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
-            for row in vehicle["characteristics"]
-        ]
-        heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
-        print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
-        if vehicle["name"] in sets_by_vehicle:
-            print_meanings(console, sets_by_vehicle[vehicle["name"]])
-    number_keys = ("road_friction", "visibility", "recognition_delay")
+        keys = ("original", "lower", "upper", "threshold")
+        rows = [(row["name"], row["unit"], *texts(row, *keys)) for row in vehicle["characteristics"]]
+        show(f"Vehicle {vehicle['name']}", rows, "characteristic", "unit", *keys)
+        print_meanings(console, _characteristics(studies).get(vehicle["name"], ()))
     weather_rows = [
-        (row["name"], *(f"{row[key]:g}" for key in number_keys), row["light"], "wet" if row["wet"] else "dry")
+        (
+            row["name"],
+            *texts(row, "road_friction", "visibility", "recognition_delay"),
+            row["light"],
+            "wet" if row["wet"] else "dry",
+        )
         for row in catalogue["weathers"]
     ]
-    if weather_rows:
-        print_names(
-            console,
-            "Weathers",
-            weather_rows,
-            ("name", "friction", "visibility", "recognition\ndelay, s", "light", "road"),
-        )
-    for name in [row["name"] for row in catalogue["weathers"] if equals_clear(WEATHERS[row["name"]])]:
-        print_text(
-            console,
-            f"{name}: no effect on road and sensors; an ADS drives as in clear weather unless its parameters differ.",
-        )
+    show("Weathers", weather_rows, "name", "friction", "visibility", "recognition\ndelay, s", "light", "road")
+    for name, *_ in weather_rows:
+        if equals_clear(WEATHERS[name]):
+            print_text(
+                console,
+                f"{name}: no effect on road and sensors; an ADS drives as in clear weather unless its parameters "
+                "differ.",
+            )
     for title, key in (
         ("ADSs", "ads"),
         ("Scenarios", "scenarios"),
@@ -134,10 +135,7 @@ def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[
         ("Metrics", "metrics"),
         ("Objectives (every metric can also be an objective)", "objectives"),
     ):
-        if catalogue[key]:
-            print_names(
-                console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description")
-            )
+        show(title, [(row["name"], row["description"]) for row in catalogue[key]], "name", "description")
 
 
 @commands.command(name="check")

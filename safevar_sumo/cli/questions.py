@@ -16,7 +16,7 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.subject import study_in
+from safevar_sumo.analysis.subject import answer_question, study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
     PICTURE_ENDINGS,
@@ -34,8 +34,7 @@ from safevar_sumo.cli.arguments import (
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.study import Study
-from safevar_sumo.terminal import open_progress, print_answer
+from safevar_sumo.terminal import print_answer
 from safevar_sumo.vehicles import CharacteristicSet
 
 SPREADSHEET_ENDINGS = (".xlsx",)
@@ -63,21 +62,21 @@ def add_question(
     return add
 
 
-def _compute_with_bar(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
-    """Compute a result; a bar on the terminal shows the progress."""
-    with open_progress(True) as progress:
-        return compute(subject, options, jobs=jobs, progress=progress)
+def _check_plot(plot: Path | None) -> None:
+    if plot is not None:
+        check_output(plot, "--plot", PICTURE_ENDINGS)
 
 
-def _to_json(result: Any) -> str:
-    return json.dumps(result.to_dict(), indent=2, allow_nan=False)
-
-
-def _print(result: Any, as_json: bool) -> None:
+def _show(result: Any, as_json: bool, plot: Path | None = None) -> None:
+    """Print an answer, and draw its figure to a file, if one is named."""
     if as_json:
-        click.echo(_to_json(result))
+        print_json(result.to_dict())
     else:
         print_answer(Console(), result.study, result.no_verdict, result.sentences())
+    if plot is not None:
+        from safevar_sumo.analysis.figures import save
+
+        save(result.figure(), plot, "--plot")
 
 
 @add_question(
@@ -99,13 +98,13 @@ def explain(
     subject = load_results_or_study(source, point)
     if out is not None:
         make_directory(out)
-    result = _compute_with_bar(explain_failures, subject, ExplainOptions(**values), jobs)
+    result = answer_question(explain_failures, subject, ExplainOptions(**values), jobs=jobs)
     if as_json:
-        click.echo(_to_json(result))
+        print_json(result.to_dict())
     else:
         print_explained(Console(), source, result, point or "", full=full)
     if out is not None:
-        write_whole(out / "causes.json", _to_json(result) + "\n")
+        write_whole(out / "causes.json", json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
         save(result.figure(), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
@@ -119,23 +118,25 @@ def explain(
 )
 def opinion(
     source: str,
+    solutions: tuple[str, ...],
     lists: tuple[str, ...],
     handles: tuple[str, ...],
     point: str | None,
     jobs: int | None,
     as_json: bool,
-    **values: Any,
+    unsafe: str | None,
 ) -> None:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    texts = (*values.pop("solutions"), *lists, *handles)
-    options = OpinionOptions(solutions=tuple(name.strip() for text in texts for name in text.split(",")), **values)
-    result = _compute_with_bar(ask_for_opinions, load_results_or_study(source, point, results_only=True), options, jobs)
+    names = tuple(name.strip() for text in (*solutions, *lists, *handles) for name in text.split(","))
+    options = OpinionOptions(solutions=names, unsafe=unsafe)
+    subject = load_results_or_study(source, point, results_only=True)
+    result = answer_question(ask_for_opinions, subject, options, jobs=jobs)
     if as_json:
         for note in result.notes:
             print_note(note)
-    _print(result, as_json)
+    _show(result, as_json)
 
 
 @add_question(ToleranceOptions, "STUDY|DIR", file_option("--plot", "Draw the profiles to this file: png, pdf or svg."))
@@ -143,16 +144,11 @@ def tolerance(
     source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
 ) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
-    from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
     subject = load_results_or_study(source, point)
-    if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
-    result = _compute_with_bar(find_tolerances, subject, ToleranceOptions(**values), jobs)
-    _print(result, as_json)
-    if plot is not None:
-        save(result.figure(), plot, "--plot")
+    _check_plot(plot)
+    _show(answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs), as_json, plot)
 
 
 @add_question(
@@ -162,21 +158,16 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which
     characteristics decide it.
     """
-    from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
     options, subject = RiskOptions(**values), load_results_or_study(source, point)
-    study = study_in(subject)
-    if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
-    result = _compute_with_bar(estimate_risk, subject, options, jobs)
-    if study.correlations:
+    _check_plot(plot)
+    result = answer_question(estimate_risk, subject, options, jobs=jobs)
+    if result.study.correlations:
         print_note("no sensitivity indices: they are not defined for correlated characteristics")
     if result.errors:
         print_warning(f"{result.errors} vehicles could not be simulated and are left out")
-    _print(result, as_json)
-    if plot is not None:
-        save(result.figure(), plot, "--plot")
+    _show(result, as_json, plot)
 
 
 @add_question(RulesOptions, "STUDY|DIR")
@@ -186,10 +177,10 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    result = _compute_with_bar(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs)
+    result = answer_question(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs=jobs)
     if as_json and result.remark:
         print_note(result.remark)
-    _print(result, as_json)
+    _show(result, as_json)
 
 
 @commands.command(name="rating")
@@ -233,16 +224,16 @@ def rating(
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
     subject = load_results_or_study(source)
-    study = subject if isinstance(subject, Study) else subject.study
-    options = RatingOptions(changes=_read_single_changes(study, changes), solution=solution)
+    characteristics = CharacteristicSet.of(study_in(subject).vehicle.characteristics)
+    values = read_changes(changes, characteristics, beyond=False, single=True)
+    options = RatingOptions(changes={name: value for name, (value,) in values.items()}, solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:
         raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
     if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
+        _check_plot(plot)
         _refuse_existing(plot, "--plot", force)
     spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
-    with open_progress(True) as progress:
-        result = rate_variant(subject, options, jobs=jobs, progress=progress)
+    result = answer_question(rate_variant, subject, options, jobs=jobs)
     for remark in remarks(result):
         print_note(remark)
     if as_json:
@@ -259,12 +250,6 @@ def rating(
         click.echo(f"Spreadsheet of {vehicle.name}: {spreadsheet.output}", err=True)
 
 
-def _read_single_changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
-    """Parse --set into the value of each changed characteristic."""
-    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), beyond=False, single=True)
-    return {name: value for name, (value,) in values.items()}
-
-
 def _refuse_existing(path: Path, flag: str, force: bool) -> None:
     if path.exists() and not force:
         raise InputError(flag, f"{path} exists", "another file, or --force")
@@ -278,8 +263,7 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
     if source_file is None or (template is not None and (xlsx is None or preprocessed is not None)):
         problem = "a spreadsheet needs the official template, or the calculator's preprocessed file, but not both"
         raise InputError("--xlsx", problem, "--xlsx with --template or --preprocessed, or --preprocessed alone")
-    output = xlsx if xlsx is not None else source_file
-    flag = "--xlsx" if xlsx is not None else "--preprocessed"
+    output, flag = (source_file, "--preprocessed") if xlsx is None else (xlsx, "--xlsx")
     _refuse_existing(output, flag, force)
     check_output(output, flag, SPREADSHEET_ENDINGS)
     try:

@@ -23,8 +23,8 @@ from safevar_sumo.cli.program import commands, print_json, print_note, print_rem
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.reference import replication
-from safevar_sumo.reference.agreement import measure_agreement, plot_agreement, write_totals
-from safevar_sumo.reference.effects import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE, effects_of, measure_coverage
+from safevar_sumo.reference.agreement import Agreement, measure_agreement, plot_agreement, write_totals
+from safevar_sumo.reference.effects import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE, Effect, effects_of, measure_coverage
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_metrics, read_reference
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import Study, load_study
@@ -96,37 +96,36 @@ def validate(
         extras = {"effects": {name: effect._asdict() for name, effect in effects.items()}} if with_effects else {}
         extras |= {} if coverage is None else {"spread": coverage._asdict()}
         print_json({**result.to_dict(), **extras})
-        return
-    console, original = (
-        Console(),
-        {side: {name: pair[side] for name, pair in result.original.items()} for side in ("reference", "here")},
-    )
-    print_by_metric(
-        console,
-        f"{loaded_study.title}: {result.rows} rows",
-        {
-            "Spearman's rho": [result.spearman],
-            "mean abs. error": [result.mean_absolute_error],
-            "error / scatter": [result.in_repeats],
-            "bias": [result.bias],
-            "original, reference": [original["reference"]],
-            "original, here": [original["here"]],
-        },
-    )
+    else:
+        sentences = [*result.sentences(), *([] if coverage is None else [str(coverage)])]
+        _print_agreement(Console(), loaded_study.title, result, effects, sentences)
+
+
+def _print_agreement(
+    console: Console, title: str, result: Agreement, effects: Mapping[str, Effect], sentences: Sequence[str]
+) -> None:
+    """Print the agreement by metric, the effects by characteristic, if there are any, and sentences."""
+    sides = ("reference", "here")
+    columns = {
+        "Spearman's rho": [result.spearman],
+        "mean abs. error": [result.mean_absolute_error],
+        "error / scatter": [result.in_repeats],
+        "bias": [result.bias],
+        **{f"original, {side}": [{name: pair[side] for name, pair in result.original.items()}] for side in sides},
+    }
+    print_by_metric(console, f"{title}: {result.rows} rows", columns)
     if effects:
-        title = (
-            "Linear effects on the safety degree over a domain, m (agree: within "
-            f"{RELATIVE_TOLERANCE:.0%} or {ABSOLUTE_TOLERANCE:g} m)"
+        tolerance = f"within {RELATIVE_TOLERANCE:.0%} or {ABSOLUTE_TOLERANCE:g} m"
+        table = WholeTable(
+            "characteristic",
+            right=(*sides, "agree"),
+            title=f"Linear effects on the safety degree over a domain, m (agree: {tolerance})",
         )
-        table = WholeTable("characteristic", right=("reference", "here", "agree"), title=title)
-        for name, (published, here, agrees) in effects.items():
-            table.add_row(
-                name,
-                *("-" if value is None else f"{value:+.2f}" for value in (published, here)),
-                {None: "-", True: "yes", False: "no"}[agrees],
-            )
+        for name, (*values, agrees) in effects.items():
+            cells = ("-" if value is None else f"{value:+.2f}" for value in values)
+            table.add_row(name, *cells, {None: "-", True: "yes", False: "no"}[agrees])
         console.print(table)
-    for sentence in [*result.sentences(), *([] if coverage is None else [str(coverage)])]:
+    for sentence in sentences:
         console.print(sentence, markup=False)
 
 

@@ -9,12 +9,13 @@ from collections import Counter
 from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
+import numpy as np
 from rich import filesize
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
@@ -32,7 +33,9 @@ from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
-from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @commands.command()
@@ -79,10 +82,19 @@ def study(
     retry_failed: bool,
     quiet: bool,
     dry_run: bool,
-    **options: Any,
+    algorithms: str | None,
+    **numbers: int | None,
 ) -> None:
     """Search STUDY; run the same command again to continue where it stopped."""
-    loaded_study, system = load_for_search(_apply_options(load_study(study), **options), study)
+    as_written = load_study(study)
+    search = as_written.search
+    changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
+    if algorithms is not None:
+        names = [name.strip() for name in algorithms.split(",")]
+        changes["algorithms"] = [search.labels.get(name, name) for name in names]
+    loaded_study, system = load_for_search(
+        msgspec.structs.replace(as_written, search=msgspec.structs.replace(search, **changes)), study
+    )
     print_remarks(loaded_study, [*system.remarks, *vehicle_remarks(system)])
     keys = _select_runs(all_runs(loaded_study), only, shard)
     if not keys:
@@ -111,15 +123,6 @@ def study(
             print_summary(Console(), loaded_study, campaign, directory, pool)
     if not quiet:
         print_text(Console(), f"Results: {directory}")
-
-
-def _apply_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
-    """The study with its search table changed by the command's options."""
-    changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
-    if algorithms is not None:
-        names = [name.strip() for name in algorithms.split(",")]
-        changes["algorithms"] = [study.search.labels.get(name, name) for name in names]
-    return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
 
 
 def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
@@ -194,6 +197,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1
     and RQ2 in brief.
     """
+    from safevar_sumo.analysis.evaluator import Evaluator
     from safevar_sumo.analysis.explain.compute import summarise_failures
     from safevar_sumo.analysis.research_questions.case import build_case
 
@@ -210,57 +214,56 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         tuple(campaign.solutions),
         scoring=campaign.scoring,
     )
-    if campaign.no_verdict:
-        print_text(console, campaign.no_verdict)
+    answer = [campaign.no_verdict] if campaign.no_verdict else []
     if len(solutions):
         with open_progress(True) as progress:
-            lines = summarise_failures(case, campaign.original, pool, str(directory), progress)
-        for line in lines:
-            print_text(console, line)
-    original = evaluations_frame(names, [(("", 0), campaign.original)])
-    algorithms = [name for name in study.search.labels if any(key.algorithm == name for key in campaign.solutions)]
-    frames = {"original vehicle": original, **{name: solutions[solutions["algorithm"] == name] for name in algorithms}}
-    collisions = [
-        sum(count for key, count in campaign.collisions.items() if key.algorithm == name) for name in algorithms
-    ]
+            answer += summarise_failures(case, campaign.original, Evaluator(study, pool, progress), str(directory))
+    for line in answer:
+        print_text(console, line)
+    console.print(_summary_table(study, campaign, solutions))
+    lines = SAFETY_NOTE.splitlines()
+    if campaign.failures:
+        lines.append(
+            f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:"
+        )
+        lines += [f"  {line}" for line in failure_lines(campaign.failures)]
+    if invalid := sum(campaign.invalid_tests.values()):
+        lines.append(
+            f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
+            "they are neither failures nor successes, and no result contains them."
+        )
+    if solutions.empty:
+        lines.append("No solution.")
+    for worst in solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").head(1).to_dict("records"):
+        lines.append(
+            f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
+            f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:"
+        )
+        changes = change_texts(case.characteristics, {name: worst[name] for name in names})
+        lines += [f"  {change}" for change in changes or ["no change"]]
+    command = f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}"
+    for line in (*lines, *summary_lines(case), command):
+        print_text(console, line)
+
+
+def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) -> WholeTable:
+    """The original vehicle, and each algorithm's solutions: their number, collisions, and means of metrics."""
+    original = evaluations_frame(tuple(study.vehicle.characteristics), [(("", 0), campaign.original)])
+    searched = {key.algorithm for key in campaign.solutions}
+    by_algorithm = {name: solutions[solutions["algorithm"] == name] for name in study.search.labels if name in searched}
+    frames = {"original vehicle": original, **by_algorithm}
+    simulated = Counter({"original vehicle": int(campaign.original.collided[0])})
+    for key, count in campaign.collisions.items():
+        simulated[key.algorithm] += count
     table = WholeTable("", right=frames, title=study.title)
-    table.add_row("solutions", "-", *(str(len(frames[name])) for name in algorithms))
+    table.add_row("solutions", "-", *(str(len(frame)) for frame in by_algorithm.values()))
     table.add_row(
         "solutions that collide", *(str((frame["outcome"] == Outcome.COLLISION).sum()) for frame in frames.values())
     )
-    table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
+    table.add_row("collisions simulated", *(str(simulated[name]) for name in frames))
     for metric in campaign.scoring.metrics:
         table.add_row(f"mean {metric.heading}", *(two_decimals(frame[metric.name].mean()) for frame in frames.values()))
-    console.print(table)
-    console.print(SAFETY_NOTE)
-    if campaign.failures:
-        console.print(
-            f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:"
-        )
-        for line in failure_lines(campaign.failures):
-            print_text(console, f"  {line}")
-    if invalid := sum(campaign.invalid_tests.values()):
-        print_text(
-            console,
-            f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
-            "they are neither failures nor successes, and no result contains them.",
-        )
-    if solutions.empty:
-        console.print("No solution.")
-    for worst in solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").head(1).to_dict("records"):
-        print_text(
-            console,
-            f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
-            f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:",
-        )
-        changes = change_texts(
-            CharacteristicSet.of(study.vehicle.characteristics), {name: worst[name] for name in names}
-        )
-        for change in changes or ["no change"]:
-            print_text(console, f"  {change}")
-    for line in summary_lines(case):
-        print_text(console, line)
-    print_text(console, f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}")
+    return table
 
 
 MAX_FRONT_ROWS = 5
@@ -269,7 +272,7 @@ MAX_RUNS_NAMED = 12
 """Maximum number of runs under way that the view names."""
 
 
-def status_view(progress: Status, rate: float | None) -> RenderableType:
+def status_view(progress: Status, rate: float | None) -> Group:
     """The study's runs by algorithm and its front so far; `rate` is the share of all work that is done per second, None
     if unknown.
     """
@@ -281,11 +284,7 @@ def status_view(progress: Status, rate: float | None) -> RenderableType:
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
         runs = [run for run in progress.runs if run.algorithm == algorithm]
         states = Counter(run.state for run in runs)
-        counts = [
-            sum(run.simulated for run in runs),
-            sum(run.collisions for run in runs),
-            sum(run.simulator_errors for run in runs),
-        ]
+        counts = np.sum([(run.simulated, run.collisions, run.simulator_errors) for run in runs], axis=0)
         best = min((run.best for run in runs if run.best is not None), default=None)
         table.add_row(
             algorithm, f"{states['finished']}/{len(runs)}", str(states["begun"]), *map(str, counts), two_decimals(best)
@@ -297,19 +296,13 @@ def status_view(progress: Status, rate: float | None) -> RenderableType:
     under_way = f"Under way: {', '.join(begun[:MAX_RUNS_NAMED])}{rest}" if begun else ""
     left = f", {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace" if rate else ""
     done = "Finished." if progress.finished else f"{progress.share:.0%} done{left}."
-    return Group(table, Text(under_way), Text(done), _front_table(progress))
-
-
-def _front_table(progress: Status) -> RenderableType:
-    """A table of the most severe non-dominated settings."""
     if not len(progress.points):
-        return Text("Nothing simulated yet.")
+        return Group(table, Text(under_way), Text(done), Text("Nothing simulated yet."))
     front = nondominated_points(progress.points)
-    front = front[front[:, 0].argsort(kind="stable")]
-    table = WholeTable(
+    front_table = WholeTable(
         right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
         title=f"Front so far: {len(front)} points, the most severe ones",
     )
-    for f_safe, f_diff, number in front[:MAX_FRONT_ROWS].tolist():
-        table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
-    return table
+    for f_safe, f_diff, number in front[front[:, 0].argsort(kind="stable")][:MAX_FRONT_ROWS].tolist():
+        front_table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
+    return Group(table, Text(under_way), Text(done), front_table)

@@ -10,7 +10,7 @@ from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.result import Explained, Explanation
 from safevar_sumo.analysis.explain.sentences import ROBUST, counts_in_words, effect_in_words, verdict_in_words
-from safevar_sumo.analysis.opinion.compute import CauseToJudge, Opinion, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.words import number_of, points_in_words
 from safevar_sumo.errors import InputError
@@ -95,9 +95,7 @@ def make_cause_sections(data: ReportInput, explained: Explained) -> list[Section
     selection = list(distinct.values())[:MAX_CAUSES]
     opinions: tuple[Opinion | None, ...] = (None,) * len(selection)
     if selection and not reason_without_opinion(data):
-        judged = [
-            CauseToJudge(failure.name, cause.changes, cause.fraction, cause.robustness) for cause, failure in selection
-        ]
+        judged = [(failure.name, cause) for cause, failure in selection]
         opinions = judge_causes(data.case.study, judged, explained.unsafe).opinions
     return [
         _make_cause_section(data, rank, *pair, opinion)

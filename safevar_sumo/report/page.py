@@ -9,6 +9,7 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,7 @@ from safevar_sumo.analysis.research_questions.figures import draw_figures
 from safevar_sumo.analysis.research_questions.tables import BoldText, lay_out
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules
+from safevar_sumo.analysis.subject import answer_question
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
@@ -244,12 +246,11 @@ def _study_data(
     options = page_options()
     explained: Explained | None = None
     if {"verdict", "causes"} & {*sections} and len(data.case.solutions):
-        explained = explain_failures(
-            data.case, options["explain"], jobs=jobs, progress=progress, statistics="causes" in sections
-        )
+        explain = partial(explain_failures, statistics="causes" in sections)
+        explained = answer_question(explain, data.case, options["explain"], jobs=jobs, progress=progress)
     replays = replay_solutions(data, explained, progress) if "causes" in sections else []
     answers = {
-        name: compute(data.case, options[name], jobs=jobs, progress=progress)
+        name: answer_question(compute, data.case, options[name], jobs=jobs, progress=progress)
         for name, compute in DOMAIN_QUESTIONS.items()
         if name in sections
     }
@@ -298,7 +299,7 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
     case, directory, options = data.case, str(data.directory), RatingOptions()
     if data.any_unsafe:
         options = RatingOptions(solution=data.select_handles("fewest")[0])
-    rating = rate_variant(case, options, jobs=jobs, progress=progress)
+    rating = answer_question(rate_variant, case, options, jobs=jobs, progress=progress)
     available = sum(sum(matrix.points) for matrix in rating.protocol.matrices)
     return {
         "title": case.study.title,

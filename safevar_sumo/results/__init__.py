@@ -3,9 +3,9 @@
 from safevar_sumo.results.journal import (
     PATIENCE as PATIENCE,
     SPARE_POSITION as SPARE_POSITION,
-    Head as Head,
     Journal as Journal,
     JournalBusyError as JournalBusyError,
+    journal_head as journal_head,
 )
 from safevar_sumo.results.load import (
     CHOICES as CHOICES,

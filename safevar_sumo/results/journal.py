@@ -21,6 +21,7 @@ import numpy as np
 import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.manifest import FORMAT, RUNS
 
@@ -37,49 +38,32 @@ Line = dict[str, Any]
 """A line of a journal."""
 
 
-class Head(NamedTuple):
-    """What a journal belongs to: the digest of a study's identity, a run's name; and the names of the
-    characteristics.
+def journal_head(study: str, run: str, characteristics: Sequence[str]) -> Line:
+    """The first line of a journal, what it belongs to: the digest of a study's identity, a run's name; and the names of
+    the characteristics.
     """
-
-    study: str
-    run: str
-    characteristics: tuple[str, ...]
-
-    def line(self) -> Line:
-        return {"format": FORMAT, "study": self.study, "run": self.run, "characteristics": list(self.characteristics)}
-
-
-class Result(NamedTuple):
-    """Solutions of a run by the `positions` of their evaluations; the run requested `asked` evaluations."""
-
-    positions: list[int]
-    asked: int
+    return {"format": FORMAT, "study": study, "run": run, "characteristics": list(characteristics)}
 
 
 class JournalContent(NamedTuple):
-    """The contents of a journal: evaluations, or None; their positions, results by budget, and the size of a torn tail
-    [bytes].
+    """The contents of a journal: evaluations and their positions; by budget, the positions of the run's solutions and
+    the number of evaluations that it requested; and the size of a torn tail [bytes].
     """
 
     positions: list[int]
-    evaluations: Evaluations | None
-    results: Mapping[int, Result]
+    evaluations: Evaluations
+    results: Mapping[int, tuple[list[int], int]]
     tail_size: int = 0
 
     def take_positions(self, positions: Sequence[int]) -> Evaluations:
         """The evaluations at `positions`, in this order."""
-        assert self.evaluations is not None
         row_of = {position: row for row, position in enumerate(self.positions)}
         return self.evaluations.take([row_of[position] for position in positions])
 
-    def requested_within(self, budget: int) -> tuple[list[int], Evaluations | None]:
-        """Positions and evaluations that a run with this budget requested, in the order of its requests; None if there
-        is none.
-        """
-        rows = sorted((position, row) for row, position in enumerate(self.positions) if 0 <= position < budget)
-        positions = [position for position, _ in rows]
-        return positions, None if self.evaluations is None else self.evaluations.take([row for _, row in rows])
+    def requested_within(self, budget: int) -> tuple[list[int], Evaluations]:
+        """Positions and evaluations that a run with this budget requested, in the order of its requests."""
+        positions = sorted(position for position in self.positions if 0 <= position < budget)
+        return positions, self.take_positions(positions)
 
 
 class JournalBusyError(SafevarError):
@@ -94,7 +78,7 @@ class Journal:
     path
         The file, made if it does not exist. A journal without evaluations passes to this owner.
     head
-        The owner of the journal.
+        The owner of the journal, as `journal_head` names it.
     deadline
         Time of `time.monotonic` until which another process may end that holds the lock.
 
@@ -111,11 +95,11 @@ class Journal:
         If the journal belongs to another study or is damaged before its tail.
     """
 
-    def __init__(self, path: Path, head: Head, deadline: float = 0.0) -> None:
-        self.path = path
+    def __init__(self, path: Path, head: Line, deadline: float = 0.0) -> None:
+        self.path, self._head = path, head
         self._file = _open_and_lock(path, deadline)
         try:
-            self.content = self._read_and_claim(head)
+            self.content = self._read_and_claim()
         except OSError as error:
             self._file.close()
             raise SafevarError(f"{path}: cannot be read: {error.strerror}; earlier data stays valid") from None
@@ -129,7 +113,7 @@ class Journal:
         """Add a batch; `files` are digests of files that user code has read for the first time."""
         if files:
             self._write({FILES_READ: dict(files)})
-        self._write(_batch_line(positions, evaluations, self._characteristics))
+        self._write(_batch_line(positions, evaluations, self._head["characteristics"]))
 
     def finish(self, positions: Sequence[int], asked: int, budget: int) -> None:
         """Add the result: the positions of the solutions, the number of requested evaluations, and their allowed
@@ -141,18 +125,17 @@ class Journal:
         """Drop failed evaluations, and results based on them."""
         self._write({"retry": True})
         self._file.seek(0)
-        self.content = _content_of(_parse(self._file.read(), self.path)[0], self.path)
+        self.content = _content_of(_parse(self._file.read(), self.path)[0], self.path, self._head)
 
     def close(self) -> None:
         """Release the lock."""
         self._file.close()
 
-    def _read_and_claim(self, head: Head) -> JournalContent:
+    def _read_and_claim(self) -> JournalContent:
         """Read the contents, cut off a torn tail, and write the head into a journal without evaluations."""
-        self._characteristics = head.characteristics
         data = self._file.read()
         lines, end = _parse(data, self.path)
-        if lines and lines[0] != head.line():
+        if lines and lines[0] != self._head:
             if any(POSITION in line for line in lines):
                 raise InputError(self.path, ANOTHER_OWNER, "another `out`")
             lines, end, data = [], 0, b""
@@ -160,8 +143,8 @@ class Journal:
         if end < len(data):
             self._truncate(end)
         if not lines:
-            self._write(head.line())
-        return _content_of(lines, self.path)._replace(tail_size=len(data) - end)
+            self._write(self._head)
+        return _content_of(lines, self.path, self._head)._replace(tail_size=len(data) - end)
 
     def _write(self, line: Line, *, sync: bool = False) -> None:
         start = self._file.tell()
@@ -183,7 +166,7 @@ class Journal:
         self._file.seek(end)
 
 
-def read_journal(path: Path, head: Head) -> JournalContent:
+def read_journal(path: Path, head: Line) -> JournalContent:
     """The contents of a journal that another process may be writing.
 
     Raises
@@ -196,9 +179,9 @@ def read_journal(path: Path, head: Head) -> JournalContent:
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     lines, end = _parse(data, path)
-    if lines and lines[0] != head.line():
+    if lines and lines[0] != head:
         raise InputError(path, ANOTHER_OWNER, "only journals of this study")
-    return _content_of(lines, path)._replace(tail_size=len(data) - end)
+    return _content_of(lines, path, head)._replace(tail_size=len(data) - end)
 
 
 def files_read_later(directory: Path) -> dict[str, str]:
@@ -304,30 +287,29 @@ def _evaluations_of(line: Line, characteristics: Sequence[str]) -> Evaluations:
     )
 
 
-def _content_of(lines: Sequence[Line], path: Path) -> JournalContent:
+def _content_of(lines: Sequence[Line], path: Path, head: Line) -> JournalContent:
     """The contents of a journal from its lines in order."""
-    positions: list[int] = []
-    batches: list[Evaluations] = []
-    results: dict[int, Result] = {}
+    characteristics, positions, results = head["characteristics"], list[int](), dict[int, tuple[list[int], int]]()
+    empty = Evaluations.none(len(characteristics), METRICS)
+    batches = list[Evaluations]()
     try:
         for line in lines:
             if POSITION in line:
                 positions += line[POSITION]
-                batches.append(_evaluations_of(line, lines[0]["characteristics"]))
+                batches.append(_evaluations_of(line, characteristics))
             elif "solutions" in line:
-                results[line["budget"]] = Result(line["solutions"], line["asked"])
+                results[line["budget"]] = (line["solutions"], line["asked"])
             elif "retry" in line and batches:
                 positions, remaining_evaluations = _drop_failures(positions, Evaluations.concatenate(batches))
                 batches, results = [remaining_evaluations], {}
-        return JournalContent(positions, Evaluations.concatenate(batches) if positions else None, results)
+        return JournalContent(positions, Evaluations.concatenate(batches) if positions else empty, results)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(path, f"was edited: {error!r}", UNDAMAGED) from None
 
 
 def _drop_failures(positions: Sequence[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
     """Positions and evaluations that a run keeps when its failed settings are simulated again."""
-    has_succeeded = ~evaluations.failed
-    pairs = list(zip(positions, has_succeeded, strict=True))
-    first_failure = min(position for position, success in pairs if not success)
-    new_positions = [position if position < first_failure else SPARE_POSITION for position, success in pairs if success]
-    return new_positions, evaluations.take(has_succeeded)
+    has_succeeded, array = ~evaluations.failed, np.array(positions)
+    first_failure = array[~has_succeeded].min()
+    kept = array[has_succeeded]
+    return np.where(kept < first_failure, kept, SPARE_POSITION).tolist(), evaluations.take(has_succeeded)

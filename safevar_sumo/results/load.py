@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.results.journal import Head, JournalContent, read_journal
+from safevar_sumo.results.journal import JournalContent, journal_head, read_journal
 from safevar_sumo.results.manifest import MANIFEST, identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
@@ -148,7 +148,7 @@ def _read_journals(
     digest = identity_digest(manifest)
     for algorithm, run in runs:
         path = journal_file(folder, run_name(algorithm, run))
-        content = read_journal(path, Head(digest, path.stem, characteristics)) if path.exists() else None
+        content = read_journal(path, journal_head(digest, path.stem, characteristics)) if path.exists() else None
         yield algorithm, run, content
 
 
@@ -168,14 +168,14 @@ def load_runs(directory: str | Path) -> StoredResults:
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
     evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], list[int](), list[Failure]()
     for algorithm, run, content in _read_journals(folder, manifest, runs, characteristics):
-        if content is not None and content.tail_size and budget not in content.results:
+        if content is None:
+            continue
+        if content.tail_size and budget not in content.results:
             warn(
                 f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
                 "so the run counts as unfinished; running the same study again simulates the lost evaluations"
             )
-        positions, evaluations = content.requested_within(budget) if content is not None else ([], None)
-        if content is None or evaluations is None:
-            continue
+        positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
         failures += [
@@ -183,7 +183,7 @@ def load_runs(directory: str | Path) -> StoredResults:
             for i in np.flatnonzero(evaluations.failed).tolist()
         ]
         if budget in content.results:
-            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget].positions)))
+            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget][0])))
     frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)
     solutions = solutions_frame(characteristics, solutions_of_runs)
@@ -206,42 +206,31 @@ def status(directory: str | Path) -> Status:
     if "imported" in manifest:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     runs, budget, characteristics = _read_search(folder, manifest)
-    summaries = [
-        _summarise_run(*journal, budget) for journal in _read_journals(folder, manifest, runs, characteristics)
-    ]
+    statuses, points = list[RunStatus](), [np.zeros((0, 3))]
+    for algorithm, run, content in _read_journals(folder, manifest, runs, characteristics):
+        if content is None:
+            statuses.append(RunStatus(algorithm, run, "waiting", 0, 0, 0, best=None))
+            continue
+        _, evaluations = content.requested_within(budget)
+        valid = evaluations.take(evaluations.valid)
+        points.append(valid.objectives)
+        statuses.append(
+            RunStatus(
+                algorithm,
+                run,
+                "finished" if budget in content.results else "begun",
+                simulated=len(evaluations),
+                collisions=int(np.count_nonzero(evaluations.collided)),
+                simulator_errors=int(np.count_nonzero(evaluations.failed)),
+                best=float(np.min(valid.f_safe)) if len(valid) else None,
+            )
+        )
     return Status(
         study=str(manifest["study"].get("name")),
         title=str(manifest["study"].get("title")),
         budget=budget,
-        runs=tuple(run for run, _ in summaries),
-        points=np.concatenate([objectives for _, objectives in summaries]),
-    )
-
-
-def _summarise_run(
-    algorithm: str, run: int, content: JournalContent | None, budget: int
-) -> tuple[RunStatus, np.ndarray]:
-    """Progress of a run, and objectives of its valid evaluations."""
-    _, evaluations = content.requested_within(budget) if content is not None else ([], None)
-    if content is None or evaluations is None:
-        state = "waiting" if content is None else "begun"
-        return RunStatus(algorithm, run, state, simulated=0, collisions=0, simulator_errors=0, best=None), np.zeros(
-            (0, 3)
-        )
-    valid_evaluations = evaluations.take(evaluations.valid)
-    state = "finished" if budget in content.results else "begun"
-    best = float(np.min(valid_evaluations.f_safe)) if len(valid_evaluations) else None
-    return (
-        RunStatus(
-            algorithm,
-            run,
-            state,
-            simulated=len(evaluations),
-            collisions=int(np.count_nonzero(evaluations.collided)),
-            simulator_errors=int(np.count_nonzero(evaluations.failed)),
-            best=best,
-        ),
-        valid_evaluations.objectives,
+        runs=tuple(statuses),
+        points=np.concatenate(points),
     )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
@@ -121,19 +121,6 @@ def write_whole(path: Path, text: str) -> None:
         raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None
 
 
-class Difference(NamedTuple):
-    """A difference between stored and present inputs in words; its layer of `IDENTITY`; and whether it may change
-    simulations.
-
-    Other search libraries and machines, other versions of this package with the same `RESULTS`, and new keys of a study
-    do not.
-    """
-
-    layer: str
-    text: str
-    changes_simulations: bool
-
-
 def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     """The manifest of a study as it is run, without the original vehicle's evaluation.
 
@@ -170,15 +157,17 @@ def identity_digest(manifest: Mapping[str, Any]) -> str:
     return sha256(json.dumps({layer: manifest.get(layer) for layer in IDENTITY}, sort_keys=True).encode()).hexdigest()
 
 
-def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[Difference]:
-    """The differences between the inputs of stored results and other inputs."""
+def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, str, bool]]:
+    """The differences between the inputs of stored results and other inputs.
+
+    Each is its layer of `IDENTITY`, a text, and whether it may change simulations: other search libraries and machines,
+    other versions of this package with the same `RESULTS`, and new keys of a study do not.
+    """
     for layer in IDENTITY:
         for key, before, after in _changed_values(stored.get(layer, {}), now.get(layer, {})):
             if layer in LAYERS_OF_FILES:
-                text = (
-                    f"{key} "
-                    f"{'no longer exists' if after is None else 'is new' if before is None else 'has changed since'}"
-                )
+                change = "no longer exists" if after is None else "is new" if before is None else "has changed since"
+                text = f"{key} {change}"
             else:
                 name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
                 text = f"{name} was {before!r} and is {after!r} now"
@@ -187,7 +176,7 @@ def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[D
                 or (layer == "versions" and key not in SIMULATORS)
                 or (layer == "resolved" and before is None)
             )
-            yield Difference(layer, text, not is_harmless)
+            yield layer, text, not is_harmless
 
 
 def search_extent_of(manifest: Mapping[str, Any]) -> Any:

@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import digest_of, file_by_name
 from safevar_sumo.records import Evaluations, finite_or_none
-from safevar_sumo.results.journal import Head, Journal, JournalBusyError, files_read_later, read_journal
+from safevar_sumo.results.journal import Journal, JournalBusyError, files_read_later, journal_head, read_journal
 from safevar_sumo.results.manifest import (
     FORMAT,
     IDENTITY,
@@ -25,7 +25,6 @@ from safevar_sumo.results.manifest import (
     MANIFEST,
     RUNS,
     SOLUTIONS,
-    Difference,
     differences,
     identity_digest,
     journal_file,
@@ -80,17 +79,21 @@ class ResultsDirectory:
         """Digests, by layer, of the files that all workers must share."""
         self.inputs["sources"] = {**self.inputs["sources"], **_later_files(path, study)}
 
-    def head(self, run: str) -> Head:
-        """The head of the journal of a run, such as nsga2-03."""
-        return Head(identity_digest(self.manifest), run, tuple(self._study.vehicle.characteristics))
+    @property
+    def digest(self) -> str:
+        """The digest of the study's identity."""
+        return identity_digest(self.manifest)
 
     def journal(self, run: str) -> Journal:
-        """Open and lock the journal of a run."""
-        path = journal_file(self.path, run)
+        """Open and lock the journal of a run, such as nsga2-03."""
+        path, head = (
+            journal_file(self.path, run),
+            journal_head(self.digest, run, [*self._study.vehicle.characteristics]),
+        )
         try:
-            return Journal(path, self.head(run))
+            return Journal(path, head)
         except JournalBusyError:
-            read_journal(path, self.head(run))  # refuses the journal of another study
+            read_journal(path, head)  # refuses the journal of another study
             raise
 
     def begin(self, original: Evaluations) -> None:
@@ -127,8 +130,8 @@ class ResultsDirectory:
 
 def input_differences(
     directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any], study: Study
-) -> list[Difference]:
-    """The differences between the stored inputs of a directory's results, with files that were first read later, and
+) -> list[tuple[str, str, bool]]:
+    """The `differences` between the stored inputs of a directory's results, with files that were first read later, and
     present inputs.
     """
     later = _later_files(directory, study)

@@ -117,11 +117,11 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles_of(case.solutions)[safe])
     (one,) = explain_failures(
-        case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=InlinePool()
+        case, ExplainOptions(solutions=(handle,), unsafe="collision"), Evaluator(case.study, InlinePool())
     ).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("requested",))
     with pytest.raises(InputError, match="nsga2:7:0"):
-        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), pool=InlinePool())
+        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), Evaluator(case.study, InlinePool()))
 
 
 def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
@@ -175,7 +175,9 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
     """It is the answer of `explain`: the same failures, the same cause of each."""
     original = Evaluator(case.study, InlinePool()).evaluate_original()
-    paragraph, count, *others, more = summarise_failures(case, original, InlinePool(), "my results")
+    paragraph, count, *others, more = summarise_failures(
+        case, original, Evaluator(case.study, InlinePool()), "my results"
+    )
     assert_tells_a_manager(paragraph, explained)
     assert [paragraph, count] == explained.sentences()[:2]
     assert len(others) >= len(explained.choices)
@@ -200,7 +202,7 @@ def test_where_nothing_collides_the_verdict_says_so_first(case: Case, share: flo
     safe = case.solutions[case.solutions["f_safe"] > share * degree].reset_index(drop=True)
     for few in (safe, safe[safe["f_safe"] < 0.9 * degree].reset_index(drop=True)):
         screened = replace(case, solutions=few)
-        first, count, *_, more = summarise_failures(screened, original, InlinePool(), "out")
+        first, count, *_, more = summarise_failures(screened, original, Evaluator(case.study, InlinePool()), "out")
         distinct = few.drop_duplicates(list(case.characteristics.names))
         assert first.startswith(
             f"No collision in {len(distinct)} vehicles; the worst stops {few['f_safe'].min():.2f} m short of the "

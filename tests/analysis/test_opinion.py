@@ -17,7 +17,9 @@ import pytest
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-from safevar_sumo.analysis.opinion.compute import CauseToJudge, Verdict, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.explain.causes import Cause
+from safevar_sumo.analysis.explain.robustness import Robustness
+from safevar_sumo.analysis.opinion.compute import Verdict, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.opinion.multi_body import (
     MultiBodyState,
     Plant,
@@ -38,6 +40,19 @@ from safevar_sumo.vehicles import LEVEL, VEHICLES
 from tests.in_process import run
 
 ONE = np.ones(1)
+
+
+def judged(solution: str, changes: dict[str, float], fraction: float, robustness: float) -> tuple[str, Cause]:
+    """A cause of a solution, as `explain` finds it."""
+    return solution, Cause(
+        changes=changes,
+        boundary={},
+        fraction=fraction,
+        alone={},
+        outcome="collision",
+        safety_degree=None,
+        neighbours=Robustness({0.05: robustness}),
+    )
 
 
 def bmw() -> Plant:
@@ -78,7 +93,7 @@ def test_the_right_hand_side_is_the_packages(seed: int) -> None:
         ),
     )
     torques = np.stack([share * torque, (1 - share) * torque])
-    speed, heights, wheels = derivatives(bmw(), body, torques, tyre_forces(bmw(), body).force)
+    speed, heights, wheels = derivatives(bmw(), body, torques, tyre_forces(bmw(), body)[0])
     flat = np.concatenate([speed, *heights, *wheels])
     assert flat == pytest.approx([theirs[column] for column in (3, 12, 9, 17, 22, 23, 25)], rel=1e-9)
 
@@ -224,10 +239,7 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(
             "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows},
         }
     )
-    causes = [
-        CauseToJudge("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0),
-        CauseToJudge("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0),
-    ]
+    causes = [judged("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0), judged("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0)]
     planted, true = judge_causes(study, causes, Unsafe()).opinions
     assert msgspec.to_builtins(planted) | {"because": ""} == {
         "solution": "nsga2:0:0",
@@ -275,7 +287,7 @@ def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatc
     """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at
     8 m/s.
     """
-    cause = CauseToJudge("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
+    cause = judged("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
     (calm,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
     monkeypatch.setattr("safevar_sumo.analysis.opinion.multi_body.TRACTION_SHARE", np.inf)
     (spinning,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
@@ -288,7 +300,7 @@ def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatc
 def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> None:
     """In ours by its robustness; in the second by the neighbours, here of the smallest change at which it collides."""
     study = load_study("rain")
-    (here,) = judge_causes(study, [CauseToJudge(None, WORN_TYRES, 0.99, 0.79)], Unsafe()).opinions
+    (here,) = judge_causes(study, [judged("nsga2:0:0", WORN_TYRES, 0.99, 0.79)], Unsafe()).opinions
     assert (here.opinion, here.because.split(";")[0]) == (
         "borderline",
         "with our model borderline: only 79 % of the neighbours are unsafe too",
@@ -299,7 +311,7 @@ def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> No
     runs = evaluate(replace(system, vehicle=vehicle), settings)
     least = float(frictions[runs.collided].max())
     (there,) = judge_causes(
-        study, [CauseToJudge(None, {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)], Unsafe()
+        study, [judged("nsga2:0:0", {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)], Unsafe()
     ).opinions
     assert (there.opinion, there.there.outcome) == ("borderline", "collision")
     assert re.match(r"with the second model only \d\d% of the neighbours are unsafe, too; also unsafe", there.because)

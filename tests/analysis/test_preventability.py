@@ -260,7 +260,7 @@ def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
     case = build_case(study, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
-    first, count, there, *_, more = summarise_failures(case, original, InlinePool(), "out")
+    first, count, there, *_, more = summarise_failures(case, original, Evaluator(case.study, InlinePool()), "out")
     assert first == (
         "At the worst of 5 test points, the original vehicle passes with a safety degree of "
         f"{original.f_safe[0]:.2f} m."
@@ -272,7 +272,7 @@ def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
         f"At {failure[0].point}, the original vehicle stops {degree:.2f} m short of the pedestrian. "
     )
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure[0].point}'")
-    whole = explain_failures(case, ExplainOptions(), pool=InlinePool(), statistics=False)
+    whole = explain_failures(case, ExplainOptions(), Evaluator(case.study, InlinePool()), statistics=False)
     tolerated = Tolerance(
         study=study,
         unsafe=Unsafe(),

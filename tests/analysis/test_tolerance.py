@@ -144,13 +144,13 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
         [("rs", 0)],
     )
     pool = Plant(study, sliver)
-    assert find_tolerances(study, ToleranceOptions(unsafe="collision"), pool=pool).joint.factor == pytest.approx(
-        1, abs=0.01
-    )
-    result = find_tolerances(case, ToleranceOptions(), pool=pool)
+    assert find_tolerances(
+        study, ToleranceOptions(unsafe="collision"), Evaluator(study, pool)
+    ).joint.factor == pytest.approx(1, abs=0.01)
+    result = find_tolerances(case, ToleranceOptions(), Evaluator(study, pool))
     assert str(result.unsafe) == "collision", "as the solutions do, and as `explain` takes it"
     assert 0.49 < result.joint.factor < 0.5
-    two = find_tolerances(case, ToleranceOptions(characteristics=("a", "b")), pool=pool)
+    two = find_tolerances(case, ToleranceOptions(characteristics=("a", "b")), Evaluator(study, pool))
     assert two.joint.factor == 1, "the solution changes others as well"
 
 

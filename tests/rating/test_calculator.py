@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
+from safevar_sumo.analysis.evaluator import open_evaluator
+from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating, rate
 from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Rater
-from safevar_sumo.records import CellResults
-from safevar_sumo.study import load_study
+from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.rating.calculator import Calculator
 
@@ -33,6 +34,11 @@ def calculator(tmp_path_factory: pytest.TempPathFactory) -> Calculator:
 @pytest.fixture(scope="module")
 def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return calculator.template(tmp_path_factory.mktemp("template"))
+
+
+def rating_of(study: Study, settings: dict[str, FloatArray]) -> Rating:
+    with open_evaluator(study) as evaluator:
+        return rate(evaluator, settings)
 
 
 def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: Path) -> None:
@@ -106,8 +112,8 @@ def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(
         },
         "worst",
     )
-    result = rate(study, {"half": characteristics.setting({"brakeTorque": 0.5}, "half"), "worst": worst})
-    idle = rate(load_study(study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
+    result = rating_of(study, {"half": characteristics.setting({"brakeTorque": 0.5}, "half"), "worst": worst})
+    idle = rating_of(load_study(study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
     for number, vehicle in enumerate([*result.vehicles, idle.original]):
         agrees(vehicle, calculator, template, tmp_path / str(number))
     assert result.original.points > result.vehicles[1].points > result.vehicles[2].points
@@ -145,7 +151,9 @@ GAIN = {
 
 def test_a_layer_may_be_gained_where_its_cell_is_lost() -> None:
     """The case that docs/rating.md explains, with its numbers."""
-    rating = rate(STUDY, {str(tread): MEMBERS.setting({**GAIN, "treadDepth": tread}, "it") for tread in (5.1, 4.2)})
+    rating = rating_of(
+        STUDY, {str(tread): MEMBERS.setting({**GAIN, "treadDepth": tread}, "it") for tread in (5.1, 4.2)}
+    )
     newer, older = rating.vehicles[1:]
     before, after = (next(test for test in one.tests if test.matrix.name == "CPNCO day") for one in (newer, older))
     assert [round(one.points, 2) for one in (newer, older)] == [33.64, 32.64]

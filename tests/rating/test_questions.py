@@ -54,7 +54,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     result = find_tolerances(
-        STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=TwoWorkers()
+        STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), Evaluator(STUDY, TwoWorkers())
     )
     (scan,) = result.alone
     assert scan.points is not None
@@ -91,13 +91,13 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     lost = points - float(evaluations.column("rating_points")[1])
     assert lost > 0
     result = explain_failures(
-        case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=TwoWorkers()
+        case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), evaluator
     )
     (failure,) = result.explanations
     assert failure.points
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
-    lines = summarise_failures(case, original, TwoWorkers(), "it")
+    lines = summarise_failures(case, original, evaluator, "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
 

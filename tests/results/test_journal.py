@@ -18,14 +18,14 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Head, Journal, JournalBusyError
-from safevar_sumo.results.journal import SPARE_POSITION, JournalContent, Result, read_journal
+from safevar_sumo.results import Journal, JournalBusyError, journal_head
+from safevar_sumo.results.journal import SPARE_POSITION, JournalContent, read_journal
 
 BATCHES = 4
 ROWS = 3
 RESULT = [1, 5]
 BUDGET = 99
-HEAD = Head("study", "nsga2-00", ("a", "b"))
+HEAD = journal_head("study", "nsga2-00", ("a", "b"))
 in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
 
 
@@ -81,9 +81,9 @@ def holds_the_first(batches: int, content: JournalContent) -> bool:
     """Whether the journal holds exactly the first batches."""
     positions, evaluations, *_ = content
     if not batches:
-        return positions == [] and evaluations is None
+        return positions == [] and len(evaluations) == 0
     expected = Evaluations.concatenate([batch(number) for number in range(batches)])
-    return evaluations is not None and positions == list(range(ROWS * batches)) and same(evaluations, expected)
+    return positions == list(range(ROWS * batches)) and same(evaluations, expected)
 
 
 def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
@@ -91,14 +91,13 @@ def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
     write(path)
     journal = Journal(path, HEAD)
     assert holds_the_first(BATCHES, journal.content)
-    assert journal.content.results == {BUDGET: Result(RESULT, asked=99)}
+    assert journal.content.results == {BUDGET: (RESULT, 99)}
     assert journal.content.tail_size == 0
     journal.close()
     content = read_journal(path, HEAD)
     assert holds_the_first(BATCHES, content)
-    assert content.results == {BUDGET: Result(RESULT, asked=99)}
+    assert content.results == {BUDGET: (RESULT, 99)}
     _, first = content.requested_within(ROWS)
-    assert first is not None
     assert same(first, batch(0)), "positions count from 0: the first three"
 
 
@@ -185,13 +184,13 @@ def test_a_journal_of_another_study_or_run_is_refused(
 ) -> None:
     write(tmp_path / "a.jsonl")
     with pytest.raises(InputError, match="belongs to another study, version or run"):
-        opened(tmp_path / "a.jsonl", Head(study, run, ("a", "b")))
+        opened(tmp_path / "a.jsonl", journal_head(study, run, ("a", "b")))
 
 
 def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
-    code = "from safevar_sumo.results import Head, Journal\nfrom pathlib import Path\n"
-    code += f"J = Journal(Path({str(path)!r}), Head{tuple(HEAD)})\n"
+    code = "from safevar_sumo.results import Journal\nfrom pathlib import Path\n"
+    code += f"J = Journal(Path({str(path)!r}), {HEAD})\n"
     code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert other.stdout is not None
@@ -210,7 +209,6 @@ def test_evaluations_after_a_failure_are_spare_after_a_retry(tmp_path: Path) -> 
     journal.retry()
     for content in (journal.content, read_journal(path, HEAD)):
         assert content.positions == [0, 1, SPARE_POSITION, SPARE_POSITION], "the third and the sixth have failed"
-        assert content.evaluations is not None
         assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3, 10 / 3, 11 / 3]
         assert content.results == {}
     journal.close()

@@ -147,8 +147,7 @@ def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_ke
 
     def changed(**layers: object) -> list[tuple[str, bool]]:
         return [
-            (difference.text, difference.changes_simulations)
-            for difference in differences(stored, {**stored, **layers})
+            (text, changes_simulations) for _, text, changes_simulations in differences(stored, {**stored, **layers})
         ]
 
     assert changed(resolved={"a": 1, "b": False}, versions={"numpy": "2", "libsumo": "1"}) == [

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
 from safevar_sumo.analysis.explain.causes import (
@@ -35,9 +35,8 @@ from safevar_sumo.analysis.explain.sentences import (
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
 from safevar_sumo.analysis.rating.render import summarise_rated_solutions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.subject import at_point, study_in
+from safevar_sumo.analysis.subject import at_point
 from safevar_sumo.analysis.words import question_command
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
@@ -46,7 +45,6 @@ from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, choose_handle, ha
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import PointResult, simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import Progress, show_no_progress
 
 CausesByRow = Mapping[int, list[MinimalCause]]
 """The minimal causes of settings, by the setting's row."""
@@ -57,13 +55,7 @@ SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
 
 
 def explain_failures(
-    source: Study | Case,
-    options: ExplainOptions,
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-    statistics: bool = True,
+    source: Study | Case, options: ExplainOptions, evaluator: Evaluator, *, statistics: bool = True
 ) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings drawn from a study's whole
     domain.
@@ -73,48 +65,42 @@ def explain_failures(
     Raises
     ------
     InputError
-        If `unsafe` or a handle cannot be read, a handle is no solution of the results, or the study cannot be
-        assembled.
+        If `unsafe` or a handle cannot be read, or a handle is no solution of the results.
     """
-    study = study_in(source)
-    with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
-        original = evaluator.evaluate_original()
-        found = _evaluate(source, options, evaluator, original, unsafe)
-        limit = options.limit // len(assemble(study).points)  # an evaluation simulates a setting at every point
-        settings, characteristics = found.evaluations.settings, evaluator.characteristics
-        sample = (
-            found.rows
-            if options.solutions
-            else []
-            if not statistics
-            else [found.rows[index] for index in select_affordable_rows(settings[found.rows], evaluator, limit)]
-        )
-        requested: Reasons = {row: ("requested",) for row in found.rows}
-        reasons = requested if options.solutions else _choose_rows(found, evaluator, original, limit)
-        analysed = sorted({*sample, *reasons})
-        causes = dict(zip(analysed, find_minimal_causes(evaluator, settings[analysed], found.unsafe), strict=True))
-        if not options.solutions:
-            reasons = _add_distinct_causes(found, evaluator, sample, reasons, causes, options.top)
-        explanations = _explain_rows(found, evaluator, original, causes, reasons)
-        preventable = assess_preventability(evaluator, _collisions(study, found.evaluations))
-        no_verdict = evaluator.no_verdict
-    sample_causes, changed = [causes[row] for row in sample], characteristics.changed(settings[sample])
-    nearest = np.argsort(found.evaluations.f_safe, kind="stable")[:1]
+    study, characteristics = evaluator.study, evaluator.characteristics
+    unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
+    original = evaluator.evaluate_original()
+    found = _evaluate(source, options, evaluator, original, unsafe)
+    limit = options.limit // len(assemble(study).points)  # an evaluation simulates a setting at every point
+    settings, sample, reasons = found.evaluations.settings, list[int](), Reasons()
+    if options.solutions:
+        sample, reasons = found.rows, {row: ("requested",) for row in found.rows}
+    else:
+        if statistics:
+            affordable = select_affordable_rows(settings[found.rows], evaluator, limit)
+            sample = [found.rows[index] for index in affordable]
+        reasons = _choose_rows(found, evaluator, original, limit)
+    analysed = sorted({*sample, *reasons})
+    causes = dict(zip(analysed, find_minimal_causes(evaluator, settings[analysed], found.unsafe), strict=True))
+    if not options.solutions:
+        reasons = _add_distinct_causes(found, evaluator, sample, reasons, causes, options.top)
+    sample_causes = [causes[row] for row in sample]
     return Explained(
         study=study,
         unsafe=found.unsafe,
         original=original,
-        nearest=found.evaluations.take(nearest),
-        explanations=explanations,
-        necessity=necessity_frame(characteristics, changed, sample_causes, len(found.rows)),
+        nearest=found.evaluations.take(np.argsort(found.evaluations.f_safe, kind="stable")[:1]),
+        explanations=_explain_rows(found, evaluator, original, causes, reasons),
+        necessity=necessity_frame(
+            characteristics, characteristics.changed(settings[sample]), sample_causes, len(found.rows)
+        ),
         distinct=count_distinct_causes(characteristics, sample_causes),
         looked_at=len(found.evaluations),
         failures=len(found.rows),
         analysed=len(sample),
         otherwise=found.deviations,
-        preventability=preventable,
-        no_verdict=no_verdict,
+        preventability=assess_preventability(evaluator, _collisions(study, found.evaluations)),
+        no_verdict=evaluator.no_verdict,
     )
 
 
@@ -293,9 +279,7 @@ def _compare_runs(result: PointResult, row: int, point: str) -> BrakingCompariso
     return compare_braking(original_run, changed_run, point)
 
 
-def summarise_failures(
-    case: Case, original: Evaluations, pool: Pool, directory: str, progress: Progress = show_no_progress
-) -> list[str]:
+def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, directory: str) -> list[str]:
     """Summarise results in lines: the verdict first, the command for the next step last; no line without a solution.
 
     Of a matrix, the failures are those at the worst point of the failure with the fewest changes.
@@ -304,7 +288,7 @@ def summarise_failures(
     ----------
     original
         The original vehicle's evaluation.
-    pool
+    evaluator
         Simulates subsets of the solutions' changes.
     directory
         The directory of the results, for the command.
@@ -321,7 +305,7 @@ def summarise_failures(
         choices = ("most_severe", *(["fewest"] if any_unsafe else []))
         handles = [choose_handle(solutions, unsafe, choice, study.name) for choice in choices]
         rows = solutions.iloc[[row_of_handle(solutions, handle) for handle in handles]]
-        evaluations = Evaluator(study, pool, progress).evaluate(rows[names].to_numpy(float), "worst points")
+        evaluations = evaluator.evaluate(rows[names].to_numpy(float), "worst points")
         count = int(unsafe.rows(distinct).sum())
         lines = [
             situation_in_words(system, original, evaluations.take([0]), len(distinct)),
@@ -331,7 +315,7 @@ def summarise_failures(
             point = system.points[evaluations.worst_points[1]].name
             case = at_point(case, point)
     if point or not system.matrix:
-        explained = explain_failures(case, ExplainOptions(), pool=pool, progress=progress, statistics=False)
+        explained = explain_failures(case, ExplainOptions(), evaluator.for_study(case.study), statistics=False)
         verdict, counts = " ".join(verdict_in_words(explained)), counts_in_words(explained)
         lines += [verdict, f"{'There, ' if point else ''}{counts}", *choices_in_words(explained)]
     if not any_unsafe:

@@ -5,15 +5,17 @@ sentences.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.robustness import draw_neighbours, is_borderline, robustness_in_words
 from safevar_sumo.analysis.opinion import OpinionOptions
@@ -21,10 +23,9 @@ from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.sumo.matrix import evaluate
@@ -59,7 +60,7 @@ class Opinion(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     solution
-        The handle of the failure with this cause; None for a cause without a failure.
+        The handle of the failure with this cause.
     changes
         The cause: values by name, in their units.
     here, there
@@ -68,7 +69,7 @@ class Opinion(msgspec.Struct, frozen=True, kw_only=True):
         The verdict, and its reason in a sentence or two.
     """
 
-    solution: str | None
+    solution: str
     changes: dict[str, float]
     here: RunEnd
     there: RunEnd
@@ -138,9 +139,8 @@ class Opinions:
             *(f"note: {note}" for note in notes),
         ]
         for one in self.opinions:
-            handle = f"{one.solution}: " if one.solution else ""
             lines += [
-                f"{handle}{one.opinion}: {list_of_changes(characteristics, one.changes)}",
+                f"{one.solution}: {one.opinion}: {list_of_changes(characteristics, one.changes)}",
                 f"  with our model {one.here}; {one.because}",
             ]
         return lines
@@ -153,15 +153,6 @@ SIMULATION_LIMIT = 12_000
 """Approximate number of simulations that search the minimal causes, the same as for a report."""
 CHANGE_SHARES = np.arange(1, 10) / 10
 """Shares of a cause's changes that the second model simulates, to locate the share from which they are unsafe."""
-
-
-class CauseToJudge(NamedTuple):
-    """A minimal cause of a solution; `fraction` and `robustness` say of our model what `explain` says of the cause."""
-
-    solution: str | None
-    changes: Mapping[str, float]
-    fraction: float
-    robustness: float | None
 
 
 def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
@@ -179,14 +170,7 @@ def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
     return system, SecondVehicle(system.vehicle, study)
 
 
-def ask_for_opinions(
-    source: Study | Case,
-    options: OpinionOptions,
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-) -> Opinions:
+def ask_for_opinions(source: Study | Case, options: OpinionOptions, evaluator: Evaluator) -> Opinions:
     """Find the minimal causes of the failures that a report explains, or of named solutions, and judge them.
 
     Raises
@@ -202,65 +186,63 @@ def ask_for_opinions(
         )
     assemble_both_systems(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
-    explained = explain_failures(source, explain_options, pool=pool, jobs=jobs, progress=progress)
-    causes = [
-        CauseToJudge(str(failure.handle), cause.changes, cause.fraction, cause.robustness)
-        for failure in explained.explanations
-        for cause in failure.causes
-    ]
+    explained = explain_failures(source, explain_options, evaluator)
+    causes = [(str(failure.handle), cause) for failure in explained.explanations for cause in failure.causes]
     return replace(
-        judge_causes(source.study, causes, explained.unsafe, progress),
+        judge_causes(source.study, causes, explained.unsafe, evaluator.progress),
         no_verdict=explained.no_verdict,
         without_cause=tuple(str(failure.handle) for failure in explained.explanations if not failure.causes),
     )
 
 
 def judge_causes(
-    study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe, progress: Progress = show_no_progress
+    study: Study, causes: Sequence[tuple[str, Cause]], unsafe: Unsafe, progress: Progress = show_no_progress
 ) -> Opinions:
-    """Simulate minimal causes with both models and judge them; raises the errors of `assemble_both_systems`."""
+    """Simulate minimal causes of solutions, named by their handles, with both models and judge them.
+
+    Raises the errors of `assemble_both_systems`.
+    """
     system, vehicle = assemble_both_systems(study)
     second, original, stage = replace(system, vehicle=vehicle), system.characteristics.original, "second vehicle model"
-    changed = [system.characteristics.setting(cause.changes, "cause", beyond=True) for cause in causes]
+    changed = [system.characteristics.setting(cause.changes, "cause", beyond=True) for _, cause in causes]
     settings = np.stack([original, *changed])
     progress(stage, 0, len(settings))
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
     ours, theirs = evaluate(system, settings), evaluate(second, np.concatenate([settings, scaled]))
     fails_here, fails_there = unsafe.of(ours), unsafe.of(theirs)
     fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
-    (original_here, *ends_here), (original_there, *ends_there) = _run_ends(ours), _run_ends(theirs)
+    ends_here, ends_there = _run_ends(ours), _run_ends(theirs)
     opinions = []
-    for row, (cause, here, there) in enumerate(zip(causes, ends_here, ends_there, strict=False), 1):
+    for row, (solution, cause) in enumerate(causes, 1):
+        there = ends_there[row]
         verdict: Verdict = "outside"
         if reasons := vehicle.reasons_to_omit(cause.changes):
             because, there = "; ".join(reasons), RunEnd()
         elif fails_here[0]:
             because = "the original vehicle itself is unsafe, so that no change is a cause"
         elif fails_there[0] or not theirs.valid[0]:
-            because = f"the original vehicle itself is not safe with the second model: {original_there}"
+            because = f"the original vehicle itself is not safe with the second model: {ends_there[0]}"
         elif not theirs.valid[row]:
             because = f"it could not be simulated with the second model: {there}"
         elif settings[row].tobytes() in vehicle.spinning:
             because = f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
         else:
             verdict = "contradicted"
-            because = f"safe with the second model: {there}; the original vehicle: {original_there}"
+            because = f"safe with the second model: {there}; the original vehicle: {ends_there[0]}"
             if fails_there[row]:
-                verdict, because = (
-                    "confirmed",
-                    (
-                        f"also unsafe with the second model: {there}; the original vehicle is safe: {original_there}. "
-                        f"{_failing_shares(fails_scaled[row])} of the changes are enough with the second model, "
-                        f"{cause.fraction:.1%} with ours"
-                    ),
+                verdict, lower_share = "confirmed", np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])
+                because = (
+                    f"also unsafe with the second model: {there}; the original vehicle is safe: {ends_there[0]}. "
+                    f"{lower_share:.0%} to {lower_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the "
+                    f"second model, {cause.fraction:.1%} with ours"
                 )
             if doubt := _doubt(second, settings[row], cause.robustness, fails_there[row], unsafe, study.search.seed):
                 verdict, because = "borderline", f"{doubt}; {because}"
         opinions.append(
             Opinion(
-                solution=cause.solution,
+                solution=solution,
                 changes=dict(cause.changes),
-                here=here,
+                here=ends_here[row],
                 there=there,
                 opinion=verdict,
                 because=because,
@@ -268,7 +250,7 @@ def judge_causes(
         )
         progress(stage, row + 1, len(settings))
     return Opinions(
-        study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=original_here, original_there=original_there
+        study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0]
     )
 
 
@@ -286,12 +268,6 @@ def _doubt(
     share = int(np.sum(same)) / max(len(same), 1)
     result = "unsafe" if is_unsafe else "safe"
     return f"with the second model only {share:.0%} of the neighbours are {result}, too" if is_borderline(share) else ""
-
-
-def _failing_shares(fails: BoolArray) -> str:
-    """The shares of a cause's changes between which it becomes unsafe, such as `40% to 50%`."""
-    lower_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails)
-    return f"{lower_share:.0%} to {lower_share + CHANGE_SHARES[0]:.0%}"
 
 
 def _run_ends(runs: Evaluations) -> list[RunEnd]:

@@ -177,20 +177,12 @@ def balanced_state(plant: Plant, speed: FloatArray) -> MultiBodyState:
     return MultiBodyState(speed, heights, np.zeros_like(heights), ones * speed / plant.radius, ones)
 
 
-class TyreForces(NamedTuple):
-    """One tyre of each axle, shape (2, N): force along the road and its greatest value [N], slip [-].
+def tyre_forces(plant: Plant, body: MultiBodyState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative.
 
-    A slip is positive when braking. `gradient` is the derivative of the force by the wheel's speed [N s/rad].
+    Of one tyre of each axle, shape (2, N): the force along the road and its greatest value [N], the slip [-], positive
+    when braking, and the derivative of the force by the wheel's speed [N s/rad].
     """
-
-    force: FloatArray
-    peak: FloatArray
-    slip: FloatArray
-    gradient: FloatArray
-
-
-def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
-    """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
     tyre, slip_speed = load_bmw_parameters().tire, np.maximum(body.speed, LEAST_SPEED)
     load = np.maximum(body.heights[2:] * plant.tyre_spring, 1.0)
     slip = (body.speed - plant.radius * body.wheel_speeds) / slip_speed
@@ -200,7 +192,7 @@ def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
     bend = 1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip)
     slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * bend
-    return TyreForces(peak * np.sin(angle), peak, slip, slope * (stiffness * plant.radius / slip_speed))
+    return peak * np.sin(angle), peak, slip, slope * (stiffness * plant.radius / slip_speed)
 
 
 def derivatives(
@@ -232,14 +224,14 @@ def advance(
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised), others explicitly, rates before heights.
     """
-    tyres = tyre_forces(plant, body)
-    is_locking = (tyres.slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
+    force, peak, slip, gradient = tyre_forces(plant, body)
+    is_locking = (slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
     lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE_RATE * step, 0.0)
     pressure_shares = np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
-    drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * tyres.peak)
+    drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * peak)
     brakes = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
-    acceleration, height_gains, wheel_gains = derivatives(plant, body, drive - brakes, tyres.force)
-    gradients = np.maximum(tyres.gradient, 0.0)
+    acceleration, height_gains, wheel_gains = derivatives(plant, body, drive - brakes, force)
+    gradients = np.maximum(gradient, 0.0)
     damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
     wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_gains / damping, 0.0)
     added_force = gradients * (wheel_speeds - body.wheel_speeds)

@@ -12,21 +12,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import open_evaluator
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
-from safevar_sumo.protocol.rater import Points, Rater, darken, rater_of, with_protocol
+from safevar_sumo.protocol.rater import Points, Rater, darken, with_protocol
 from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import driven_entry
-from safevar_sumo.terminal import Progress, show_no_progress
-from safevar_sumo.vehicles import CharacteristicSet, region_of
+from safevar_sumo.sumo.system import assemble
 
 POINT_KINDS = ("standard", "extended", "robustness")
 DECIMALS = 9
@@ -194,27 +192,19 @@ class Rating:
         return f"<Rating of {self.study.name}, points of {max_points(self.protocol):g}: {vehicles}>"
 
 
-def rate_variant(
-    subject: Study | Case,
-    options: RatingOptions,
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-) -> Rating:
+def rate_variant(subject: Study | Case, options: RatingOptions, evaluator: Evaluator) -> Rating:
     """Rate the original vehicle, and the variant if the options describe one.
 
     Raises
     ------
     InputError
-        If the results have no such solution, a value is outside its domain, the changed variant violates a constraint,
-        or the study cannot be assembled.
+        If the results have no such solution, a value is outside its domain, or the changed variant violates a
+        constraint.
     SimulationError
         If a vehicle cannot be simulated.
     """
-    study = subject if isinstance(subject, Study) else subject.study
+    study, characteristics = evaluator.study, evaluator.characteristics
     setting_values, name = dict[str, float](), "variant"
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     if options.solution is not None:
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
@@ -228,40 +218,33 @@ def rate_variant(
         setting_values, name = {**setting_values, **options.changes}, f"{name} changed" if setting_values else name
     variants = {name: characteristics.setting(setting_values, "changes")} if setting_values else {}
     if options.changes:
-        region_of(study).check(variants[name][np.newaxis], "changes")
-    return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
+        evaluator.region.check(variants[name][np.newaxis], "changes")
+    return rate(evaluator, variants)
 
 
-def rate(
-    study: Study,
-    settings: Mapping[str, FloatArray],
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-) -> Rating:
+def rate(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     """Rate a study's original vehicle and variants, given as settings of shape (n,) by name; the filter is not applied.
 
     Raises
     ------
     InputError
-        If the study cannot be assembled.
+        If the study cannot be assembled with the protocol.
     SimulationError
         If a vehicle cannot be simulated.
     """
-    with open_evaluator(with_protocol(study, EURO_NCAP_2026), pool, jobs, progress) as evaluator:
-        rater = rater_of(evaluator.study, evaluator.study.source)
-        assert rater is not None
-        settings_by_name = {"original": evaluator.characteristics.original, **settings}
-        cells = evaluator.simulate_cells(np.stack(list(settings_by_name.values())), "cells and robustness layers")
-        names = evaluator.characteristics.names
-        vehicles = [
-            RatedVehicle(
-                name=name, setting=dict(zip(names, setting.tolist(), strict=True)), rater=rater, cells=cells.of([index])
-            )
-            for index, (name, setting) in enumerate(settings_by_name.items())
-        ]
-        return Rating(study=evaluator.study, vehicles=vehicles, no_verdict=evaluator.no_verdict)
+    study = with_protocol(evaluator.study, EURO_NCAP_2026)
+    rater, rated = assemble(study, study.source).rater, evaluator.for_study(study)
+    assert rater is not None
+    settings_by_name = {"original": rated.characteristics.original, **settings}
+    cells = rated.simulate_cells(np.stack(list(settings_by_name.values())), "cells and robustness layers")
+    names = rated.characteristics.names
+    vehicles = [
+        RatedVehicle(
+            name=name, setting=dict(zip(names, setting.tolist(), strict=True)), rater=rater, cells=cells.of([index])
+        )
+        for index, (name, setting) in enumerate(settings_by_name.items())
+    ]
+    return Rating(study=study, vehicles=vehicles, no_verdict=rated.no_verdict)
 
 
 def remarks(rating: Rating) -> list[str]:

@@ -14,19 +14,16 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson, open_evaluator
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.answer import Estimate, Risk
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns
-from safevar_sumo.analysis.subject import study_in
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
-from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.region import REJECTIONS
 
@@ -46,42 +43,32 @@ QuantileFunction = Callable[[FloatArray], FloatArray]
 """Turns probabilities into values in the characteristic's unit."""
 
 
-def estimate_risk(
-    source: Study | Case,
-    options: RiskOptions,
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-) -> Risk:
+def estimate_risk(source: Study | Case, options: RiskOptions, evaluator: Evaluator) -> Risk:
     """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes
     vehicles.
 
     Raises
     ------
     InputError
-        If a distribution of the study is impossible or `unsafe` cannot be used, or the study cannot be assembled.
+        If a distribution of the study is impossible or `unsafe` cannot be used.
     SimulationError
         If no vehicle can be simulated.
     """
-    study = study_in(source)
-    model = VariationModel(study)
-    with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.choose_criterion(options.unsafe, source)
-        simulated_before = evaluator.simulated
-        estimate = vars(_draw_vehicles(evaluator, model, unsafe, options))
-        has_indices = not (model.is_correlated or evaluator.region or options.requires_rare_method)
-        sensitivity, sensitivity_of_unsafe = (
-            compute_sensitivities(evaluator, model, unsafe, options.confidence) if has_indices else (None, None)
-        )
-        no_verdict = evaluator.no_verdict
+    model = VariationModel(evaluator.study)
+    unsafe = evaluator.choose_criterion(options.unsafe, source)
+    simulated_before = evaluator.simulated
+    estimate = vars(_draw_vehicles(evaluator, model, unsafe, options))
+    has_indices = not (model.is_correlated or evaluator.region or options.requires_rare_method)
+    sensitivity, sensitivity_of_unsafe = (
+        compute_sensitivities(evaluator, model, unsafe, options.confidence) if has_indices else (None, None)
+    )
     samples, simulations = estimate["simulations"] - estimate["errors"], simulated_before + estimate.pop("simulations")
     return Risk(
-        study=study,
+        study=evaluator.study,
         unsafe=unsafe,
         confidence=options.confidence,
         sensitivity=sensitivity,
-        no_verdict=no_verdict,
+        no_verdict=evaluator.no_verdict,
         sensitivity_of_unsafe=sensitivity_of_unsafe,
         samples=samples,
         simulations=simulations,

@@ -16,17 +16,15 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, clopper_pearson, open_evaluator
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, clopper_pearson
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.words import join_phrases, number_of
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.terminal import Progress, constraints_in_words, meanings, show_no_progress
+from safevar_sumo.terminal import constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 MIN_SETTINGS = 10
@@ -170,27 +168,16 @@ def _condition_in_words(characteristic: Characteristic, low: float | None, high:
     return f"{characteristic.name} {f'below {high:g}' if low is None else f'above {low:g}'}{characteristic.suffix}"
 
 
-def find_rules(
-    source: Study | Case,
-    options: RulesOptions,
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-) -> Rules:
+def find_rules(source: Study | Case, options: RulesOptions, evaluator: Evaluator) -> Rules:
     """Find rules that say where a study is unsafe, from random settings of the whole domain.
 
     Raises
     ------
     InputError
-        If `unsafe` cannot be used, or the study cannot be assembled.
+        If `unsafe` cannot be used.
     """
-    study = study_in(source)
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.choose_criterion(options.unsafe, source)
-        evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
-        no_verdict = evaluator.no_verdict
+    characteristics, unsafe = evaluator.characteristics, evaluator.choose_criterion(options.unsafe, source)
+    evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
     in_training = np.arange(len(evaluations)) < len(evaluations) // 2
     training, validation = (evaluations.take(evaluations.valid & half) for half in (in_training, ~in_training))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
@@ -209,11 +196,11 @@ def find_rules(
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(box, validation.settings, is_unsafe_validation, characteristics.names) for box in boxes]
     return Rules(
-        study=study,
+        study=evaluator.study,
         unsafe=unsafe,
         rules=sorted(rules, key=lambda rule: -(rule.coverage or 0.0)),
         remark=remark,
-        no_verdict=no_verdict,
+        no_verdict=evaluator.no_verdict,
         samples=samples,
         unsafe_share=all_unsafe / samples,
         unsafe_interval=clopper_pearson(all_unsafe, samples),

@@ -9,20 +9,17 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, open_evaluator, sobol_points
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.analysis.explain.causes import find_boundary_shares, settings_on_lines
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan, scan_pairs
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles.region import REJECTIONS
 
 MAX_UNSAFE_SHARE = 0.003
@@ -39,14 +36,7 @@ MIN_FACTOR = 1e-6
 """Smallest factor of a box; below it there is no safe box."""
 
 
-def find_tolerances(
-    source: Study | Case,
-    options: ToleranceOptions,
-    *,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-) -> Tolerance:
+def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: Evaluator) -> Tolerance:
     """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the
     vehicle.
 
@@ -55,36 +45,34 @@ def find_tolerances(
     Raises
     ------
     InputError
-        If `unsafe` or a name cannot be used, the study cannot be assembled, or hardly any setting of a box satisfies
-        its constraints.
+        If `unsafe` or a name cannot be used, or hardly any setting of a box satisfies the study's constraints.
     """
-    study = study_in(source)
+    study = evaluator.study
     columns = _columns_of(study, options.characteristics)
     if options.pairs and len(columns) < 2:
         raise InputError("pairs", "one characteristic makes no pair", "at least two characteristics")
-    with open_evaluator(study, pool, jobs, progress) as evaluator:
-        original = evaluator.evaluate_original()
-        unsafe = evaluator.choose_criterion(options.unsafe, source, original)
-        # A box of a rated study would take thousands of whole test matrices. Characteristics that constraints tie so
-        # closely that hardly any setting in a box is feasible are refused first.
-        needs_box = not unsafe.of(original)[0] and not is_rated(study)
-        if needs_box:
-            _random_settings(evaluator, columns, 1.0, 1, np.random.default_rng(study.search.seed))
-        scans = scan(evaluator, columns, unsafe)
-        pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
-        box = SafeBox()
-        if needs_box:
-            found, known = _unsafe_settings(evaluator, scans, pairs or []), _known_settings(source, columns, unsafe)
-            box = find_safe_box(evaluator, columns, unsafe, found, known)
-        return Tolerance(
-            study=study,
-            unsafe=unsafe,
-            original=original,
-            alone=scans,
-            pairs=pairs,
-            joint=box._replace(characteristics=tuple(evaluator.characteristics.names[column] for column in columns)),
-            no_verdict=evaluator.no_verdict,
-        )
+    original = evaluator.evaluate_original()
+    unsafe = evaluator.choose_criterion(options.unsafe, source, original)
+    # A box of a rated study would take thousands of whole test matrices. Characteristics that constraints tie so
+    # closely that hardly any setting in a box is feasible are refused first.
+    needs_box = not unsafe.of(original)[0] and not is_rated(study)
+    if needs_box:
+        _random_settings(evaluator, columns, 1.0, 1, np.random.default_rng(study.search.seed))
+    scans = scan(evaluator, columns, unsafe)
+    pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
+    box = SafeBox()
+    if needs_box:
+        found, known = _unsafe_settings(evaluator, scans, pairs or []), _known_settings(source, columns, unsafe)
+        box = find_safe_box(evaluator, columns, unsafe, found, known)
+    return Tolerance(
+        study=study,
+        unsafe=unsafe,
+        original=original,
+        alone=scans,
+        pairs=pairs,
+        joint=box._replace(characteristics=tuple(evaluator.characteristics.names[column] for column in columns)),
+        no_verdict=evaluator.no_verdict,
+    )
 
 
 def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int]:
