@@ -116,7 +116,7 @@ class Evaluator:
         bounds, seed = self.characteristics, self.study.search.seed
         rng = np.random.default_rng(seed)
         return self.region.draw_feasible(
-            lambda count: np.asarray(bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower)),
+            lambda count: bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower),
             number,
             np.random.default_rng(seed),
             rejections=MAX_REJECTIONS,
@@ -245,7 +245,7 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
     """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
     lower, upper = characteristics.lower, characteristics.upper
-    return np.asarray(lower + sobol_points(number, len(characteristics), seed) * (upper - lower))
+    return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
 
 
 def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

@@ -159,16 +159,12 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
     """Remarks on earlier results in a directory: runs of other lengths, and runs that the study no longer has."""
     if not (results.path / MANIFEST).exists():
         return []
-    earlier, now, remarks = (
-        read_manifest(results.path)["study"]["search"]["evaluations"],
-        study.search.evaluations,
-        list[str](),
+    earlier, now = read_manifest(results.path)["study"]["search"]["evaluations"], study.search.evaluations
+    changed = (
+        f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
+        "name another solution than in earlier output and reports"
     )
-    if earlier != now:
-        remarks.append(
-            f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
-            "name another solution than in earlier output and reports"
-        )
+    remarks = [] if earlier == now else [changed]
     names = stored_runs(results.path) - set(map(str, all_runs(study)))
     if names:
         remarks.append(
@@ -216,11 +212,8 @@ class CampaignProgress:
         self, progress: Progress, study: Study, keys: Sequence[RunKey], show_warning: Callable[[str], None] = warn
     ) -> None:
         self.warned, self._progress, self._study, self._run_count = show_warning, progress, study, len(keys)
-        self._runs, self._replayed, self._finished_runs = (
-            dict[RunKey, RunProgress](),
-            dict[RunKey, int](),
-            set[RunKey](),
-        )
+        self._runs, self._replayed = dict[RunKey, RunProgress](), dict[RunKey, int]()
+        self._finished_runs = set[RunKey]()
         self.progressed([])
 
     def progressed(self, runs: Sequence[RunProgress]) -> None:

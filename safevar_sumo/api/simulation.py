@@ -58,22 +58,23 @@ def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd
     import pandas as pd  # takes longer to load than the simulation
 
     trace = runs.trace
-    active = trace.active[:, 0]
     ttc = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
     columns = {
-        "time [s]": trace.time,
-        "position [m]": trace.position[:, 0],
-        "speed [m/s]": trace.speed[:, 0],
-        "acceleration [m/s^2]": np.diff(trace.speed[:, 0], prepend=trace.speed[:1, 0]) / trace.step,
-        "gap [m]": trace.gap[:, 0],
-        "ttc [s]": ttc[:, 0],
-        "throttle [-]": trace.throttle[:, 0],
-        "brake [-]": trace.brake[:, 0],
-        "gear [-]": trace.gear[:, 0],
-        "lateral [m]": trace.lateral[:, 0],
-        "lateral speed [m/s]": trace.lateral_speed[:, 0],
+        "position [m]": trace.position,
+        "speed [m/s]": trace.speed,
+        "acceleration [m/s^2]": np.diff(trace.speed, axis=0, prepend=trace.speed[:1]) / trace.step,
+        "gap [m]": trace.gap,
+        "ttc [s]": ttc,
+        "throttle [-]": trace.throttle,
+        "brake [-]": trace.brake,
+        "gear [-]": trace.gear,
+        "lateral [m]": trace.lateral,
+        "lateral speed [m/s]": trace.lateral_speed,
     }
-    frame = pd.DataFrame({name: values[active] for name, values in columns.items()})
+    active = trace.active[:, 0]
+    frame = pd.DataFrame(
+        {"time [s]": trace.time[active], **{name: column[active, 0] for name, column in columns.items()}}
+    )
     observed = pd.DataFrame(
         [
             {
@@ -143,23 +144,15 @@ class Simulation:
     @property
     def objectives(self) -> dict[str, float]:
         """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
-        fields = self.to_dict()
-        return {
-            name: float(value) if value is not None else np.nan
-            for name, value in fields.items()
-            if name.startswith("f_")
-        }
+        return {name: float(self.evaluation.column(name)[0]) for name in ("f_safe", "f_diff", "f_num_diff")}
 
     @property
     def units(self) -> dict[str, str]:
         """The unit of every number of `to_dict`, by its name."""
-        units_of_metrics = {metric.name: metric.unit for metric in self.scoring.metrics}
-        units_of_metrics |= {
-            objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics
-        }
         return {
             "collision_speed": "m/s",
-            **units_of_metrics,
+            **{metric.name: metric.unit for metric in self.scoring.metrics},
+            **{one.name: one.unit for one in self.scoring.objectives if one.name in self.metrics},
             "f_safe": "m, or -m/s",
             "f_diff": "fraction",
             "f_num_diff": "characteristics",
@@ -338,15 +331,13 @@ def evaluate(
     """
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
-    requested, index = _read_settings(settings, characteristics)
-    _refuse_illegal_values(requested, characteristics, beyond)
+    requested, index = _read_settings(settings, characteristics, beyond)
     if not beyond:
         system.check_feasible(requested, "settings", filtered=filtered)
-    simulated_settings = characteristics.filter(requested) if filtered else requested
+    simulated = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
-        evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report_progress)
-    no_run = "", 0
-    frame = evaluations_frame(characteristics.names, [(no_run, evaluations)]).drop(columns=["algorithm", "run"])
+        evaluations = evaluate_settings(loaded_study, simulated, pool, jobs, report_progress)
+    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
 
@@ -365,35 +356,29 @@ def evaluate_settings(
         return evaluator.evaluate(settings, "settings", ignore_constraints=True)
 
 
-def _read_settings(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:
-    """Convert a user's settings into an array of shape (M, n), and the index of its rows."""
+def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bool) -> tuple[FloatArray, Any]:
+    """Convert a user's settings into an array of shape (M, n), and the index of its rows; refuses illegal values."""
     import pandas as pd
 
     names = list(characteristics.names)
     if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
-        if not isinstance(settings, pd.DataFrame):
+        if isinstance(settings, pd.DataFrame):
+            for name in settings.columns.difference(names, sort=False):
+                raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
+            values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
+            array, index = np.where(np.isnan(values), characteristics.original, values), settings.index
+        else:
             array = np.array(settings, dtype=float)
             if array.ndim != 2 or array.shape[1] != len(names):
                 raise InputError(
                     "settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}"
                 )
-            return array, pd.RangeIndex(len(array))
-        for name in settings.columns.difference(names, sort=False):
-            raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
-        values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
+            index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
-    return np.where(np.isnan(values), characteristics.original, values), settings.index
-
-
-def _refuse_illegal_values(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    is_legal = np.column_stack(
-        [
-            characteristic.is_legal(values, beyond=beyond)
-            for characteristic, values in zip(characteristics, requested.T, strict=True)
-        ]
-    )
-    for row, column in np.argwhere(~is_legal)[:1]:
-        characteristics.members[column].check(float(requested[row, column]), f"settings, row {row}", beyond=beyond)
+    is_legal = [item.is_legal(values, beyond=beyond) for item, values in zip(characteristics, array.T, strict=True)]
+    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:
+        characteristics.members[column].check(float(array[row, column]), f"settings, row {row}", beyond=beyond)
+    return array, index

@@ -93,13 +93,10 @@ def combine_values(
     values_by_name: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet
 ) -> FloatArray:
     """Make M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in turn."""
-    columns = [characteristics.names.index(name) for name in values_by_name]
-    settings = []
-    for values in product(*values_by_name.values()):
-        setting = base.copy()
-        setting[columns] = values
-        settings.append(setting)
-    return np.array(settings)
+    combinations = list(product(*values_by_name.values()))
+    settings = np.tile(base, (len(combinations), 1))
+    settings[:, [characteristics.names.index(name) for name in values_by_name]] = combinations
+    return settings
 
 
 def _parse_values(change: str, text: str, original: float, forms: str) -> list[float]:
@@ -155,26 +152,6 @@ class CommandTarget(NamedTuple):
     row: dict[str, Any] | None = None
 
 
-def replay_options(command: CommandFunction) -> CommandFunction:
-    """Add the options that choose a solution of a results directory."""
-    for option in (
-        click.option(
-            "--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."
-        ),
-        click.option(
-            "--fewest", "choice", flag_value="fewest", help="Replay the unsafe solution with the fewest changes."
-        ),
-        click.option("--most-severe", "choice", flag_value="most_severe", help="Replay the most severe solution."),
-        click.option(
-            "--solution",
-            metavar="ALG:RUN:N",
-            help="Replay solution N of a run in a results directory; N counts from 0.",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
 def load_target(source: str, solution: str | None, choice: str | None) -> CommandTarget:
     """Load the subject of a command: a study by name or path, or a results directory.
 
@@ -191,17 +168,14 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
         return CommandTarget(study_in(_load_subject(source)), source)
     case = load_results_or_study(source, results_only=True)
     assert not isinstance(case, Study)
-    requested_handle = None if solution is None else SolutionId.parse(solution)
-    handle = requested_handle or choose_handle(case.solutions, case.unsafe, str(choice), source)
+    handle = (
+        choose_handle(case.solutions, case.unsafe, str(choice), source)
+        if solution is None
+        else SolutionId.parse(solution)
+    )
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return CommandTarget(
-        study=case.study,
-        source=source,
-        handle=handle,
-        setting=setting,
-        row={str(name): value for name, value in row.items()},
-    )
+    return CommandTarget(case.study, source, handle, setting, {str(name): value for name, value in row.items()})
 
 
 def file_option(
@@ -218,17 +192,11 @@ point_option = click.option("--point", metavar="NAME", help="Only this point of 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 AS_IT_IS_NOW_KEY = "safevar_sumo.as_it_is_now"
 """Key of the flag --as-it-is-now in a command's context; functions that read results directories look it up."""
-
-
-def _store_flag(context: click.Context, _option: click.Parameter, value: bool) -> None:
-    context.meta[AS_IT_IS_NOW_KEY] = value
-
-
 as_it_is_now_option = click.option(
     "--as-it-is-now",
     is_flag=True,
     expose_value=False,
-    callback=_store_flag,
+    callback=lambda context, _option, value: context.meta.update({AS_IT_IS_NOW_KEY: value}),
     help="If results were computed with other files or versions, simulate with the present ones and say so.",
 )
 
@@ -261,28 +229,29 @@ def _add_flag(flag: str, name: str, default: Any, option: Option) -> Callable[[C
             multiple=option.form == "repeated",
             metavar=option.metavar,
             help=option.help,
-            callback=lambda _context, _option, value: _split_names(value) if option.form == "commas" else value,
+            callback=lambda _context, _option, value: (
+                split_names(value) if option.form == "commas" and value else value
+            ),
         )
-    (low_is_open, high_is_open), show_default = option.is_open, default is not None
     click_type: click.ParamType[Any] = click.STRING
     if option.kind is int:
         click_type = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
-        click_type = click.FloatRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
+        click_type = click.FloatRange(option.low, option.high, *option.is_open)
     return click.option(
         flag,
         name,
         type=click_type,
         default=default,
-        show_default=show_default,
+        show_default=default is not None,
         metavar=option.metavar,
         help=option.help,
     )
 
 
-def _split_names(text: str | None) -> tuple[str, ...] | None:
+def split_names(text: str) -> tuple[str, ...]:
     """Split names at commas."""
-    return None if text is None else tuple(name.strip() for name in text.split(","))
+    return tuple(name.strip() for name in text.split(","))
 
 
 def load_results_or_study(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:

@@ -30,6 +30,7 @@ from safevar_sumo.cli.arguments import (
     load_results_or_study,
     point_option,
     read_changes,
+    split_names,
 )
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
@@ -129,7 +130,7 @@ def opinion(
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    names = tuple(name.strip() for text in (*solutions, *lists, *handles) for name in text.split(","))
+    names = tuple(name for text in (*solutions, *lists, *handles) for name in split_names(text))
     options = OpinionOptions(solutions=names, unsafe=unsafe)
     subject = load_results_or_study(source, point, results_only=True)
     result = answer_question(ask_for_opinions, subject, options, jobs=jobs)

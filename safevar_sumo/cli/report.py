@@ -18,6 +18,7 @@ from safevar_sumo.cli.arguments import (
     file_option,
     jobs_option,
     point_option,
+    split_names,
 )
 from safevar_sumo.cli.program import commands, print_note, print_warning
 from safevar_sumo.results import make_directory, write_whole
@@ -97,7 +98,7 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, point: str
     from safevar_sumo.terminal import open_progress
 
     check_output(out, "--out", (".html", ".htm"))
-    sections = [name.strip() for name in only.split(",")] if only is not None else []
+    sections = split_names(only) if only is not None else ()
     with open_progress(True) as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())

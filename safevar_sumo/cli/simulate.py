@@ -33,7 +33,6 @@ from safevar_sumo.cli.arguments import (
     load_target,
     point_option,
     read_changes,
-    replay_options,
 )
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
@@ -52,7 +51,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 @commands.command(name="simulate")
 @click.argument("study", metavar="STUDY|DIR", shell_complete=complete_study)
-@replay_options
+@click.option(
+    "--solution", metavar="ALG:RUN:N", help="Replay solution N of a run in a results directory; N counts from 0."
+)
+@click.option("--most-severe", "choice", flag_value="most_severe", help="Replay the most severe solution.")
+@click.option("--fewest", "choice", flag_value="fewest", help="Replay the unsafe solution with the fewest changes.")
+@click.option(
+    "--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."
+)
 @click.option(
     "--set",
     "changes",
@@ -116,19 +122,25 @@ def simulate_command(
             raise InputError("--set", f"{' '.join(changes)} is a sweep", expected)
         _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
         return
-    parameter_sets = studies_of_sets(target.study) if spread else []
-    for name in parameters_outside_sets(target.study) if spread else ():
-        print_note(f"[spread] does not vary {name}: the study's value is not the first of its list")
+    if spread:
+        studies_of_sets(target.study)  # refuses a study without sets before any simulation
+        for name in parameters_outside_sets(target.study):
+            print_note(f"[spread] does not vary {name}: the study's value is not the first of its list")
     simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
     if target.row is not None and not changes:
-        _warn_of_differences(target, simulation)
+        from safevar_sumo.replay.comparison import list_differences
+
+        for difference in list_differences(simulation.evaluation, target.row):
+            print_warning(f"{target.handle} of {study}: {difference}; have versions or code changed since the study?")
     if trace is not None:
         with whole_file(trace, "--trace") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")
     if plot or animate or gui:
         _show(target.study, system, simulation.evaluation.settings[0], plot, animate, (slower or 1.0) if gui else None)
-    settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
-    spreads = compute_model_spreads(target.study, settings, point or "") if parameter_sets else []
+    spreads = []
+    if spread:
+        settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
+        spreads = compute_model_spreads(target.study, settings, point or "")
     _print_results(target, system, simulation, spreads, as_json)
 
 
@@ -193,7 +205,7 @@ def _simulate_sweep(
     else:
         print_heading(Console(), target.study.title, no_verdict)
         print_sweep(Console(), system.characteristics, names, evaluations)
-    reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
+    reset_count = np.count_nonzero((settings != requested_settings).any(axis=1))
     if reset_count:
         print_note(
             f"in {reset_count} of {len(requested_settings)} settings the filter reset small changes; "
@@ -248,24 +260,19 @@ def _rating_command(target: CommandTarget, system: System, simulation: Simulatio
     return f"{RatingOptions(changes=changes or None, solution=solution).command_line(target.source)} --matrix"
 
 
-def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
-    """Warn where a replay differs from the recorded solution."""
-    from safevar_sumo.replay.comparison import list_differences
-
-    assert target.row is not None
-    for difference in list_differences(simulation.evaluation, target.row):
-        print_warning(
-            f"{target.handle} of {target.source}: {difference}; have versions or code changed since the study?"
-        )
-
-
 def print_simulation(console: Console, simulation: Simulation) -> None:
     """Print a setting beside the original vehicle: its values, outcome, metrics and objectives, and a verdict."""
     if simulation.no_verdict:
         print_text(console, simulation.no_verdict)
-    _print_setting(console, simulation)
+    table = WholeTable("characteristic", "unit", right=("original", "simulated"), title=simulation.study.title)
     characteristics = CharacteristicSet.of(simulation.study.vehicle.characteristics)
-    print_meanings(console, [item for item in characteristics if simulation.setting[item.name] != item.original])
+    changed = [item for item in characteristics if simulation.setting[item.name] != item.original]
+    for item in characteristics:
+        value, style = simulation.setting[item.name], "bold" if item in changed else None
+        beyond = "" if item.lower <= value <= item.upper else " (beyond)"
+        table.add_row(item.name, item.unit, f"{item.original:g}", f"{value:g}{beyond}", style=style)
+    console.print(table)
+    print_meanings(console, changed)
     records = (simulation.original.to_dict(), simulation.to_dict())
     table = WholeTable("result", "unit", right=("original", "simulated"))
     table.add_row("outcome", "", *(record["outcome"] for record in records))
@@ -277,16 +284,6 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     print_text(console, f"The original vehicle {simulation.original.verdict}.")
     if simulation is not simulation.original and simulation.setting != simulation.original.setting:
         print_text(console, f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}.")
-
-
-def _print_setting(console: Console, simulation: Simulation) -> None:
-    table = WholeTable("characteristic", "unit", right=("original", "simulated"), title=simulation.study.title)
-    for characteristic in CharacteristicSet.of(simulation.study.vehicle.characteristics):
-        value = simulation.setting[characteristic.name]
-        style = "bold" if value != characteristic.original else None
-        value_text = f"{value:g}" + ("" if characteristic.lower <= value <= characteristic.upper else " (beyond)")
-        table.add_row(characteristic.name, characteristic.unit, f"{characteristic.original:g}", value_text, style=style)
-    console.print(table)
 
 
 def _safety_comparison(simulation: Simulation) -> str:
@@ -336,11 +333,11 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
     tables: dict[str, dict[str, dict[Any, Text]]] = {}
     for result, entry in zip(results, records, strict=True):
         coordinates = dict(result.point.parameters)
-        title, location = (
-            f"{coordinates.pop('test')}, {coordinates.pop('weather')}",
-            coordinates.pop(LOCATION_DIMENSION, None),
-        )
-        tables.setdefault(title, {}).setdefault(_row_name(coordinates), {})[location] = _cell_text(entry)
+        title = f"{coordinates.pop('test')}, {coordinates.pop('weather')}"
+        location = coordinates.pop(LOCATION_DIMENSION, None)
+        speed = [f"{coordinates.pop(SPEED_DIMENSION):g} km/h"] if SPEED_DIMENSION in coordinates else []
+        name = ", ".join([*speed, *(f"{key} {value}" for key, value in coordinates.items())])
+        tables.setdefault(title, {}).setdefault(name, {})[location] = _cell_text(entry)
     for title, rows in tables.items():
         columns = dict.fromkeys(location for cells in rows.values() for location in cells)
         table = WholeTable(
@@ -350,9 +347,8 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
             table.add_row(name, *(cells.get(column, "") for column in columns))
         console.print(table)
     if records:
-        summary = points_in_words(
-            [entry["point"] for entry in records if entry["impact_speed"] is not None], len(records)
-        )
+        failing = [entry["point"] for entry in records if entry["impact_speed"] is not None]
+        summary = points_in_words(failing, len(records))
         if invalid := sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records):
             summary += (
                 f" {invalid} are invalid tests: the vehicle violates the test's speed tolerance before the ADS acts."
@@ -360,21 +356,13 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
         print_text(console, summary)
 
 
-def _row_name(coordinates: dict[str, Any]) -> str:
-    speed = [f"{coordinates[SPEED_DIMENSION]:g} km/h"] if SPEED_DIMENSION in coordinates else []
-    others = (f"{name} {value}" for name, value in coordinates.items() if name != SPEED_DIMENSION)
-    return ", ".join([*speed, *others])
-
-
 def _cell_text(result: dict[str, Any]) -> Text:
     if result["outcome"] == Outcome.INVALID_TEST:
         return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
     if result["impact_speed"] is None:
         contact = f", {result['contact']['side']} side touched" if "contact" in result else ""
-        return Text(
-            "avoided" + contact if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"],
-            "green",
-        )
+        is_avoided = result["outcome"] in (Outcome.STOPPED, Outcome.PASSED)
+        return Text(f"avoided{contact}" if is_avoided else result["outcome"], "green")
     relative_speed = (result["relative_impact_speed"] or 0.0) * KMH_PER_MS
     colour = next((colour for limit, colour in COLOUR_BANDS if relative_speed < limit), "red")
     return Text(f"{result['impact_speed'] * KMH_PER_MS:.1f} km/h", colour)

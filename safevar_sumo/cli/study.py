@@ -24,7 +24,7 @@ from safevar_sumo.analysis.words import change_texts, two_decimals
 from safevar_sumo.api.running import ENGINES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option
+from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
 from safevar_sumo.cli.program import commands, print_note, print_remarks, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
@@ -90,8 +90,7 @@ def study(
     search = as_written.search
     changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
     if algorithms is not None:
-        names = [name.strip() for name in algorithms.split(",")]
-        changes["algorithms"] = [search.labels.get(name, name) for name in names]
+        changes["algorithms"] = [search.labels.get(name, name) for name in split_names(algorithms)]
     loaded_study, system = load_for_search(
         msgspec.structs.replace(as_written, search=msgspec.structs.replace(search, **changes)), study
     )

@@ -155,17 +155,16 @@ def _collisions(study: Study, evaluations: Evaluations) -> Evaluations:
 
 def _choose_rows(found: _Found, evaluator: Evaluator, original: Evaluations, limit: int) -> Reasons:
     """Choose the failures that are smallest robust, of the fewest changes, most severe, and of the smallest changes."""
-    reasons: Reasons = {}
+    reasons, candidates = Reasons(), found.evaluations.take(found.rows)
     if not found.rows:
         return reasons
-    candidates = found.evaluations.take(found.rows)
     if not is_rated(evaluator.study) and not found.unsafe.of(original)[0]:
         step = _time_step(assemble(evaluator.study))
         index = find_smallest_robust_failure(evaluator, candidates, step, found.unsafe, limit)
-        reasons = {} if index is None else {found.rows[index]: (ROBUST,)}
+        if index is not None:
+            reasons[found.rows[index]] = (ROBUST,)
     for choice in ("fewest", "most_severe", "smallest"):
-        order = np.lexsort([getattr(candidates, name) for name in reversed(CHOICES[choice])])
-        row = found.rows[int(order[0])]
+        row = found.rows[np.lexsort([candidates.column(name) for name in reversed(CHOICES[choice])])[0]]
         reasons[row] = (*reasons.get(row, ()), REASONS[choice])
     return reasons
 
@@ -178,9 +177,9 @@ def _add_distinct_causes(
     keys = {row: {cause_key(evaluator.characteristics, one) for one in causes[row]} for row in causes}
     for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])["cause"]:
         if len(chosen) < top and not any(key in keys[row] for row in chosen):
-            rows = np.array([row for row in sample if key in keys[row]])
-            order = np.lexsort([rows, evaluations.f_diff[rows], evaluations.f_num_diff[rows]])
-            chosen[int(rows[order[0]])] = (DISTINCT_CAUSE,)
+            rows = [row for row in sample if key in keys[row]]
+            simplest = min(rows, key=lambda row: (evaluations.f_num_diff[row], evaluations.f_diff[row], row))
+            chosen[simplest] = (DISTINCT_CAUSE,)
     return chosen
 
 

@@ -133,8 +133,8 @@ class Explained:
     @property
     def choices(self) -> list[Explanation]:
         """The failures that were chosen by their size or severity, in the order in which they are shown."""
-        titles = [reason for reason in LABELS if reason != DISTINCT_CAUSE]
-        return list({id(failure): failure for reason in titles if (failure := self.by_reason.get(reason))}.values())
+        failures = (self.by_reason.get(reason) for reason in LABELS if reason != DISTINCT_CAUSE)
+        return list({id(failure): failure for failure in failures if failure}.values())
 
     @property
     def by_reason(self) -> Mapping[str, Explanation]:
@@ -154,21 +154,15 @@ class Explained:
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
-
-        def columns(*names: str) -> dict[str, Any]:
-            rows = self.necessity[["characteristic", *names]].itertuples(index=False)
-            return {name: values[0] if len(values) == 1 else values for name, *values in rows}
-
+        by_name = self.necessity.set_index("characteristic")
         summary = {
-            "necessary": columns("necessary"),
-            "changed": columns("changed"),
-            "necessary_interval": columns("necessary_lower", "necessary_upper"),
+            "necessary": by_name["necessary"].to_dict(),
+            "changed": by_name["changed"].to_dict(),
+            "necessary_interval": by_name[["necessary_lower", "necessary_upper"]].T.to_dict("list"),
             "preventable": self.preventability.to_dict(),
+            **driven_entry(self.no_verdict),
         }
-        return [
-            *(failure.to_dict() for failure in self.explanations),
-            {"summary": summary | driven_entry(self.no_verdict)},
-        ]
+        return [*(failure.to_dict() for failure in self.explanations), {"summary": summary}]
 
     def __repr__(self) -> str:
         counts = f"{self.failures} of {self.looked_at}, {len(self.explanations)} in full"

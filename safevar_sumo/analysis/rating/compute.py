@@ -266,7 +266,7 @@ def remarks(rating: Rating) -> list[str]:
                 f"{vehicle.name}: {UNCHECKED} is not green, which Euro NCAP requires; "
                 f"Euro NCAP's calculator {protocol.calculator_version} does not check this, nor do these points."
             )
-        invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
+        invalid_cells = np.count_nonzero(~vehicle.cells.valid)
         if invalid_cells:
             lines.append(
                 f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle "

@@ -144,23 +144,20 @@ def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
             )
         for metric in case.scoring.metrics:
             rows = solutions_for_metric(case.solutions, metric)
-            undefined_values = int(rows[metric.name].isna().sum())
-            if undefined_values:
+            if undefined_values := int(rows[metric.name].isna().sum()):
                 notes.append(
                     f"{metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which the tests omit."
                 )
-    if question == "rq1":
-        undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
-        if undefined_metrics:
-            names = ", ".join(undefined_metrics)
-            notes.append(f"the original vehicle's {names} is undefined, so that no test uses it.")
+    undefined = ", ".join(name for name, value in case.original.items() if pd.isna(value))
+    if question == "rq1" and undefined:
+        notes.append(f"the original vehicle's {undefined} is undefined, so that no test uses it.")
     if question in ("rq1-runs", "rq2-runs"):
         notes += notes_over_runs(case, question[:3].upper(), pooling=alone or question == "rq1-runs")
     if question == "rq2" and not case.has_runs:
         notes.append("igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
-    if question == "rq2" and case.has_runs:
-        empty_runs = len(set(case.finished_runs) - set(case.solutions.groupby(["algorithm", "run"]).groups))
-        if empty_runs:
+    elif question == "rq2":
+        with_solutions = case.solutions.groupby(["algorithm", "run"]).groups
+        if empty_runs := len({*case.finished_runs} - {*with_solutions}):
             notes.append(f"{empty_runs} finished runs found no solution; they have no igd, igd_plus or hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
         notes.append(
@@ -169,13 +166,8 @@ def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
         )
     if question == "combinations" and frequent_combinations(case).empty:
         notes.append("no critical solution has exactly four characteristics changed.")
-    units = [
-        f"{characteristic.name} {characteristic.unit}"
-        for characteristic in case.characteristics
-        if characteristic.unit != "-"
-    ]
-    return [
-        *case.remarks,
-        *(f"{case.name}: {note}" for note in notes),
-        *([f"Units of delta: {', '.join(units)}."] if question == "rq3.3" else []),
-    ]
+    lines = [*case.remarks, *(f"{case.name}: {note}" for note in notes)]
+    if question == "rq3.3":
+        units = (f"{item.name} {item.unit}" for item in case.characteristics if item.unit != "-")
+        lines.append(f"Units of delta: {', '.join(units)}.")
+    return lines

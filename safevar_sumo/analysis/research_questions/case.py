@@ -129,12 +129,9 @@ class Case:
     def shortfall(self) -> str:
         """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
         done, planned = Counter(algorithm for algorithm, _ in self.finished_runs), self.study.search.runs
-        shortfalls = [
-            f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned
-        ]
-        if not self.has_runs or not shortfalls:
-            return ""
-        return f"{self.name}: unfinished, {', '.join(shortfalls)}; only solutions of finished runs count."
+        labels = self.study.search.labels if self.has_runs else ()
+        missing = ", ".join(f"{name} {done[name]} of {planned} runs" for name in labels if done[name] < planned)
+        return f"{self.name}: unfinished, {missing}; only solutions of finished runs count." if missing else ""
 
     @property
     def remarks(self) -> list[str]:
@@ -186,7 +183,14 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     cases = []
     for path in paths:
         try:
-            cases.append(_load_case(path))
+            manifest, evaluations, solutions, finished, failures = load_runs(path)
+            study = convert_table(path / MANIFEST, manifest["study"], Study, "study")
+            study = msgspec.structs.replace(study, origin=Origin(places=folders_of(path, manifest)))
+            scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
+            has_runs = "imported" not in manifest
+            cases.append(
+                build_case(study, manifest["original"], solutions, evaluations, finished, has_runs, failures, scoring)
+            )
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
             raise InputError(
                 path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`"
@@ -196,23 +200,6 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case
         for case, path in zip(cases, paths, strict=True)
     ]
-
-
-def _load_case(directory: Path) -> Case:
-    manifest, evaluations, solutions, finished, failures = load_runs(directory)
-    study = convert_table(directory / MANIFEST, manifest["study"], Study, "study")
-    scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
-    study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory, manifest)))
-    return build_case(
-        study,
-        manifest["original"],
-        solutions,
-        evaluations,
-        finished,
-        has_runs="imported" not in manifest,
-        failures=failures,
-        scoring=scoring,
-    )
 
 
 def build_case(

@@ -45,7 +45,7 @@ def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
     """Changes of n characteristics in M solutions, each in its unit: filtered minus original value, the paper's v'' -
     v; shape (M, n).
     """
-    return np.asarray(solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original)
+    return solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original
 
 
 def change_numbers(case: Case) -> list[str]:
@@ -231,9 +231,7 @@ def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
     columns = [suffixed for name in ("percent", "rank", "increase", "decrease") for suffixed in (name, f"{name}_other")]
     table = ours.join(theirs.add_suffix("_other"))[columns].reset_index()
     table.insert(3, "difference", table["percent_other"] - table["percent"])
-    table.insert(0, "other", other.name)
-    table.insert(0, "setting", clearer.name)
-    return table
+    return pd.DataFrame({"setting": clearer.name, "other": other.name, **table})
 
 
 def _clearness(case: Case) -> tuple[float, float, float]:

@@ -41,9 +41,14 @@ from safevar_sumo.metrics import MetricFacts
 TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original"]
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS]
-RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
-RQ1_RUNS_COLUMNS += ["mean", "original"]
-RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS]
+RUNS_COLUMNS = {
+    "RQ1": [
+        *("setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"),
+        *("mean", "original"),
+    ],
+    "RQ2": ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS],
+}
+"""Columns of RQ1 and RQ2 over runs."""
 PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", *TEST_COLUMNS]
 RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm"]
 RANK_COLUMNS += ["critical_difference"]
@@ -61,12 +66,10 @@ def pooled_values(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The mean of a metric's defined values in each finished run that has some, by the run's number."""
+    case.runs_of(algorithm)  # raises if there are none
     solutions = defined_solutions(case.solutions_of(algorithm), metric)
-    samples = {
-        run: solutions.loc[solutions["run"] == run, metric.name].to_numpy(dtype=float)
-        for run in case.runs_of(algorithm)
-    }
-    return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)
+    by_run = solutions.groupby("run")[metric.name]
+    return pd.Series({run: float(np.mean(values.to_numpy(dtype=float))) for run, values in by_run}, dtype=float)
 
 
 def rq1(case: Case) -> pd.DataFrame:
@@ -141,26 +144,21 @@ def _nsga2_pairs(case: Case) -> list[tuple[str, str]]:
 
 
 def _samples(case: Case, sample_of: SampleFunction) -> Samples:
-    samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
-    indicators = compute_indicators(case) if case.has_runs and len(case.solutions) else None
-    for name, more_is_better in MORE_IS_BETTER.items():
-        samples[name] = (
-            more_is_better,
-            {
-                algorithm: pd.Series(dtype=float)
-                if indicators is None
-                else indicators.loc[indicators.index.get_level_values("algorithm") == algorithm, name].droplevel(
-                    "algorithm"
-                )
-                for algorithm in case.algorithms
-            },
-        )
-    for metric in case.scoring.metrics:
-        samples[metric.name] = (
-            metric.more_is_unsafe,
-            {algorithm: sample_of(case, algorithm, metric) for algorithm in case.algorithms},
-        )
-    return samples
+    indicators = pd.DataFrame()
+    if case.has_runs and len(case.solutions):
+        indicators = compute_indicators(case)
+    empty = pd.Series(dtype=float)
+    by_algorithm = {str(name): rows.droplevel("algorithm") for name, rows in indicators.groupby(level=0)}
+    return {
+        **{
+            name: (more, {one: by_algorithm[one][name] if one in by_algorithm else empty for one in case.algorithms})
+            for name, more in MORE_IS_BETTER.items()
+        },
+        **{
+            metric.name: (metric.more_is_unsafe, {one: sample_of(case, one, metric) for one in case.algorithms})
+            for metric in case.scoring.metrics
+        },
+    }
 
 
 def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[dict[str, Any]]:
@@ -191,11 +189,7 @@ def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
     if NSGA2 in case.algorithms and len(case.algorithms) > 1:
         rows["RQ2"] = _rows_of_pairs(case, _nsga2_pairs(case), _samples(case, run_means))
     _add_holm([row for rows_of_question in rows.values() for row in rows_of_question])
-    return {
-        question: pd.DataFrame(rows[question], columns=columns, dtype=object)
-        for question, columns in (("RQ1", RQ1_RUNS_COLUMNS), ("RQ2", RQ2_RUNS_COLUMNS))
-        if question in rows
-    }
+    return {name: pd.DataFrame(rows[name], columns=RUNS_COLUMNS[name], dtype=object) for name in rows}
 
 
 def _add_holm(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -208,9 +202,9 @@ def _add_holm(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def rq1_runs(case: Case) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
-    Columns: `RQ1_RUNS_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus
-    half the share of equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the
-    run means. `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
+    Columns: `RUNS_COLUMNS["RQ1"]`. `effect_size` is the share of runs whose mean is safer than the original's value,
+    plus half the share of equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of
+    the run means. `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
 
     Raises
     ------
@@ -224,7 +218,7 @@ def rq2_runs(case: Case) -> pd.DataFrame:
     """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics'
     means over solutions.
 
-    Columns: `RQ2_RUNS_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is
+    Columns: `RUNS_COLUMNS["RQ2"]`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is
     defined as in `rq1_runs`.
 
     Raises
@@ -251,9 +245,8 @@ def compare_pairs(case: Case) -> pd.DataFrame:
         If there are no runs, or runs of only one algorithm.
     """
     samples = _samples_of_several(case, 2)
-    return pd.DataFrame(
-        _add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples)), columns=PAIR_COLUMNS, dtype=object
-    )
+    rows = _add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples))
+    return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
 
 
 def rank_algorithms(case: Case) -> pd.DataFrame:

@@ -66,13 +66,13 @@ def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
 def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     """The objectives' values, smaller being better, shape (rows, objectives); NaN where undefined."""
     signs = [objective.sign for objective in case.scoring.objectives]
-    return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
+    return frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs
 
 
 def defined_minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     """The `minimised_values` of the rows in which all objectives are defined."""
     points = minimised_values(case, frame)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def reference_front(case: Case) -> FloatArray:

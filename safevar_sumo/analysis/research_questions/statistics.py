@@ -142,5 +142,5 @@ def critical_difference(algorithm_count: int, run_count: int, alpha: float = ALP
     """Least difference of mean ranks that the test distinguishes (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)) for k
     algorithms and N runs.
     """
-    q = float(scipy.stats.studentized_range.ppf(1 - alpha, algorithm_count, np.inf)) / np.sqrt(2)
+    q = scipy.stats.studentized_range.ppf(1 - alpha, algorithm_count, np.inf) / np.sqrt(2)
     return float(q * np.sqrt(algorithm_count * (algorithm_count + 1) / (6 * run_count)))

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.research_questions.comparisons import titles_of
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.study import unit_text
 
 UNDEFINED = "-"
 SAFETY_UNITS = {
@@ -188,18 +189,13 @@ def lay_out(answer: Answer) -> list[Table]:
 
 
 def _arrange(frame: pd.DataFrame, layout: Layout) -> pd.DataFrame:
-    labels = frame[list(layout.labels)].rename(columns=HEADINGS)
-    cells = frame.set_index(
-        pd.MultiIndex.from_frame(labels) if len(labels.columns) > 1 else pd.Index(labels.iloc[:, 0])
-    )
+    cells = frame.set_index(list(layout.labels), drop=False).rename_axis(index=lambda name: HEADINGS.get(name, name))
     if layout.over is None:
         return cells[layout.columns].rename(columns=HEADINGS)
-    blocks = {
-        block: group[layout.columns]
-        if isinstance(layout.columns, str)
-        else group[layout.columns].rename(columns=HEADINGS)
-        for block, group in cells.groupby(layout.over, sort=False)
-    }
+    blocks = {}
+    for block, group in cells.groupby(frame[layout.over].to_numpy(), sort=False):
+        columns = group[layout.columns]
+        blocks[block] = columns if isinstance(columns, pd.Series) else columns.rename(columns=HEADINGS)
     return pd.concat(blocks, axis=1).fillna(UNDEFINED)
 
 
@@ -257,16 +253,13 @@ def _format(value: float | None, spec: str) -> str:
     return format(int(value) if spec == "d" else value, spec)
 
 
-def _note_on_metrics(metrics: Iterable[MetricFacts]) -> str:
+def _note_on_metrics(metrics: Sequence[MetricFacts]) -> str:
     """The metrics' units, and the solutions over which each metric is taken."""
-    titles: dict[bool, list[str]] = {False: [], True: []}
-    for metric in metrics:
-        titles[metric.over_collisions].append(metric.title + (f" [{metric.unit}]" if metric.unit != "-" else ""))
-    parts = [
-        f"{join_phrases(names)} over {which}"
-        for names, which in ((titles[False], "solutions without collision"), (titles[True], "all solutions"))
-        if names
-    ]
+    parts = []
+    for over_collisions, which in ((False, "solutions without collision"), (True, "all solutions")):
+        counted = [metric for metric in metrics if metric.over_collisions is over_collisions]
+        if counted:
+            parts.append(f"{join_phrases(one.title + unit_text(one.unit, ' [{}]') for one in counted)} over {which}")
     return f"{'; '.join(parts)}."
 
 

@@ -233,10 +233,10 @@ def _quantile_function(characteristic: Characteristic, distribution: Distributio
         case Triangular():
             lower, width = values["lower"], values["upper"] - values["lower"]
             triangle = scipy.stats.triang((values["mode"] - lower) / width, loc=lower, scale=width)
-            return lambda p: np.asarray(triangle.ppf(p))
+            return lambda p: triangle.ppf(p)
         case Normal():
             normal = _truncated_normal(low, high, values["mean"], values["deviation"])
-            return lambda p: np.asarray(normal.ppf(p))
+            return lambda p: normal.ppf(p)
         case Lognormal():
             logarithm = _truncated_normal(np.log(low), np.log(high), np.log(values["median"]), values["sigma"])
             return lambda p: np.exp(logarithm.ppf(p))
@@ -263,7 +263,7 @@ def compute_sensitivities(
     seed, names = evaluator.study.search.seed % 2**32, evaluator.characteristics.names
     problem = {"num_vars": len(names), "names": list(names), "bounds": [[0.0, 1.0]] * len(names)}
     points = sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
-    evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "sensitivity analysis")
+    evaluations = evaluator.evaluate(model.settings(points), "sensitivity analysis")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
     if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < MIN_OUTCOMES:
