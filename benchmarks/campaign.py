@@ -96,7 +96,7 @@ def processors() -> float:
 
 
 def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     rng = np.random.default_rng(seed)
     return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
 

@@ -115,7 +115,7 @@ def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(wha
             assert ((pedal >= 0) & (pedal <= 1)).all()
 
 
-SMOKE = CharacteristicSet.of(load_study("smoke").vehicle.characteristics)
+SMOKE = CharacteristicSet.of(load_study("smoke"))
 FEW = settings(
     max_examples=12, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture], deadline=None
 )

@@ -30,6 +30,8 @@ PARTS_PER_WORKER = 2
 """Number of parts per worker into which the cells of a rating are divided."""
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
+Interval = tuple[float, float]
+"""Lower and upper end."""
 CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
 a safety degree.
@@ -248,7 +250,7 @@ def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 
     return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
 
 
-def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> Interval:
     """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`."""
     import scipy
 

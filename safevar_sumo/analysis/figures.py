@@ -11,13 +11,14 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import WRITABLE, whole_file
+from safevar_sumo.records import JsonObject
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 200
-PICTURE_METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+PICTURE_METADATA: Mapping[str, JsonObject] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 """Metadata by file ending; they keep the date out of the file, so that equal figures have equal bytes."""
 FONT = 8
 DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"

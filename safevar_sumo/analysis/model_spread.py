@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter, missing_parameter
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
@@ -53,7 +53,7 @@ class ModelSpread:
     upper: float | None
     collisions: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The fields as plain values."""
         return asdict(self)
 
@@ -104,7 +104,7 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
 
     It is the Euclidean distance, each characteristic in widths of its domain, but at least `LEAST_DISTANCE`.
     """
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     changes = (settings - characteristics.original) / (characteristics.upper - characteristics.lower)
     return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
 

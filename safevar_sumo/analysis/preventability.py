@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -20,7 +19,7 @@ from msgspec.structs import replace
 from safevar_sumo.ads.reference_drivers import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.words import number_of, share_in_words
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import System, assemble
@@ -79,7 +78,7 @@ class Preventability:
         """The share of a category among the simulated collisions; 0 if no collision was simulated."""
         return self.counts.get(category, 0) / max(self.looked_at, 1)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The shares, None without a simulated collision, and the competent driver's 95 % interval, for JSON.
 
         If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a
@@ -175,7 +174,7 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
     ]
 
 
-def approach_parameters(system: System) -> dict[str, Any]:
+def approach_parameters(system: System) -> JsonObject:
     """Parameters with which a reference driver approaches from rest as the driving system does with the original
     vehicle.
 

@@ -19,6 +19,7 @@ from safevar_sumo.records import (
     TIME_DECIMALS,
     Evaluations,
     FloatArray,
+    JsonObject,
     Observation,
     Outcome,
     SimulationRuns,
@@ -174,7 +175,7 @@ class Simulation:
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The JSON of `simulate`: plain values, None where undefined."""
         return {
             "study": self.study.name,

@@ -99,7 +99,7 @@ def evaluate_all(
 
 def ask_why_no_verdict(study: Study, pool: Pool) -> str:
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
-    original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+    original = CharacteristicSet.of(study).original[np.newaxis]
     result = wait_for_result(
         RetryingPool(pool, study).submit(pack_study(study, inputs_of(study, pool), empty_road=True), original)
     )
@@ -129,7 +129,7 @@ def source_digests(study: Study, pool: Pool) -> Files:
         # Without an entry, a file that does not exist: its digest differs.
         files_read = _files_read.get(key, {"": "never read"})
         if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
-            original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+            original = CharacteristicSet.of(study).original[np.newaxis]
             _files_read[key] = dict(
                 wait_for_result(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files
             )
@@ -165,7 +165,7 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> None:
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / name
     if name in _passed_checks or marker.exists():
         return
-    original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+    original = CharacteristicSet.of(study).original[np.newaxis]
     wait_for_result(pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True))
     _passed_checks.add(name)
     with suppress(OSError):  # without the marker, the next process checks again

@@ -266,7 +266,7 @@ def _evaluate_original(
     study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer
 ) -> Evaluations:
     """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails."""
-    setting = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+    setting = CharacteristicSet.of(study).original[np.newaxis]
 
     def simulate() -> Evaluations:
         return wait_for_result(pool.submit(work, setting, must_succeed=True))
@@ -350,7 +350,7 @@ def forecast(
         with suppress(_Enough):
             run_campaign(probe, keys, results, pool, stopwatch, batch, engine=engine)
     evaluations = runs * search.evaluations
-    numbers = len(CharacteristicSet.of(study.vehicle.characteristics)) + len(METRICS) + NUMBERS_BESIDE_METRICS
+    numbers = len(CharacteristicSet.of(study)) + len(METRICS) + NUMBERS_BESIDE_METRICS
     return Forecast(
         evaluations, stopwatch.rate, evaluations / stopwatch.rate, evaluations * numbers * CHARACTERS_PER_NUMBER
     )

@@ -37,10 +37,7 @@ class Retries:
 
     def __init__(self, study: Study) -> None:
         self._study, self._failures_in_a_row = study, 0
-        self._characteristics, self._user_code = (
-            CharacteristicSet.of(study.vehicle.characteristics),
-            user_code_names(study),
-        )
+        self._characteristics, self._user_code = (CharacteristicSet.of(study), user_code_names(study))
 
     def evaluate(self, compute: Compute, settings: FloatArray, *, must_succeed: bool = False) -> Iterator[Evaluations]:
         """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after
@@ -160,7 +157,7 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was
     reduced.
     """
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     point = ["--point", shlex.quote(study.origin.point)] if study.origin.point else []
     changes = [
         f"--set {characteristic.name}={value!r}"

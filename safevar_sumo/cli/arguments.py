@@ -21,7 +21,7 @@ from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.cli.program import print_note, print_warning
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.output import check_writable
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.study import Study, load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -149,7 +149,7 @@ class CommandTarget(NamedTuple):
     source: str
     handle: SolutionId | None = None
     setting: FloatArray | None = None
-    row: dict[str, Any] | None = None
+    row: JsonObject | None = None
 
 
 def load_target(source: str, solution: str | None, choice: str | None) -> CommandTarget:

@@ -13,6 +13,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.cli.arguments import json_option
 from safevar_sumo.cli.program import commands, print_json
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
+from safevar_sumo.records import JsonObject
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
@@ -37,7 +38,7 @@ def list_command(section: str | None, as_json: bool) -> None:
         _print_catalogue(Console(), studies, [section] if section else SECTIONS)
 
 
-def _catalogue(studies: list[Study]) -> dict[str, Any]:
+def _catalogue(studies: list[Study]) -> JsonObject:
     keys = ("name", "unit", "original", "lower", "upper", "threshold", "meaning", "counterpart")
     characteristics = {
         name: [{key: getattr(item, key) for key in keys} for item in members]
@@ -83,7 +84,7 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
 
 def _characteristics(studies: list[Study]) -> dict[str, CharacteristicSet]:
     """The characteristics of each vehicle, in the first study that has it."""
-    return {study.vehicle.model: CharacteristicSet.of(study.vehicle.characteristics) for study in reversed(studies)}
+    return {study.vehicle.model: CharacteristicSet.of(study) for study in reversed(studies)}
 
 
 def _described(models: Mapping[str, Callable[..., Any]]) -> list[dict[str, str]]:

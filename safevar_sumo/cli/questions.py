@@ -225,7 +225,7 @@ def rating(
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
     subject = load_results_or_study(source)
-    characteristics = CharacteristicSet.of(study_in(subject).vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study_in(subject))
     values = read_changes(changes, characteristics, beyond=False, single=True)
     options = RatingOptions(changes={name: value for name, (value,) in values.items()}, solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:

@@ -162,7 +162,7 @@ def import_command(study: str, out: Path, original: str | None, **paths: Path | 
         raise InputError("import", "no file is given", "at least one of --nsga2, --rs, --safe-fuzzer")
     adds_to_results = original is None and (out / MANIFEST).exists()
     metrics = None if adds_to_results else original_metrics(original, loaded_study.published)
-    characteristics = CharacteristicSet.of(loaded_study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(loaded_study)
     solutions = {
         algorithm: evaluations_of(read_rows(path, characteristics), characteristics)
         for algorithm, path in files.items()

@@ -38,7 +38,7 @@ from safevar_sumo.cli.program import commands, print_json, print_note, print_war
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import whole_file
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
@@ -265,7 +265,7 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     if simulation.no_verdict:
         print_text(console, simulation.no_verdict)
     table = WholeTable("characteristic", "unit", right=("original", "simulated"), title=simulation.study.title)
-    characteristics = CharacteristicSet.of(simulation.study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(simulation.study)
     changed = [item for item in characteristics if simulation.setting[item.name] != item.original]
     for item in characteristics:
         value, style = simulation.setting[item.name], "bold" if item in changed else None
@@ -356,7 +356,7 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
         print_text(console, summary)
 
 
-def _cell_text(result: dict[str, Any]) -> Text:
+def _cell_text(result: JsonObject) -> Text:
     if result["outcome"] == Outcome.INVALID_TEST:
         return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
     if result["impact_speed"] is None:

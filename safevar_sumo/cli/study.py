@@ -9,7 +9,7 @@ from collections import Counter
 from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 import msgspec
@@ -27,7 +27,7 @@ from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
 from safevar_sumo.cli.program import commands, print_note, print_remarks, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
@@ -88,7 +88,7 @@ def study(
     """Search STUDY; run the same command again to continue where it stopped."""
     as_written = load_study(study)
     search = as_written.search
-    changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
+    changes: JsonObject = {name: value for name, value in numbers.items() if value is not None}
     if algorithms is not None:
         changes["algorithms"] = [search.labels.get(name, name) for name in split_names(algorithms)]
     loaded_study, system = load_for_search(

@@ -17,6 +17,7 @@ from safevar_sumo.records.driving import (
     Encounter as Encounter,
     FloatArray as FloatArray,
     IntArray as IntArray,
+    JsonObject as JsonObject,
     Nominal as Nominal,
     Observation as Observation,
     Outcome as Outcome,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,8 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int_]
+JsonObject = dict[str, Any]
+"""An object of JSON, or a table of TOML: plain values by key."""
 
 STANDSTILL = 1e-3
 """Speed below which a vehicle counts as standing [m/s] (method section 4)."""

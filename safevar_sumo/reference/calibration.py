@@ -261,7 +261,7 @@ def _begin_at_random(
 
 
 def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
-    original, agreements = CharacteristicSet.of(study.vehicle.characteristics).original, {}
+    original, agreements = CharacteristicSet.of(study).original, {}
     for name, data in references.items():
         evaluations = evaluate_all(study, np.concatenate([original[np.newaxis], data.settings]), pool)
         rows = evaluations.take(np.arange(1, len(evaluations)))

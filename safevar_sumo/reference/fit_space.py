@@ -177,7 +177,7 @@ class StudyFit:
         self.study = study
         self._losses = [ReferenceLoss(data, study) for data in references.values()]
         self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
-        original = CharacteristicSet.of(study.vehicle.characteristics).original
+        original = CharacteristicSet.of(study).original
         settings = [original[np.newaxis], *(data.settings for data in references.values())]
         self._ends = [0, *np.cumsum([len(rows) for rows in settings])]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
@@ -245,7 +245,7 @@ class ReferenceLoss:
         self._deviations = {
             name: float(np.std(values)) for name, values in defined_values.items() if values.size and np.ptp(values) > 0
         }
-        self._regression = Regression.over(data.settings, CharacteristicSet.of(study.vehicle.characteristics))
+        self._regression = Regression.over(data.settings, CharacteristicSet.of(study))
         self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
 
     def of(self, evaluations: Evaluations) -> float:

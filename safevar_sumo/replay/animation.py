@@ -7,13 +7,13 @@ import subprocess
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
 from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, lane_outlines, lay_out_scene
 
@@ -246,7 +246,7 @@ def animation_page(scene: FlatScene) -> str:
     )
 
 
-def player_data(scene: FlatScene) -> dict[str, Any]:
+def player_data(scene: FlatScene) -> JsonObject:
     """The data of the template `player`: the still picture, and under `played` the data of the script. y points
     down.
     """
@@ -287,7 +287,7 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
     }
 
 
-def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
+def _list_jumps(scene: FlatScene) -> list[JsonObject]:
     """The moments that the player's buttons jump to, in order of time."""
     jumps = []
     for row, moments in enumerate(scene.comparison.moments):
@@ -300,7 +300,7 @@ def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
-def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
+def _drive_data(scene: FlatScene, row: int) -> JsonObject:
     trace, moments = scene.comparison.runs.trace, scene.comparison.moments[row]
     samples = slice(0, moments.end + 1)
     return {
@@ -314,7 +314,7 @@ def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
     }
 
 
-def _moving_body_data(body: FlatBody) -> dict[str, Any]:
+def _moving_body_data(body: FlatBody) -> JsonObject:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
     return {
         "drive": body.row if body.is_vut else None,
@@ -324,7 +324,7 @@ def _moving_body_data(body: FlatBody) -> dict[str, Any]:
     }
 
 
-def _still_body_data(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
+def _still_body_data(body: FlatBody, scene: FlatScene) -> JsonObject:
     """One body at the key sample."""
     place = np.array([values[scene.key_sample] for values in (body.x, -body.y, -np.rad2deg(body.heading))])
     x, y, heading = _rounded_list(place)

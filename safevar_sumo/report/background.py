@@ -16,7 +16,7 @@ from safevar_sumo.analysis.model_spread import compute_model_spreads
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.reference import Totals, shipped_totals_of
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.causes import FIRST_CHOICES
@@ -35,7 +35,7 @@ GENERAL_LIMITS = (
 )
 
 
-def describe_tested_system(data: ReportInput) -> dict[str, Any]:
+def describe_tested_system(data: ReportInput) -> JsonObject:
     """Describe the tested vehicle, driving system and scenario, and the search, in sentences.
 
     `characteristics` holds name, unit, original, lower, upper, threshold and meaning of each.
@@ -123,7 +123,7 @@ def _agreement_sentence(file: str, totals: Totals) -> str:
     return f"{'; '.join(parts)}."
 
 
-def describe_limits(data: ReportInput, explained: Explained | None) -> dict[str, Any]:
+def describe_limits(data: ReportInput, explained: Explained | None) -> JsonObject:
     """Describe how far the findings of one study hold, and how well it agrees with published data.
 
     `published` lists metrics of the original vehicle: name, published value, value here. `spread` lists vehicles: name,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from safevar_sumo.analysis.explain.braking_comparison import sentence
@@ -14,7 +12,7 @@ from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.words import number_of, points_in_words
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import KMH_PER_MS
+from safevar_sumo.records import KMH_PER_MS, JsonObject
 from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.scenarios import distance_in_words
@@ -25,10 +23,9 @@ MAX_CAUSES = 6
 FIRST_CHOICES = ("fewest", "smallest", "most_severe")
 """Choices that select the first solutions on the page, as the flags of `simulate` do."""
 NO_VALUE = "–"  # noqa: RUF001
-Section = dict[str, Any]
 
 
-def make_verdict(data: ReportInput, explained: Explained | None, tolerance: Tolerance | None) -> Section:
+def make_verdict(data: ReportInput, explained: Explained | None, tolerance: Tolerance | None) -> JsonObject:
     """The verdict: the sentences of `explain`, key figures, and the failures that they name."""
     if explained is None:
         return {"sentences": ["No solution was found."], "is_bad": False, "key_figures": [], "failures": []}
@@ -41,7 +38,7 @@ def make_verdict(data: ReportInput, explained: Explained | None, tolerance: Tole
     }
 
 
-def _describe_failure(data: ReportInput, failure: Explanation) -> Section:
+def _describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
     setting, matrix = np.array(list(failure.setting.values())), data.system.matrix
     largest = float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
     return {
@@ -81,7 +78,7 @@ def _key_figures(data: ReportInput, explained: Explained, tolerance: Tolerance |
     ]
 
 
-def make_cause_sections(data: ReportInput, explained: Explained) -> list[Section]:
+def make_cause_sections(data: ReportInput, explained: Explained) -> list[JsonObject]:
     """A section for one minimal cause of each set of characteristics.
 
     The first is the cause that the verdict names; the others follow in order of their robustness, then of their size.
@@ -105,7 +102,7 @@ def make_cause_sections(data: ReportInput, explained: Explained) -> list[Section
 
 def _make_cause_section(
     data: ReportInput, rank: int, cause: Cause, failure: Explanation, opinion: Opinion | None
-) -> Section:
+) -> JsonObject:
     comparison, player = data.play(data.case.characteristics.setting(cause.changes, "cause", beyond=True))
     rows = [
         (item.name, item.short_name, item.words, *(quantity_text(value, item.unit) for value in values))
@@ -136,10 +133,10 @@ def reason_without_opinion(data: ReportInput) -> str:
     return ""
 
 
-def replay_solutions(data: ReportInput, explained: Explained | None, progress: Progress) -> list[Section]:
+def replay_solutions(data: ReportInput, explained: Explained | None, progress: Progress) -> list[JsonObject]:
     """Replay the solutions that `FIRST_CHOICES` select and the explained ones."""
     failures = [failure.name for failure in explained.explanations if failure.handle] if explained else []
-    handles, entries = list(dict.fromkeys([*data.select_handles(*FIRST_CHOICES), *failures])), list[Section]()
+    handles, entries = list(dict.fromkeys([*data.select_handles(*FIRST_CHOICES), *failures])), list[JsonObject]()
     for index, handle in enumerate(handles):
         progress("replays", index, len(handles))
         row, setting = data.solutions[handle], data.setting_of(handle)

@@ -18,7 +18,7 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.scene import lay_out_scene
@@ -31,7 +31,7 @@ EXPLAIN_SIMULATIONS = 30_000
 """Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
 
 
-def page_options() -> dict[str, Any]:
+def page_options() -> JsonObject:
     """Each question's options on the page: smaller samples than the commands take."""
     all_options: tuple[Options, ...] = (
         ExplainOptions(limit=EXPLAIN_SIMULATIONS),
@@ -60,7 +60,7 @@ class ReportInput:
     later_changes: Sequence[str] = ()
 
     @cached_property
-    def solutions(self) -> dict[str, dict[str, Any]]:
+    def solutions(self) -> dict[str, JsonObject]:
         """Rows of the solutions by handle; each row also holds its handle."""
         handles = map(str, handles_of(self.case.solutions))
         rows: list[dict[Any, Any]] = self.case.solutions.to_dict("records")
@@ -91,7 +91,7 @@ class ReportInput:
         texts = changes_in_words(characteristics, setting)
         return [(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
 
-    def play(self, setting: FloatArray) -> tuple[Comparison, dict[str, Any]]:
+    def play(self, setting: FloatArray) -> tuple[Comparison, JsonObject]:
         """Simulate a setting beside the original vehicle, in a matrix at its worst point; the second value is the
         animation, in the form that the template `player` takes, with the point.
         """

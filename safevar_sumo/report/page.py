@@ -41,6 +41,7 @@ from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.background import describe_agreement, describe_limits, describe_tested_system
@@ -66,7 +67,7 @@ HIDDEN_COLUMNS = ("lower", "upper", "not_simulated")
 """Columns of an answer's frame that the table beside its figure leaves out."""
 
 
-def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
+def list_tables(cases: Sequence[Case]) -> list[JsonObject]:
     """Every table of the research questions; if none can be answered, one table with the reason."""
     try:
         answers = answer_questions(cases)
@@ -75,7 +76,7 @@ def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
     return [table_data(table.frame, table.title, table.notes) for answer in answers for table in lay_out(answer)]
 
 
-def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> dict[str, Any]:
+def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> JsonObject:
     """A frame as the template's table: the index as labels, the outer level of columns as headings over several
     columns.
     """
@@ -106,7 +107,7 @@ def _cell_text(value: Any) -> str:
     return "" if value is None else superscript_powers(str(value))
 
 
-def figure_data(figure: Figure, frame: pd.DataFrame) -> dict[str, Any]:
+def figure_data(figure: Figure, frame: pd.DataFrame) -> JsonObject:
     """An answer's figure, with its values as a table."""
     shown = frame[[name for name in frame if name not in HIDDEN_COLUMNS]].set_index("characteristic")
     return {**_picture("", figure), "table": table_data(shown, "Values of the figure")}
@@ -292,7 +293,7 @@ def _study_data(
     }
 
 
-def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
+def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) -> JsonObject:
     """The page's data about one rated study: the original vehicle, and the solution with the fewest changes that loses
     a point, simulated in all cells.
     """

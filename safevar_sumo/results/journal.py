@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,7 +22,7 @@ import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.manifest import FORMAT, RUNS
 
 SPARE_POSITION = -1
@@ -34,11 +34,8 @@ UNDAMAGED = "the file as it was, or no file: the run is then simulated again"
 ANOTHER_OWNER = "belongs to another study, version or run"
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
-Line = dict[str, Any]
-"""A line of a journal."""
 
-
-def journal_head(study: str, run: str, characteristics: Sequence[str]) -> Line:
+def journal_head(study: str, run: str, characteristics: Sequence[str]) -> JsonObject:
     """The first line of a journal, what it belongs to: the digest of a study's identity, a run's name; and the names of
     the characteristics.
     """
@@ -95,7 +92,7 @@ class Journal:
         If the journal belongs to another study or is damaged before its tail.
     """
 
-    def __init__(self, path: Path, head: Line, deadline: float = 0.0) -> None:
+    def __init__(self, path: Path, head: JsonObject, deadline: float = 0.0) -> None:
         self.path, self._head = path, head
         self._file = _open_and_lock(path, deadline)
         try:
@@ -146,7 +143,7 @@ class Journal:
             self._write(self._head)
         return _content_of(lines, self.path, self._head)._replace(tail_size=len(data) - end)
 
-    def _write(self, line: Line, *, sync: bool = False) -> None:
+    def _write(self, line: JsonObject, *, sync: bool = False) -> None:
         start = self._file.tell()
         try:
             remainder = memoryview(msgspec.json.encode(line) + b"\n")
@@ -166,7 +163,7 @@ class Journal:
         self._file.seek(end)
 
 
-def read_journal(path: Path, head: Line) -> JournalContent:
+def read_journal(path: Path, head: JsonObject) -> JournalContent:
     """The contents of a journal that another process may be writing.
 
     Raises
@@ -221,7 +218,7 @@ def _open_and_lock(path: Path, deadline: float) -> IO[bytes]:
             return file
 
 
-def _parse(data: bytes, path: Path) -> tuple[list[Line], int]:
+def _parse(data: bytes, path: Path) -> tuple[list[JsonObject], int]:
     """All whole lines, and the offset at which they end.
 
     Raises
@@ -229,11 +226,11 @@ def _parse(data: bytes, path: Path) -> tuple[list[Line], int]:
     InputError
         If a line is damaged that is not the last one, or the file is no journal.
     """
-    lines: list[Line] = []
+    lines: list[JsonObject] = []
     end = 0
     for text in data.splitlines(keepends=True):
         try:
-            line = msgspec.json.decode(text, type=Line)
+            line = msgspec.json.decode(text, type=JsonObject)
         except msgspec.DecodeError as error:
             if end + len(text) == len(data):
                 break
@@ -249,7 +246,7 @@ def _parse(data: bytes, path: Path) -> tuple[list[Line], int]:
     return lines, end
 
 
-def _batch_line(positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]) -> Line:
+def _batch_line(positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]) -> JsonObject:
     """A batch of evaluations as a table."""
     line = {
         POSITION: list(positions),
@@ -264,7 +261,7 @@ def _batch_line(positions: Sequence[int], evaluations: Evaluations, characterist
     return line
 
 
-def _evaluations_of(line: Line, characteristics: Sequence[str]) -> Evaluations:
+def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluations:
     """The batch of evaluations in a line."""
     if len({len(values) for values in line.values()}) > 1:
         raise ValueError("columns of different lengths")
@@ -287,7 +284,7 @@ def _evaluations_of(line: Line, characteristics: Sequence[str]) -> Evaluations:
     )
 
 
-def _content_of(lines: Sequence[Line], path: Path, head: Line) -> JournalContent:
+def _content_of(lines: Sequence[JsonObject], path: Path, head: JsonObject) -> JournalContent:
     """The contents of a journal from its lines in order."""
     characteristics, positions, results = head["characteristics"], list[int](), dict[int, tuple[list[int], int]]()
     empty = Evaluations.none(len(characteristics), METRICS)

@@ -5,14 +5,15 @@ choice.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results.journal import JournalContent, journal_head, read_journal
 from safevar_sumo.results.manifest import MANIFEST, identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
@@ -66,7 +67,7 @@ class StoredResults(NamedTuple):
         Every setting that could not be simulated.
     """
 
-    manifest: dict[str, Any]
+    manifest: JsonObject
     evaluations: pd.DataFrame
     solutions: pd.DataFrame
     finished: tuple[tuple[str, int], ...] = ()
@@ -118,7 +119,7 @@ class Status(NamedTuple):
         done = sum(self.budget if run.state == "finished" else min(run.simulated, self.budget) for run in self.runs)
         return done / max(self.budget * len(self.runs), 1)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """The object that `status --json` prints."""
         return {
             "study": self.study,
@@ -130,7 +131,7 @@ class Status(NamedTuple):
         }
 
 
-def _read_search(folder: Path, manifest: Mapping[str, Any]) -> tuple[list[tuple[str, int]], int, tuple[str, ...]]:
+def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, int]], int, tuple[str, ...]]:
     """The runs of a manifest's study, the budget of each run [evaluations], and the characteristics."""
     try:
         study = manifest["study"]
@@ -142,7 +143,7 @@ def _read_search(folder: Path, manifest: Mapping[str, Any]) -> tuple[list[tuple[
 
 
 def _read_journals(
-    folder: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]], characteristics: tuple[str, ...]
+    folder: Path, manifest: JsonObject, runs: Sequence[tuple[str, int]], characteristics: tuple[str, ...]
 ) -> Iterator[tuple[str, int, JournalContent | None]]:
     """Algorithm, number and journal's content of every run; None for a run without a journal."""
     digest = identity_digest(manifest)

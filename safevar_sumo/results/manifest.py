@@ -15,6 +15,7 @@ from typing import Any
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import DESCRIPTION_KEYS, Study, tables_of
 
 FORMAT = 4
@@ -121,7 +122,7 @@ def write_whole(path: Path, text: str) -> None:
         raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None
 
 
-def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
+def manifest_of(study: Study, identity: Mapping[str, Any]) -> JsonObject:
     """The manifest of a study as it is run, without the original vehicle's evaluation.
 
     Parameters
@@ -139,9 +140,9 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def evaluation_keys(study: Study) -> dict[str, Any]:
+def evaluation_keys(study: Study) -> JsonObject:
     """Study keys that affect evaluations."""
-    tables: dict[str, Any] = tables_of(study)
+    tables: JsonObject = tables_of(study)
     for characteristic in tables["vehicle"]["characteristics"].values():
         for key in DESCRIPTION_KEYS:
             del characteristic[key]
@@ -152,12 +153,12 @@ def evaluation_keys(study: Study) -> dict[str, Any]:
     }
 
 
-def identity_digest(manifest: Mapping[str, Any]) -> str:
+def identity_digest(manifest: JsonObject) -> str:
     """The digest that identifies a manifest's study in its journals."""
     return sha256(json.dumps({layer: manifest.get(layer) for layer in IDENTITY}, sort_keys=True).encode()).hexdigest()
 
 
-def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, str, bool]]:
+def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
     """The differences between the inputs of stored results and other inputs.
 
     Each is its layer of `IDENTITY`, a text, and whether it may change simulations: other search libraries and machines,
@@ -179,18 +180,18 @@ def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[t
             yield layer, text, not is_harmless
 
 
-def search_extent_of(manifest: Mapping[str, Any]) -> Any:
+def search_extent_of(manifest: JsonObject) -> Any:
     """The study keys that decide which runs, of which length, the table of solutions covers."""
     search = manifest["study"]["search"]
     return [search["algorithms"], search["runs"], search["evaluations"]]
 
 
-def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:
+def write_manifest(directory: Path, manifest: JsonObject) -> None:
     """Write a manifest."""
     write_whole(directory / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
 
 
-def read_manifest(directory: Path) -> dict[str, Any]:
+def read_manifest(directory: Path) -> JsonObject:
     """The manifest of a results directory.
 
     Raises
@@ -222,7 +223,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     return dict(manifest)
 
 
-def folders_of(directory: Path, manifest: Mapping[str, Any]) -> tuple[str, ...]:
+def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
     """Folders of the user code and files of a directory's study: those of the manifest that exist, then the directory's
     two parents.
     """

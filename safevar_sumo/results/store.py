@@ -16,7 +16,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import digest_of, file_by_name
-from safevar_sumo.records import Evaluations, finite_or_none
+from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
 from safevar_sumo.results.journal import Journal, JournalBusyError, files_read_later, journal_head, read_journal
 from safevar_sumo.results.manifest import (
     FORMAT,
@@ -75,7 +75,7 @@ class ResultsDirectory:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
         self._refuse_another_study()
-        self.inputs: dict[str, Any] = {layer: self.manifest.get(layer, {}) for layer in LAYERS_OF_FILES}
+        self.inputs: JsonObject = {layer: self.manifest.get(layer, {}) for layer in LAYERS_OF_FILES}
         """Digests, by layer, of the files that all workers must share."""
         self.inputs["sources"] = {**self.inputs["sources"], **_later_files(path, study)}
 
@@ -129,7 +129,7 @@ class ResultsDirectory:
 
 
 def input_differences(
-    directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any], study: Study
+    directory: Path, stored: JsonObject, now: JsonObject, study: Study
 ) -> list[tuple[str, str, bool]]:
     """The `differences` between the stored inputs of a directory's results, with files that were first read later, and
     present inputs.
@@ -193,7 +193,7 @@ def evaluations_frame(
     )
 
 
-def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
+def record(evaluations: Evaluations, row: int) -> JsonObject:
     """One evaluation as plain values; undefined values are None."""
     numbers = {
         "collision_speed": evaluations.collision_speed[row],
@@ -260,7 +260,7 @@ def write_imported(
         frame = frame.sort_values(
             ["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True
         )
-    manifest: dict[str, Any] = {
+    manifest: JsonObject = {
         "format": FORMAT,
         "study": tables,
         "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
@@ -272,7 +272,7 @@ def write_imported(
     return replaced_counts
 
 
-def _earlier_manifest(path: Path, study: dict[str, Any]) -> dict[str, Any]:
+def _earlier_manifest(path: Path, study: JsonObject) -> JsonObject:
     """The manifest of an earlier import of the study; empty if there is none."""
     if not (path / RUNS).exists() and not (path / MANIFEST).exists():
         return {}

@@ -17,7 +17,7 @@ from msgspec import Struct
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import CharacteristicTable, unit_text
+from safevar_sumo.study import Study, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
@@ -119,9 +119,10 @@ class CharacteristicSet:
     members: tuple[Characteristic, ...]
 
     @classmethod
-    def of(cls, table: Mapping[str, CharacteristicTable]) -> CharacteristicSet:
-        """The characteristics of a study's table, in its order."""
-        return cls(tuple(Characteristic(name=name, **msgspec.structs.asdict(entry)) for name, entry in table.items()))
+    def of(cls, study: Study) -> CharacteristicSet:
+        """The characteristics of a study, in its order."""
+        rows = study.vehicle.characteristics.items()
+        return cls(tuple(Characteristic(name=name, **msgspec.structs.asdict(row)) for name, row in rows))
 
     def __len__(self) -> int:
         return len(self.members)

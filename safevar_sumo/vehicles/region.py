@@ -163,7 +163,7 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
         If a function cannot be loaded, or if the original vehicle or every change is infeasible.
     """
     source = source or study.source
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
     lookup = Lookup(source, study.origin.places)

@@ -45,7 +45,7 @@ class Plant:
         degree: Callable[[FloatArray], FloatArray] | None = None,
         failing: Region | None = None,
     ):
-        self._characteristics, self._region = CharacteristicSet.of(study.vehicle.characteristics), region
+        self._characteristics, self._region = CharacteristicSet.of(study), region
         self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
         self._failing = failing or nowhere
         self.seen: set[bytes] = set()

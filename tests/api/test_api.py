@@ -52,9 +52,7 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.objectives["f_num_diff"] == 1
     assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
     assert result.metrics["safety_degree"] == result.objectives["f_safe"]
-    assert result.original.setting == {
-        one.name: one.original for one in CharacteristicSet.of(result.study.vehicle.characteristics)
-    }
+    assert result.original.setting == {one.name: one.original for one in CharacteristicSet.of(result.study)}
     assert result.original.original is result.original
     assert result.original.metrics != result.metrics
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1

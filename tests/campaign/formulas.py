@@ -19,7 +19,7 @@ from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.made_up import made_up_evaluations
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def evaluated(settings: np.ndarray) -> Evaluations:

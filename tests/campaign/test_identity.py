@@ -52,7 +52,7 @@ def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -
     study = msgspec.structs.replace(
         study, scenario=msgspec.structs.replace(study.scenario, parameters={"network": str(tmp_path / "mine")})
     )
-    work, original = pack_study(study), CharacteristicSet.of(study.vehicle.characteristics).original[None]
+    work, original = pack_study(study), CharacteristicSet.of(study).original[None]
     evaluate_batch(work, original)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
     traffic.write_text(traffic.read_text() + "<!-- -->")

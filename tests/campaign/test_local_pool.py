@@ -27,7 +27,7 @@ from tests.campaign.formulas import evaluated
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = pack_study(load_study("smoke"))
-ORIGINAL = CharacteristicSet.of(load_study("smoke").vehicle.characteristics).original[np.newaxis]
+ORIGINAL = CharacteristicSet.of(load_study("smoke")).original[np.newaxis]
 
 
 def processes() -> list[psutil.Process]:
@@ -97,7 +97,7 @@ def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> Non
 
 
 STUDY = load_study("sun")
-SUN = CharacteristicSet.of(STUDY.vehicle.characteristics)
+SUN = CharacteristicSet.of(STUDY)
 WITH_USER_CODE = msgspec.structs.replace(
     STUDY, ads=ModelTable(model="my_ads:Mine"), origin=Origin(called="my study.toml")
 )
@@ -180,7 +180,7 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
 
 def reproduced(study: Study, **values: float) -> str:
     """What follows the study's name in the command that reproduces these values."""
-    setting = CharacteristicSet.of(study.vehicle.characteristics).setting(values, "test", beyond=True)
+    setting = CharacteristicSet.of(study).setting(values, "test", beyond=True)
     return reproduction_command(study, setting).partition(f"simulate {study.name}")[2]
 
 

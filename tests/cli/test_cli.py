@@ -102,7 +102,7 @@ def test_80_columns_break_no_word_of_a_heading() -> None:
     assert len(head) <= 80
 
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def simulate(*arguments: str) -> Result:

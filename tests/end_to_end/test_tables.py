@@ -26,7 +26,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def package_csv(path: Path, rows: int, seed: int, **constant: float) -> Path:
     """Made-up solutions of the study sun in the published package's columns: rounded, unfiltered, radius in cm."""
     rng = np.random.default_rng(seed)
-    characteristics = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+    characteristics = CharacteristicSet.of(load_study("sun"))
     settings = np.round(rng.uniform(characteristics.lower, characteristics.upper, (rows, len(characteristics))), 3)
     settings[::2, :6] = characteristics.original[:6] + 0.001
     sd = np.round(rng.uniform(-1, 3, rows), 3)
@@ -79,7 +79,7 @@ def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> Non
     frame = pd.read_csv(imported / "solutions.csv")
     assert "run" not in frame
     assert len(frame) == 70
-    characteristics = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+    characteristics = CharacteristicSet.of(load_study("sun"))
     settings = frame[list(characteristics.names)].to_numpy()
     assert (settings[:, :6] == characteristics.original[:6]).any(axis=0).all(), (
         "changes below the threshold are put back"

@@ -99,7 +99,7 @@ def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(
     calculator: Calculator, template: Path, tmp_path: Path
 ) -> None:
     study = load_study("euro_ncap_rating")
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     worst = characteristics.setting(
         {
             "treadDepth": 1.6,
@@ -137,7 +137,7 @@ def test_the_pages_commands_run_as_typed(
 
 
 STUDY = load_study("euro_ncap_rating")
-MEMBERS = CharacteristicSet.of(STUDY.vehicle.characteristics)
+MEMBERS = CharacteristicSet.of(STUDY)
 GAIN = {
     "treadDepth": 4.2,
     "brakeTorque": 0.87,

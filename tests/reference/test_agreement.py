@@ -82,8 +82,8 @@ def test_rank_correlation_of_known_orders() -> None:
         assert rank_correlation(np.arange(len(undefined)), np.array(undefined)) is None
 
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
-LGSVL = CharacteristicSet.of(load_study("lgsvl").vehicle.characteristics)
+SUN = CharacteristicSet.of(load_study("sun"))
+LGSVL = CharacteristicSet.of(load_study("lgsvl"))
 SUN_COLUMNS = [
     "max_rpm",
     "dampRateFullT",

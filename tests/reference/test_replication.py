@@ -30,7 +30,7 @@ from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def typed(*arguments: object) -> Result:

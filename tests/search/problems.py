@@ -13,7 +13,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.vehicles.region import FeasibleRegion
 from tests.made_up import made_up_evaluations
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
 Evaluate = Callable[[CharacteristicSet, np.ndarray], Evaluations]
 

@@ -141,7 +141,7 @@ def test_dirty_sensors_see_late_and_not_far() -> None:
     assert seen[100] == pytest.approx(60 - 0.5 * 96)
 
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def one(lower: float, original: float, upper: float) -> Characteristic:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations, islice
 from math import comb
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,7 +21,7 @@ from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.words import direction_in_words
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, FloatArray, finite_or_none
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.vehicles import CharacteristicSet
 
 MAX_SUBSETS = 20_000
@@ -222,7 +222,7 @@ class Cause:
         }[self.end]
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """An entry of `minimal_causes` in `explain --json`."""
         names = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
         return {name: getattr(self, name) for name in names}

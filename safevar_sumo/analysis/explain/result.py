@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -16,7 +16,7 @@ from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dol
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import SolutionId
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
@@ -71,7 +71,7 @@ class Explanation:
             name for name in self.changed if self.causes and all(name in cause.changes for cause in self.causes)
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """An entry of `explain --json`."""
         algorithm, run, index = self.handle or (None, None, None)
         return {
@@ -128,7 +128,7 @@ class Explained:
 
     @property
     def characteristics(self) -> CharacteristicSet:
-        return CharacteristicSet.of(self.study.vehicle.characteristics)
+        return CharacteristicSet.of(self.study)
 
     @property
     def choices(self) -> list[Explanation]:
@@ -152,7 +152,7 @@ class Explained:
         """The answer in sentences, the verdict first."""
         return answer_in_words(self)
 
-    def to_dict(self) -> list[dict[str, Any]]:
+    def to_dict(self) -> list[JsonObject]:
         """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
         by_name = self.necessity.set_index("characteristic")
         summary = {

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import msgspec
 import numpy as np
@@ -25,7 +25,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, FloatArray, Outcome, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.sumo.matrix import evaluate
@@ -101,7 +101,7 @@ class Opinions:
     without_cause: tuple[str, ...] = ()
     no_verdict: str = ""
 
-    def to_dict(self) -> list[dict[str, Any]]:
+    def to_dict(self) -> list[JsonObject]:
         """The JSON of `opinion`."""
         return [*map(msgspec.to_builtins, self.opinions), *summary_entry(self.no_verdict)]
 
@@ -131,7 +131,7 @@ class Opinions:
 
     def sentences(self) -> list[str]:
         """The answer as lines: how many causes are confirmed, then every cause with the reason."""
-        characteristics = CharacteristicSet.of(self.study.vehicle.characteristics)
+        characteristics = CharacteristicSet.of(self.study)
         *notes, counts = self.notes
         lines = [
             f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {counts}.",

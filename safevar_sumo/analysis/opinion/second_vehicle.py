@@ -23,7 +23,7 @@ from safevar_sumo.analysis.opinion.multi_body import (
     load_bmw_parameters,
 )
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, GuardedVehicle, Sensors, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.base import Characteristics
@@ -44,7 +44,7 @@ class Road(NamedTuple):
     wet: bool | BoolArray
 
 
-def _brakes_for(force: FloatArray, mass: float) -> dict[str, Any]:
+def _brakes_for(force: FloatArray, mass: float) -> JsonObject:
     """The package's wheels, and brakes that decelerate a vehicle of `mass` [kg] with them by `force` / `mass`."""
     bmw = load_bmw_parameters()
     return {

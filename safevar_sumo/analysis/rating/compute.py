@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +18,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, with_protocol
-from safevar_sumo.records import CellResults, FloatArray, finite_or_none
+from safevar_sumo.records import CellResults, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
@@ -98,8 +97,8 @@ class RatedVehicle:
             warning, DECIMALS
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        cells: dict[str, list[dict[str, Any]]] = {matrix.name: [] for matrix in self.protocol.matrices}
+    def to_dict(self) -> JsonObject:
+        cells: dict[str, list[JsonObject]] = {matrix.name: [] for matrix in self.protocol.matrices}
         for cell_number, cell in enumerate(self.protocol.cells):
             impact, warning = self.measured(cell_number)
             cells[cell.matrix.name].append(
@@ -176,7 +175,7 @@ class Rating:
         ]
         return pd.DataFrame(rows, columns=["vehicle", "test", "light", *POINT_KINDS, "total", "possible"])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The JSON of `rating`."""
         return {
             "study": self.study.name,

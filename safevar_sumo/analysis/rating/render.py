@@ -121,7 +121,7 @@ def test_in_words(test: RatedTest) -> str:
 
 
 def _changes_in_words(rating: Rating, variant: RatedVehicle) -> str:
-    characteristics = CharacteristicSet.of(rating.study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(rating.study)
     changes = [
         (
             f"{characteristic.short_name} "
@@ -294,7 +294,7 @@ def summarise_rated_solutions(
             f"No solution loses a point of the original's {original_points:.2f}.",
             f"Points against each characteristic: {question_command('tolerance', directory)}",
         ]
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     lines = [
         f"The original vehicle earns {original_points:.2f} points. {int(has_loss.sum())} of "
         f"{number_of(len(solutions), 'solution')} lose at least one point."

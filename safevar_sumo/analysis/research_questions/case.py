@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,7 +15,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, convert_table
@@ -74,7 +73,7 @@ class Case:
 
     @property
     def characteristics(self) -> CharacteristicSet:
-        return CharacteristicSet.of(self.study.vehicle.characteristics)
+        return CharacteristicSet.of(self.study)
 
     @property
     def weather(self) -> Weather:
@@ -204,7 +203,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
 
 def build_case(
     study: Study,
-    original: Mapping[str, Any],
+    original: JsonObject,
     solutions: pd.DataFrame,
     evaluations: pd.DataFrame,
     finished: Sequence[tuple[str, int]],

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,6 +36,7 @@ from safevar_sumo.analysis.research_questions.statistics import (
 )
 from safevar_sumo.analysis.words import number_of, two_decimals
 from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.records import JsonObject
 
 TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original"]
@@ -93,7 +93,7 @@ def rq1(case: Case) -> pd.DataFrame:
 
 def _rows_against_original(
     case: Case, sample_of: SampleFunction, test: Callable[[pd.Series[float], float], TwoSampleTest]
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     case.require_solutions()
     rows = []
     for algorithm in case.algorithms:
@@ -161,7 +161,7 @@ def _samples(case: Case, sample_of: SampleFunction) -> Samples:
     }
 
 
-def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[dict[str, Any]]:
+def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[JsonObject]:
     """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`."""
     return [
         {
@@ -192,7 +192,7 @@ def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
     return {name: pd.DataFrame(rows[name], columns=RUNS_COLUMNS[name], dtype=object) for name in rows}
 
 
-def _add_holm(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _add_holm(rows: list[JsonObject]) -> list[JsonObject]:
     """Add `p_holm` to the rows, corrected as one family."""
     for row, p in zip(rows, correct_by_holm([row["p_value"] for row in rows]), strict=True):
         row["p_holm"] = p
@@ -262,7 +262,7 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs, or fewer than three algorithms.
     """
-    tests, rows = list[dict[str, Any]](), list[dict[str, Any]]()
+    tests, rows = list[JsonObject](), list[JsonObject]()
     for metric, (more_is_better, by_algorithm) in _samples_of_several(case, 3).items():
         blocks = pd.DataFrame(by_algorithm).dropna()
         values = blocks.to_numpy(dtype=float)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.evaluator import Interval
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, escape_dollars, new_figure
 from safevar_sumo.analysis.risk import RARE_BELOW
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import finite_or_none
+from safevar_sumo.records import JsonObject, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.characteristics import Uniform
 from safevar_sumo.sumo.empty_road import driven_entry
@@ -54,7 +55,7 @@ class Estimate:
 
     probability: float
     coefficient_of_variation: float
-    interval: tuple[float, float]
+    interval: Interval
     failures: int
     errors: int
     simulations: int
@@ -98,7 +99,7 @@ class Risk(Estimate):
         probability = self.of_fleet(vehicles)
         return "above 0.99" if probability > 0.99 else f"{probability:.2g}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The JSON of `risk`."""
         rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")
         return {
@@ -150,7 +151,7 @@ class Risk(Estimate):
     def sentences(self) -> Iterator[str | Table]:
         """The probability with its interval, how vehicles vary, and which characteristics decide."""
         low, high = self.interval
-        characteristics = CharacteristicSet.of(self.study.vehicle.characteristics)
+        characteristics = CharacteristicSet.of(self.study)
         sampling = "" if self.method == "monte_carlo" else f", drawn by {self.method.replace('_', ' ')}"
         yield f"Unsafe: {self.unsafe.description}. {self.failures} of {self.samples} vehicles{sampling}."
         label = "Share of the domain that is unsafe:" if self.is_share_of_domain else "Probability"

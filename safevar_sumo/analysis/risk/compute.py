@@ -21,7 +21,7 @@ from safevar_sumo.analysis.risk.answer import Estimate, Risk
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -186,7 +186,7 @@ class VariationModel:
     """
 
     def __init__(self, study: Study) -> None:
-        self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+        self._characteristics = CharacteristicSet.of(study)
         self._quantiles = [
             _quantile_function(characteristic, study.variation.get(characteristic.name, Uniform()))
             for characteristic in self._characteristics
@@ -271,7 +271,7 @@ def compute_sensitivities(
     return _sobol_indices(problem, degree, confidence, seed), _sobol_indices(problem, is_unsafe, confidence, seed)
 
 
-def _sobol_indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
+def _sobol_indices(problem: JsonObject, output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
     """Sobol indices of an output over the design, without base points at which the output is undefined for any
     setting.
     """

@@ -16,12 +16,12 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, clopper_pearson
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Interval, clopper_pearson
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.terminal import constraints_in_words, meanings
@@ -41,9 +41,6 @@ RULES_NOTE = (
 """What the shares of rules are shares of."""
 LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
-
-
-Interval = tuple[float, float]
 
 
 class Rule(NamedTuple):
@@ -89,7 +86,7 @@ class Rule(NamedTuple):
             f"{join_phrases(conditions or ['everywhere'])}{others}: {unsafe.in_words} in {density}, covers {coverage}"
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """An entry of `rules --json`."""
         limits, *shares = self
         conditions = [
@@ -109,11 +106,11 @@ class Rules:
     rules: list[Rule]
     samples: int
     unsafe_share: float
-    unsafe_interval: tuple[float, float]
+    unsafe_interval: Interval
     remark: str = ""
     no_verdict: str = ""
 
-    def to_dict(self) -> list[dict[str, Any]]:
+    def to_dict(self) -> list[JsonObject]:
         """The JSON of `rules`: a list with an entry for each rule, and a summary if no verdict on the ADS is
         possible.
         """
@@ -140,7 +137,7 @@ class Rules:
 
     def sentences(self) -> Iterator[str | Table]:
         """Every rule with its density and coverage."""
-        characteristics, (low, high) = CharacteristicSet.of(self.study.vehicle.characteristics), self.unsafe_interval
+        characteristics, (low, high) = CharacteristicSet.of(self.study), self.unsafe_interval
         yield (
             f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles "
             "drawn evenly over "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 from rich.table import Table
@@ -16,7 +16,7 @@ from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeSc
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
@@ -105,7 +105,7 @@ class Tolerance:
             index=pd.Index([scan.characteristic.name for scan in self.alone], name="characteristic"),
         ).reset_index()
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The JSON of `tolerance`."""
         return {
             "study": self.study.name,

@@ -8,15 +8,15 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.evaluator import Evaluator, Interval
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
@@ -33,7 +33,6 @@ GRID_VALUES = 21
 PARTS_PER_SIDE, PLANE_ROUNDS, MAX_SQUARES = 4, 4, 12
 """Search for the nearest unsafe setting of a plane: number of parts of a divided square's side, of rounds (down to a
 5120th of the domain), and maximum number of squares divided in each round."""
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +93,7 @@ class OneAtATimeScan:
             (value for value in kept if kept[value] < limit), key=lambda value: abs(value - original), default=None
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """An entry of `alone` in `tolerance --json`; in a rated study with points, and where points are first lost."""
         rating_entries = (
             {}

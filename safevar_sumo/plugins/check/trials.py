@@ -61,7 +61,7 @@ def try_simulations(study: Study) -> Iterator[Failure]:
 
 def try_constraint(study: Study, function: str) -> Iterator[Failure]:
     """Apply a constraint's function to the original vehicle, the corners of the domains and random settings."""
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     settings = _settings(characteristics, COMPUTED)
 
     def load() -> Callable[[Rows], Results]:
