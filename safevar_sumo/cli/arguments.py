@@ -32,8 +32,10 @@ if TYPE_CHECKING:
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
-def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
+def check_output(path: Path | None, flag: str, endings: tuple[str, ...] = PICTURE_ENDINGS) -> None:
     """Refuse an output file with an unknown ending, with solutions, or that cannot be written; names the flag."""
+    if path is None:
+        return
     if path.name == SOLUTIONS and path.exists():
         raise InputError(flag, f"{path} holds results", "another file")
     if path.suffix.lower() not in endings:
@@ -140,6 +142,7 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 CommandFunction = Callable[..., Any]
+Decorator = Callable[[CommandFunction], CommandFunction]
 
 
 class CommandTarget(NamedTuple):
@@ -178,13 +181,12 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
     return CommandTarget(case.study, source, handle, setting, {str(name): value for name, value in row.items()})
 
 
-def file_option(
-    flag: str, help_text: str, *, metavar: str = "FILE", **options: Any
-) -> Callable[[CommandFunction], CommandFunction]:
+def file_option(flag: str, help_text: str, *, metavar: str = "FILE", **options: Any) -> Decorator:
     """An option that names a file or directory to write."""
     return click.option(flag, type=click.Path(path_type=Path), metavar=metavar, help=help_text, **options)
 
 
+directories_argument = click.argument("directories", nargs=-1, required=True, metavar="DIR...")
 jobs_option = click.option(
     "--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]"
 )
@@ -206,7 +208,7 @@ def as_it_is_now() -> bool:
     return bool(click.get_current_context().meta.get(AS_IT_IS_NOW_KEY))
 
 
-def add_flags(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
+def add_flags(question: type[Options]) -> Decorator:
     """Decorator that adds the flags of a question's options; the command makes them by `question(**keywords)`."""
 
     def add(command: CommandFunction) -> CommandFunction:
@@ -219,7 +221,7 @@ def add_flags(question: type[Options]) -> Callable[[CommandFunction], CommandFun
     return add
 
 
-def _add_flag(flag: str, name: str, default: Any, option: Option) -> Callable[[CommandFunction], CommandFunction]:
+def _add_flag(flag: str, name: str, default: Any, option: Option) -> Decorator:
     if option.kind is bool:
         return click.option(flag, name, is_flag=True, default=default, help=option.help)
     if option.form != "one":

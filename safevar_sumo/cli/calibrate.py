@@ -12,7 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import terminate_as_interrupt
-from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, file_option, jobs_option
+from safevar_sumo.cli.arguments import check_output, complete_study, file_option, jobs_option
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import find_owner, print_by_metric, read_rows
 from safevar_sumo.errors import InputError
@@ -70,8 +70,7 @@ def calibrate_command(
     systems = [assemble(item, name) for item, name in zip(studies, names, strict=True)]
     if len({item.name for item in studies}) < len(studies):
         raise InputError("STUDY", f"two studies are called {studies[0].name!r}", "studies of different names")
-    if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
+    check_output(plot, "--plot")
     owners = [find_owner(word, studies) for word in words if word not in names]
     if len({path.name for _, path in owners}) < len(owners):
         raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")

@@ -19,8 +19,8 @@ from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import answer_question, study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
-    PICTURE_ENDINGS,
     CommandFunction,
+    Decorator,
     add_flags,
     as_it_is_now_option,
     check_output,
@@ -42,12 +42,12 @@ SPREADSHEET_ENDINGS = (".xlsx",)
 
 
 def add_question(
-    options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
+    options: type[Options], metavar: str, *further_decorators: Decorator
 ) -> Callable[[CommandFunction], click.Command]:
     """Decorator of a question's command: adds flags for its options, and flags that all questions share."""
 
     def add(command: CommandFunction) -> click.Command:
-        decorators: list[Callable[[CommandFunction], CommandFunction]] = [
+        decorators: list[Decorator] = [
             click.argument("source", metavar=metavar),
             add_flags(options),
             point_option,
@@ -61,11 +61,6 @@ def add_question(
         return commands.command(name=options.question)(command)
 
     return add
-
-
-def _check_plot(plot: Path | None) -> None:
-    if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
 
 
 def _show(result: Any, as_json: bool, plot: Path | None = None) -> None:
@@ -148,7 +143,7 @@ def tolerance(
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
     subject = load_results_or_study(source, point)
-    _check_plot(plot)
+    check_output(plot, "--plot")
     _show(answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs), as_json, plot)
 
 
@@ -162,7 +157,7 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
     options, subject = RiskOptions(**values), load_results_or_study(source, point)
-    _check_plot(plot)
+    check_output(plot, "--plot")
     result = answer_question(estimate_risk, subject, options, jobs=jobs)
     if result.study.correlations:
         print_note("no sensitivity indices: they are not defined for correlated characteristics")
@@ -230,8 +225,8 @@ def rating(
     options = RatingOptions(changes={name: value for name, (value,) in values.items()}, solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:
         raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
+    check_output(plot, "--plot")
     if plot is not None:
-        _check_plot(plot)
         _refuse_existing(plot, "--plot", force)
     spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
     result = answer_question(rate_variant, subject, options, jobs=jobs)

@@ -12,9 +12,9 @@ from rich.console import Console
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.api.simulation import evaluate_settings
 from safevar_sumo.cli.arguments import (
-    PICTURE_ENDINGS,
     check_output,
     complete_study,
+    directories_argument,
     file_option,
     jobs_option,
     json_option,
@@ -70,9 +70,8 @@ def validate(
     loaded_study = load_study(study)
     print_remarks(loaded_study)
     characteristics = assemble(loaded_study, study).characteristics
-    for path, flag, endings in ((plot, "--plot", PICTURE_ENDINGS), (totals, "--totals", (".toml",))):
-        if path is not None:
-            check_output(path, flag, endings)
+    check_output(plot, "--plot")
+    check_output(totals, "--totals", (".toml",))
     data = read_rows(reference, characteristics)
     settings = np.concatenate([characteristics.original[np.newaxis], data.settings])
     with open_progress(True) as progress:
@@ -222,7 +221,7 @@ class _MultivalueCommand(click.Command):
 
 
 @commands.command(cls=_MultivalueCommand)
-@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@directories_argument
 @click.option(
     "--published",
     "published",
@@ -244,8 +243,7 @@ def replicate(
     directories: tuple[str, ...], published: tuple[str, ...], out: Path | None, references: tuple[str, ...]
 ) -> None:
     """Compare the results DIR... with published ones: tables side by side, and whether each conclusion holds."""
-    if out is not None:
-        check_output(out, "--out", (".md",))
+    check_output(out, "--out", (".md",))
     cases, data = load_cases(directories), dict[str, list[ReferenceData]]()
     for reference in references:
         index, path = find_owner(reference, [case.study for case in cases])

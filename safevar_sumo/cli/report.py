@@ -15,6 +15,7 @@ from safevar_sumo.cli.arguments import (
     as_it_is_now,
     as_it_is_now_option,
     check_output,
+    directories_argument,
     file_option,
     jobs_option,
     point_option,
@@ -28,7 +29,7 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
 
 
 @commands.command()
-@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@directories_argument
 @click.option("--rq", "question", type=click.Choice(QUESTIONS), help="Answer only this question.")
 @click.option(
     "--format",
@@ -58,7 +59,7 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
 
 
 @commands.command()
-@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@directories_argument
 @file_option("--out", "Directory for the pictures.", metavar="DIR", required=True)
 @click.option(
     "--format",
@@ -84,7 +85,7 @@ def _print_notes(notes: list[str]) -> None:
 
 
 @commands.command()
-@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@directories_argument
 @file_option("--out", "File to write the page to.", metavar="FILE.html", default=Path("report.html"), show_default=True)
 @click.option(
     "--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ..."

@@ -21,7 +21,6 @@ from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
-    PICTURE_ENDINGS,
     CommandTarget,
     as_it_is_now_option,
     check_output,
@@ -146,10 +145,8 @@ def simulate_command(
 
 def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None) -> None:
     """Before any simulation, refuse files that cannot be written."""
-    if trace is not None:
-        check_output(trace, "--trace", (".csv",))
-    if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
+    check_output(trace, "--trace", (".csv",))
+    check_output(plot, "--plot")
     if animation is not None:
         from safevar_sumo.replay.animation import ENDINGS, find_ffmpeg
 

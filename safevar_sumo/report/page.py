@@ -44,9 +44,16 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.replay.comparison import format_number, superscript_powers
-from safevar_sumo.report.background import describe_agreement, describe_limits, describe_tested_system
-from safevar_sumo.report.causes import make_cause_sections, make_verdict, reason_without_opinion, replay_solutions
 from safevar_sumo.report.input import ReportInput, page_options, read_inputs
+from safevar_sumo.report.sections import (
+    describe_agreement,
+    describe_limits,
+    describe_tested_system,
+    make_cause_sections,
+    make_verdict,
+    reason_without_opinion,
+    replay_solutions,
+)
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.terminal import Progress, show_no_progress

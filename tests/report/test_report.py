@@ -25,8 +25,8 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, input as report_input, make_report, page as report_page
-from safevar_sumo.report.background import describe_conditions
 from safevar_sumo.report.page import read_inputs
+from safevar_sumo.report.sections import describe_conditions
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point, weather_of
 from safevar_sumo.sumo.system import assemble

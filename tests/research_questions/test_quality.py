@@ -12,25 +12,23 @@ import pytest
 import scipy
 from hypothesis import given, strategies as st
 
-from safevar_sumo.analysis.research_questions.indicators import (
-    compute_attainment,
-    compute_convergence,
-    compute_indicators,
-    defined_minimised_values,
-    hypervolume,
-    igd,
-    igd_plus,
-    nondominated_points,
-    normalised,
-    reference_front,
-)
 from safevar_sumo.analysis.research_questions.statistics import (
     EXACT_TEST,
     TwoSampleTest,
     compare_samples,
+    compute_attainment,
+    compute_convergence,
+    compute_indicators,
     correct_by_holm,
     critical_difference,
+    defined_minimised_values,
+    hypervolume,
+    igd,
+    igd_plus,
     magnitude_of,
+    nondominated_points,
+    normalised,
+    reference_front,
     signed_rank_test,
 )
 from safevar_sumo.errors import InputError

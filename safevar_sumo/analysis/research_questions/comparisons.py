@@ -23,11 +23,13 @@ from safevar_sumo.analysis.research_questions.case import (
     UnanswerableError,
     defined_solutions,
 )
-from safevar_sumo.analysis.research_questions.indicators import INDICATOR_TITLES, MORE_IS_BETTER, compute_indicators
 from safevar_sumo.analysis.research_questions.statistics import (
     ALPHA,
+    INDICATOR_TITLES,
+    MORE_IS_BETTER,
     TwoSampleTest,
     compare_samples,
+    compute_indicators,
     correct_by_holm,
     critical_difference,
     fewest_runs,

@@ -25,7 +25,8 @@ from safevar_sumo.analysis.figures import (
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq31, rq32
 from safevar_sumo.analysis.research_questions.comparisons import rank_algorithms
-from safevar_sumo.analysis.research_questions.indicators import (
+from safevar_sumo.analysis.research_questions.statistics import (
+    ALPHA,
     INDICATOR_TITLES,
     REFERENCE_COORDINATE,
     SURFACE_PERCENTAGES,
@@ -34,7 +35,6 @@ from safevar_sumo.analysis.research_questions.indicators import (
     defined_minimised_values,
     nondominated_points,
 )
-from safevar_sumo.analysis.research_questions.statistics import ALPHA
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.study import SAFETY_DEGREE
