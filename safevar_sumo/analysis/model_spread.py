@@ -5,14 +5,13 @@ equally well.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter, missing_parameter
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
@@ -33,8 +32,7 @@ fall a frame off.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelSpread:
+class ModelSpread(NamedTuple):
     """Predictions for one setting by the parameter sets of a study's table [spread].
 
     Attributes
@@ -52,10 +50,6 @@ class ModelSpread:
     lower: float | None
     upper: float | None
     collisions: int
-
-    def to_dict(self) -> JsonObject:
-        """The fields as plain values."""
-        return asdict(self)
 
     def __str__(self) -> str:
         """One sentence on the band and the collisions."""

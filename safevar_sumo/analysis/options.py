@@ -115,13 +115,9 @@ class Options:
         its default.
         """
         parts = [PROGRAM_COMMAND, self.question, quote(subject)]
-        for option_field in fields(self):
-            value, flag, definition = (
-                getattr(self, option_field.name),
-                self.flags()[option_field.name],
-                option_field.metadata["option"],
-            )
-            if value == option_field.default:
+        for name, definition in self.definitions().items():
+            value, flag = getattr(self, name), self.flags()[name]
+            if value == getattr(type(self), name):
                 continue
             if isinstance(value, Mapping):
                 value = [f"{key}={number!r}" for key, number in value.items()]

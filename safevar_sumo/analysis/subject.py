@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST, input_differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import Progress, open_progress
@@ -47,9 +48,9 @@ class Results:
         return self.case.study
 
     @cached_property
-    def original(self) -> Mapping[str, Any]:
+    def original(self) -> JsonObject:
         """The original vehicle's outcome, metrics and objectives as plain values, None where undefined."""
-        return dict(read_manifest(self.directory)["original"])
+        return JsonObject(read_manifest(self.directory)["original"])
 
     @property
     def solutions(self) -> pd.DataFrame:

@@ -102,7 +102,7 @@ def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[
         if rows:
             print_names(console, title, rows, heads)
 
-    def texts(row: Mapping[str, Any], *keys: str) -> tuple[str, ...]:
+    def texts(row: JsonObject, *keys: str) -> tuple[str, ...]:
         return tuple(f"{row[key]:g}" for key in keys)
 
     study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]

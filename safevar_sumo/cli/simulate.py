@@ -218,7 +218,7 @@ def _print_results(
     if as_json:
         solution = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(result) for result in results_at_points]} if results_at_points else {}
-        spread = {"spread": {**spreads[0].to_dict(), "original": spreads[1].to_dict()}} if spreads else {}
+        spread = {"spread": {**spreads[0]._asdict(), "original": spreads[1]._asdict()}} if spreads else {}
         print_json({**simulation.to_dict(), **solution, **matrix, **spread})
     else:
         print_simulation(Console(), simulation)

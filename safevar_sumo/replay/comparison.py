@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.braking_comparison import brake_onset
 from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
-from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike, unit_text
 from safevar_sumo.sumo.batch import score
@@ -270,7 +270,7 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     return replace(runs, trace=replace(trace, throttle=throttle, brake=brake))
 
 
-def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
+def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
     """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no
     rating points.
     """

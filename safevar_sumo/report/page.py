@@ -247,9 +247,7 @@ def make_report(
     )
 
 
-def _study_data(
-    data: ReportInput, sections: Collection[str], jobs: int | None, progress: Progress
-) -> Mapping[str, Any]:
+def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, progress: Progress) -> JsonObject:
     """Make the data of one study that the templates of these sections need."""
     options = page_options()
     explained: Explained | None = None

@@ -1,6 +1,6 @@
 """Statistics of runs (docs/method.md, section 7): tests (Mann-Whitney U, signed ranks, Friedman), effect sizes and
-corrections for many tests; then the quality of a run's front: IGD on the objectives in their units, IGD+ and hypervolume
-on normalised ones.
+corrections for many tests; then the quality of a run's front: IGD on the objectives in their units, IGD+ and
+hypervolume on normalised ones.
 """
 
 from __future__ import annotations

@@ -94,11 +94,6 @@ class Risk(Estimate):
         """Probability that at least one of N = `vehicles` vehicles that vary independently is unsafe, 1 - (1 - p)^N."""
         return float(-np.expm1(vehicles * np.log1p(-self.probability))) if self.probability < 1 else 1.0
 
-    def of_fleet_in_words(self, vehicles: int) -> str:
-        """The probability `of_fleet`, which is never called certain."""
-        probability = self.of_fleet(vehicles)
-        return "above 0.99" if probability > 0.99 else f"{probability:.2g}"
-
     def to_dict(self) -> JsonObject:
         """The JSON of `risk`."""
         rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")
@@ -172,9 +167,10 @@ class Risk(Estimate):
                 "vary."
             )
         elif 0 < self.probability < RARE_BELOW:
+            of_fleet = self.of_fleet(FLEET_VEHICLES)
             yield (
                 f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
-                f"{self.of_fleet_in_words(FLEET_VEHICLES)}."
+                f"{'above 0.99' if of_fleet > 0.99 else f'{of_fleet:.2g}'}."
             )
         yield _how_vehicles_vary(self.study)
         yield from constraints_in_words(self.study)
