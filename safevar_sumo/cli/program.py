@@ -116,7 +116,7 @@ def commands() -> None:
 
 def main() -> None:
     """Run the program; its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input) or 130 (interrupted)."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = lambda message, *_, **__: print_warning(message)  # without its file and line
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file
         faulthandler.enable()  # if compiled code crashes, its line is printed
     try:
@@ -144,11 +144,6 @@ def _error_in_two_lines(error: click.ClickException) -> str:
     """Put an error of click into the form of this program's errors."""
     command = " ".join([PROGRAM_COMMAND, *(word for word in sys.argv[1:2] if word in COMMANDS)])
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Show a warning without its file and line."""
-    print_warning(message)
 
 
 @contextmanager

@@ -102,11 +102,6 @@ class BrakingComparison(NamedTuple):
     parts: dict[str, float]
     point: str = ""
 
-    @property
-    def lost_margin(self) -> float:
-        """Sum of the parts [m]; below 0 if the changed vehicle gained margin."""
-        return sum(self.parts.values())
-
 
 def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is nearest; None if it
@@ -250,4 +245,4 @@ def sentence(comparison: BrakingComparison) -> str:
     if abs(comparison.parts["remainder"]) > MAX_OMITTED_REMAINDER:
         phrases.append(f"{comparison.parts['remainder']:.2f} m unexplained")
     lost = f"{endings} Its margin, the gap at the brake command less the distance needed to stop, is "
-    return f"{lost}{comparison.lost_margin:.2f} m smaller: {', '.join(phrases) or 'they brake alike'}."
+    return f"{lost}{sum(comparison.parts.values()):.2f} m smaller: {', '.join(phrases) or 'they brake alike'}."

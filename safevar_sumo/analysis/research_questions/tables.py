@@ -223,7 +223,11 @@ def _mark_tests(cells: pd.DataFrame, answer: Answer) -> pd.DataFrame:
     it), and significant effect sizes, without the correction only notable ones.
     """
     frame = answer.frame
-    p_values = {name: frame[name].map(_format_p_value) for name in ("p_value", "p_holm") if name in frame}
+    p_values = {
+        name: frame[name].map(lambda p: "<0.001" if p is not None and p < 0.001 else _format(p, ".3f"))
+        for name in ("p_value", "p_holm")
+        if name in frame
+    }
     name = list(p_values)[-1]
     is_significant = is_notable = frame[name].astype(float) < ALPHA
     if name == "p_value":
@@ -237,10 +241,6 @@ def _mark_tests(cells: pd.DataFrame, answer: Answer) -> pd.DataFrame:
     if "effect_size" in cells:
         cells["effect_size"] = _bold_where(cells["effect_size"], is_notable)
     return cells
-
-
-def _format_p_value(value: float | None) -> str:
-    return "<0.001" if value is not None and value < 0.001 else _format(value, ".3f")
 
 
 def _bold_where(cells: pd.Series[str], conditions: pd.Series[bool]) -> list[str]:

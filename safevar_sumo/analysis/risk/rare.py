@@ -68,19 +68,15 @@ class Response:
     """
 
     def __init__(self, evaluator: Evaluator, settings_of: SettingsFunction, unsafe: Unsafe) -> None:
-        self._evaluator, self._settings_of, self._unsafe = evaluator, settings_of, unsafe
-        self.dimensions = len(evaluator.characteristics)
+        self._evaluator, self.settings_of, self._unsafe = evaluator, settings_of, unsafe
+        self.names, self.dimensions = evaluator.characteristics.names, len(evaluator.characteristics)
         self.simulations = self.errors = self.failure_count = 0
         self.nearest = np.zeros((0, self.dimensions))
-
-    def values_at(self, point: FloatArray) -> dict[str, float]:
-        """The values by characteristic of the vehicle at a point, shape (1, n)."""
-        return dict(zip(self._evaluator.characteristics.names, self._settings_of(point)[0].tolist(), strict=True))
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
         array = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
-        return self.record(array, self._evaluator.evaluate(self._settings_of(array), "rare failures"))
+        return self.record(array, self._evaluator.evaluate(self.settings_of(array), "rare failures"))
 
     def record(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
         """Count known evaluations of points, remember the nearest failure among the points, and return the response."""
@@ -154,7 +150,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
         quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR_DEGREES))
         factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
         interval, remark = (mean / factor, min(mean * factor, 1.0)), ""
-        design_point = response.values_at(_find_design_point(response, np.random.default_rng(seed)))
+        (setting,) = response.settings_of(_find_design_point(response, np.random.default_rng(seed))).tolist()
+        design_point = dict(zip(response.names, setting, strict=True))
     return Estimate(
         probability=max(mean, 0.0),
         coefficient_of_variation=variation,

@@ -98,17 +98,10 @@ def _unsafe_settings(evaluator: Evaluator, scans: Sequence[OneAtATimeScan], pair
 def find_safe_box(
     evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray, known: FloatArray
 ) -> SafeBox:
-    """The largest safe box around an original vehicle that is safe itself.
+    """The largest safe box, in which `columns` vary, around an original vehicle that is safe itself.
 
-    Parameters
-    ----------
-    columns
-        The characteristics that vary.
-    unsafe_settings
-        Unsafe settings, shape (K, n), each the nearest of its line; the box ends before all of them.
-    known
-        Unsafe solutions of a search, shape (L, n); the box shrinks from them as from unsafe settings that it finds
-        itself.
+    The box ends before all of `unsafe_settings`, shape (K, n), each the nearest of its line. From the unsafe solutions
+    of a search, `known`, shape (L, n), it shrinks as from unsafe settings that it finds itself.
 
     Notes
     -----
