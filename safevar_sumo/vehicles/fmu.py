@@ -98,24 +98,8 @@ class FmuVehicle(Vehicle):
         self._communication_step = description.communication_step(table["step"], source, "vehicle")
         self.UNITS = dict(units)
         self._sensor_entries, self._type_entries = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
-        for key, entries, quantities in (
-            ("sensors", self._sensor_entries, SENSOR_UNITS),
-            ("sumo_type", self._type_entries, TYPE_UNITS),
-        ):
-            for name, entry in entries.items():
-                if name not in quantities:
-                    raise unknown_name(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
-                if key == "sensors" and isinstance(entry, str) and entry not in units:
-                    raise unknown_name(
-                        source,
-                        f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic",
-                        entry,
-                        units,
-                        ", or a number",
-                    )
-                self._refuse_too_small(
-                    table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency"
-                )
+        self._check_entries("sensors", self._sensor_entries, SENSOR_UNITS, table["characteristics"])
+        self._check_entries("sumo_type", self._type_entries, TYPE_UNITS, table["characteristics"])
         input_ports = ports_of(
             description,
             table["inputs"],
@@ -135,13 +119,8 @@ class FmuVehicle(Vehicle):
                 if name not in entries:
                     raise InputError(source, f"vehicle.{key}.{name} is missing", LEGAL_ENTRIES[key])
         self._characteristic_units = {
-            entry: self._unit_pair(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
-            for key, entries, quantities in (
-                ("sensors", self._sensor_entries, SENSOR_UNITS),
-                ("sumo_type", self._type_entries, TYPE_UNITS),
-            )
-            for name, unit in quantities.items()
-            if isinstance(entry := entries.get(name), str) and entry in units
+            **self._characteristic_units_of(description, "sensors", self._sensor_entries, SENSOR_UNITS),
+            **self._characteristic_units_of(description, "sumo_type", self._type_entries, TYPE_UNITS),
         }
         characteristic_ports = {
             name: self._characteristic_port(description, name, unit)
@@ -154,27 +133,43 @@ class FmuVehicle(Vehicle):
         type_ports = ports_of(
             description, type_variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type"
         )
-        self._inputs, self._characteristics, self._outputs = (
-            tuple(input_ports),
-            tuple(characteristic_ports),
-            (*output_ports, *type_ports),
-        )
-        self._reads_type = bool(type_ports)
+        self._inputs, self._characteristics = tuple(input_ports), tuple(characteristic_ports)
+        self._outputs, self._reads_type = (*output_ports, *type_ports), bool(type_ports)
         ports = [*input_ports.values(), *characteristic_ports.values()]
         constants = constants_of(description, table["parameters"], ports, source, "vehicle.parameters")
         self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
         self.takes_slope, self.can_start_moving = "grade" in input_ports, "initial_speed" in input_ports
-        self.remarks = (
-            []
-            if "road_friction" in input_ports
-            else [
-                (
-                    f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it "
-                    "accelerates and brakes"
-                )
+        if "road_friction" not in input_ports:
+            self.remarks = [
+                f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it "
+                "accelerates and brakes"
             ]
-        )
+
+    def _check_entries(
+        self,
+        key: str,
+        entries: Mapping[str, str | float],
+        quantities: Mapping[str, str],
+        table: Mapping[str, CharacteristicTable],
+    ) -> None:
+        """Refuse names of no quantity, and wrong values, in the study's table `vehicle.sensors` or
+        `vehicle.sumo_type`.
+        """
+        for name, entry in entries.items():
+            if name not in quantities:
+                raise unknown_name(
+                    self._guard.source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities
+                )
+            if key == "sensors" and isinstance(entry, str) and entry not in self.UNITS:
+                raise unknown_name(
+                    self._guard.source,
+                    f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic",
+                    entry,
+                    self.UNITS,
+                    ", or a number",
+                )
+            self._refuse_too_small(table, f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
 
     def _refuse_too_small(
         self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool
@@ -204,18 +199,22 @@ class FmuVehicle(Vehicle):
             defined_unit,
         )
 
-    def _unit_pair(
-        self, description: Description, name: str, unit: str, quantity_unit: str, key: str
-    ) -> tuple[Unit, Unit]:
-        """The units of a characteristic that sets a quantity, and of the quantity."""
-        defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
-        if defined_unit is None or not defined_unit.fits(SI[quantity_unit]):
-            raise InputError(
-                self._guard.source,
-                f"{key} = {name!r}: the unit of that characteristic is {unit!r}",
-                f"a unit of {quantity_unit}",
-            )
-        return defined_unit, SI[quantity_unit]
+    def _characteristic_units_of(
+        self, description: Description, key: str, entries: Mapping[str, str | float], quantities: Mapping[str, str]
+    ) -> dict[str, tuple[Unit, Unit]]:
+        """The units of the characteristics that set quantities, and of those quantities."""
+        pairs = {}
+        for name, unit in quantities.items():
+            if isinstance(entry := entries.get(name), str) and entry in self.UNITS:
+                defined_unit = description.units.get(self.UNITS[entry]) or COMMON_UNITS.get(self.UNITS[entry])
+                if defined_unit is None or not defined_unit.fits(SI[unit]):
+                    raise InputError(
+                        self._guard.source,
+                        f"vehicle.{key}.{name} = {entry!r}: the unit of that characteristic is {self.UNITS[entry]!r}",
+                        f"a unit of {unit}",
+                    )
+                pairs[entry] = defined_unit, SI[unit]
+        return pairs
 
     def prepare(
         self,
