@@ -127,7 +127,7 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
     reasons = [_reason_for_sumo(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
     keys = [
-        _Key(scenario, network, tuple(options))
+        (scenario, network, tuple(options))
         for scenario, network in zip(recordable, stage_networks(recordable), strict=True)
     ]
     new_keys = [key for key in dict.fromkeys(keys) if key not in _recordings]
@@ -137,7 +137,7 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
         ]:
             del _recordings[old_key]
         _recordings.update(zip(new_keys, _recordings_of(new_keys), strict=True))
-    scenes = {key.scenario: _recordings[key] for key in keys}
+    scenes = {scenario: _recordings[scenario, network, step] for scenario, network, step in keys}
     return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
@@ -151,14 +151,8 @@ def _reason_for_sumo(scenario: Scenario) -> str:
     return ""
 
 
-class _Key(NamedTuple):
-    """A scenario, its network, and additional options of SUMO."""
-
-    scenario: Any
-    network: Network
-    options: tuple[str, ...]
-
-
+_Key = tuple[Any, Network, tuple[str, ...]]
+"""A scenario, its network, and additional options of SUMO."""
 _recordings: dict[_Key, Recording | str] = {}
 """The scenes that this process keeps, or the reasons why scenes cannot be recorded."""
 
@@ -169,10 +163,11 @@ def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
     def play() -> list[Recording | str]:
         return [_play(*key) for key in keys]
 
-    if any(isinstance(key.scenario, GuardedScenario) for key in keys):
+    if any(isinstance(scenario, GuardedScenario) for scenario, _, _ in keys):
         return play()
     inputs = [
-        (type(key.scenario).__name__, to_builtins(key.scenario), key.network.digests, key.options) for key in keys
+        (type(scenario).__name__, to_builtins(scenario), network.digests, options)
+        for scenario, network, options in keys
     ]
     digest = sha256(_code_bytes() + repr(inputs).encode())
 
