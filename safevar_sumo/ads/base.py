@@ -24,6 +24,9 @@ NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
+Memory = Any
+"""What an ADS remembers of N vehicles, of its own type."""
+
 
 class Ads:
     """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills its fields.
@@ -45,14 +48,14 @@ class Ads:
     max_vehicles: int | None = None
 
     @abstractmethod
-    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         """Memory at the start of a run of `n` vehicles with `step` seconds between two calls of `drive`."""
 
     @abstractmethod
-    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
         """Command the pedals for the coming step; returns the memory for the next call."""
 
-    def warns(self, memory: Any) -> BoolArray | None:
+    def warns(self, memory: Memory) -> BoolArray | None:
         """Which drivers are warned after `drive`, shape (N,); None if the ADS never warns."""
         return None
 
@@ -83,15 +86,15 @@ class GuardedAds(Ads):
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
 
-    def warns(self, memory: Any) -> BoolArray | None:
+    def warns(self, memory: Memory) -> BoolArray | None:
         warned = self._guard.call("warns", self._ads.warns, memory)
         return None if warned is None else self._guard.booleans("warns", "warnings", warned, (self._vehicle_count,))
 
-    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         self._vehicle_count = n
         return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
 
-    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
         result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
         command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
         throttle, brake = self._guard.elements("drive", command, "(Command(throttle, brake), memory)")

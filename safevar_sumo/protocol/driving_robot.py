@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from safevar_sumo.records import BoolArray, Command, FloatArray
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
+from safevar_sumo.vehicles.base import Prepared, State
 
 MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
 """Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB test protocols, "test
@@ -47,7 +47,7 @@ class DrivingRobot:
     """
 
     def __init__(
-        self, points: Sequence[Point], vehicle: Vehicle, prepared: Any, state: VehicleState, step: float
+        self, points: Sequence[Point], vehicle: Vehicle, prepared: Prepared, state: VehicleState, step: float
     ) -> None:
         n = len(state.speed)
         speeds = [point.scenario.test_speed for point in points]
@@ -65,7 +65,7 @@ class DrivingRobot:
         without a test.
         """
 
-    def drive(self, command: Command, state: Any, is_open: BoolArray) -> tuple[Command, Any]:
+    def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
         """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while
         the robot drives.
 

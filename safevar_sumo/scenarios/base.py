@@ -174,6 +174,10 @@ class Scene(NamedTuple):
     visible: BoolArray = ALL_TRUE
 
 
+ScenarioMemory = Any
+"""What a scenario remembers of a run, of its own type."""
+
+
 class Scenario:
     """A scenario. Its fields are the parameters of `scenario.parameters`.
 
@@ -214,11 +218,11 @@ class Scenario:
         pre_crash, test_speed = "", None
 
     @abstractmethod
-    def begin(self, world: World) -> Any:
+    def begin(self, world: World) -> ScenarioMemory:
         """Prepare a run, before the first step; returns the memory for `observe`."""
 
     @abstractmethod
-    def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
+    def observe(self, world: World, step: float, memory: ScenarioMemory) -> tuple[Scene, ScenarioMemory]:
         """The obstacle now, `step` seconds after the last call, and the new memory; may also command the actors."""
 
     @abstractmethod
@@ -267,7 +271,7 @@ class PreCrash(StrEnum):
     LEAD_DECELERATING = "lead vehicle decelerating"
 
 
-def distance_in_words(scenario: Any, safety_degree: float) -> str:
+def distance_in_words(scenario: Scenario, safety_degree: float) -> str:
     """A safety degree above 0 in metres, and between which points it is, if not from the bumper on."""
     return f"{safety_degree:.2f} m{' from centre to centre' if scenario.centre_to_centre else ''}"
 
@@ -336,10 +340,10 @@ class GuardedScenario(Scenario):
     def remarks(self) -> list[str]:
         return [str(remark) for remark in self._guard.call("remarks", self._scenario.remarks)]
 
-    def begin(self, world: World) -> Any:
+    def begin(self, world: World) -> ScenarioMemory:
         return self._guard.call("begin", self._scenario.begin, _ReadOnlyWorld(world))
 
-    def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
+    def observe(self, world: World, step: float, memory: ScenarioMemory) -> tuple[Scene, ScenarioMemory]:
         n = len(world.vehicle_positions("vut"))
         result = self._guard.call("observe", self._scenario.observe, _ReadOnlyWorld(world), step, memory)
         scene, memory = self._guard.elements("observe", result, "(Scene, memory)")

@@ -7,7 +7,7 @@ thousands of vehicles.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -37,6 +37,7 @@ PARKED_GAP = 1.0
 """
 Times = float | Sequence[float]
 """One time, or the times of all samples [s]."""
+Quantity = FloatArray | float
 
 
 class Target(NamedTuple):
@@ -52,10 +53,10 @@ class Target(NamedTuple):
 
     edge: FloatArray
     lateral: FloatArray
-    lateral_speed: Any = 0.0
-    speed: Any = 0.0
-    is_clear: Any = False
-    ahead: Any = 0.0
+    lateral_speed: Quantity = 0.0
+    speed: Quantity = 0.0
+    is_clear: BoolArray | bool = False
+    ahead: Quantity = 0.0
 
 
 class EncounterConstants(NamedTuple):
@@ -67,12 +68,12 @@ class EncounterConstants(NamedTuple):
     `parked_offset` from the lane's middle to the parked cars.
     """
 
-    passed_gap: Any = -np.inf
-    follows: Any = False
-    hidden: Any = False
-    edge_to_middle: Any = 0.0
-    setback: Any = 0.0
-    parked_offset: Any = 0.0
+    passed_gap: Quantity = -np.inf
+    follows: BoolArray | bool = False
+    hidden: BoolArray | bool = False
+    edge_to_middle: Quantity = 0.0
+    setback: Quantity = 0.0
+    parked_offset: Quantity = 0.0
 
 
 class TargetMotion(NamedTuple):
@@ -179,7 +180,7 @@ def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> 
     return np.asarray(~np.asarray(constants.hidden) | is_free)
 
 
-def value_at(times: Times, function: Callable[[float], float]) -> Any:
+def value_at(times: Times, function: Callable[[float], float]) -> Quantity:
     """A function's value at one time, or an array of its values at all times."""
     return np.array([function(time) for time in times]) if isinstance(times, Sequence) else function(times)
 

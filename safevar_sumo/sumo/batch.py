@@ -36,6 +36,7 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.world import INSERTION_DECELERATION, Contacts, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, slope_of
+from safevar_sumo.vehicles.base import Prepared
 
 Watcher = Callable[[SumoWorld], None]
 """A function that is called with SUMO's world at every sample."""
@@ -199,7 +200,7 @@ def _simulate(
     )
 
 
-def _insert_vehicles(system: System, settings: FloatArray, world: Any) -> Any:
+def _insert_vehicles(system: System, settings: FloatArray, world: Any) -> Prepared:
     """Put the vehicles onto the roads; returns their constants."""
     vehicle, n = system.vehicle, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
@@ -251,7 +252,7 @@ def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, float, Sl
     return friction, step, slope, np.repeat(wetness, size) if any(wetness) else False
 
 
-def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
+def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
     """The vehicles' sensors: the weather adds its recognition delay and scales the range by its visibility."""
     (point,) = system.points  # SUMO simulates one point at once
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)

@@ -14,11 +14,10 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.sumo.network import CopiedNetwork
-from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.sumo.world import Api, SumoWorld
 
 CONNECTION_ATTEMPTS = 15
 """Number of times, once per second, that traci tries to connect to the SUMO process that it has started."""
@@ -57,7 +56,7 @@ def open_world(
         stop_engine(api)
 
 
-def engine_api(engine: Engine) -> Any:
+def engine_api(engine: Engine) -> Api:
     if engine is Engine.LIBSUMO:
         import libsumo
 
@@ -90,7 +89,7 @@ def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     ]
 
 
-def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
+def start_engine(api: Api, engine: Engine, command: list[str]) -> None:
     if engine is Engine.LIBSUMO:
         try:
             api.start(command)
@@ -117,7 +116,7 @@ def program_path(engine: Engine) -> str:
     return str(Path(sumo.SUMO_HOME) / "bin" / ("sumo-gui" if engine is Engine.GUI else "sumo"))
 
 
-def stop_engine(api: Any) -> None:
+def stop_engine(api: Api) -> None:
     """Close SUMO, without errors if SUMO never started or the user closed its window."""
     with suppress(api.TraCIException, api.FatalTraCIError):
         api.close()

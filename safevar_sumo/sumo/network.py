@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError, did_you_mean
 from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
@@ -272,7 +272,7 @@ def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
     """
     networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
 
-    def stage(scenario: Any) -> Network:
+    def stage(scenario: Scenario) -> Network:
         may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
         return (_stage.__wrapped__ if may_vary else _stage)(scenario, networks[scenario.network])
 

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import msgpack, to_builtins
 
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, GuardedScenario, Scenario
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import Network, copied_network, is_shipped, stage_networks, sumo_version
-from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
+from safevar_sumo.sumo.world import Api, SumoWorld, begin, direction_of
 
 MAX_RECORDINGS = 4000
 """Largest number of recorded scenes that a process keeps; a scene of ten seconds takes about ten kilobytes."""
@@ -67,7 +67,7 @@ class LaneSequence(NamedTuple):
     stretch: FloatArray
     shape_length: FloatArray
 
-    def at(self, lane: Any) -> LaneSequence:
+    def at(self, lane: IntArray) -> LaneSequence:
         """The current lanes of N vehicles, given by lane number; columns of length N."""
         return LaneSequence._make(column[lane] for column in self)
 
@@ -151,7 +151,7 @@ def _reason_for_sumo(scenario: Scenario) -> str:
     return ""
 
 
-_Key = tuple[Any, Network, tuple[str, ...]]
+_Key = tuple[Scenario, Network, tuple[str, ...]]
 """A scenario, its network, and additional options of SUMO."""
 _recordings: dict[_Key, Recording | str] = {}
 """The scenes that this process keeps, or the reasons why scenes cannot be recorded."""
@@ -187,7 +187,7 @@ def _code_bytes() -> bytes:
     return b"".join([sumo_version().encode(), *(file.read_bytes() for file in files)])
 
 
-def _packed_array(array: Any) -> tuple[tuple[int, ...], bytes]:
+def _packed_array(array: FloatArray) -> tuple[tuple[int, ...], bytes]:
     return array.shape, array.tobytes()
 
 
@@ -196,7 +196,7 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     return np.frombuffer(content).reshape(shape)
 
 
-def _play(scenario: Any, network: Network, options: tuple[str, ...]) -> Recording | str:
+def _play(scenario: Scenario, network: Network, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, Engine.LIBSUMO, options) as world:
         world.depart(at_any_speed=True)
@@ -277,7 +277,7 @@ def _ids_in_first_copy(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
             yield id_, name
 
 
-def _lane_sequence_of(api: Any, vut: str) -> tuple[LaneSequence, FloatArray]:
+def _lane_sequence_of(api: Api, vut: str) -> tuple[LaneSequence, FloatArray]:
     """The lanes of the rest of a vehicle's route, and their common direction.
 
     Raises

@@ -32,7 +32,9 @@ LOOP_FUNCTIONS = (
     "step",
 )
 """Functions that begin, advance or end simulations."""
-Call = Callable[[str, str, tuple[Any, ...], Mapping[str, Any]], Any]
+Arguments = tuple[Any, ...]
+"""Positional arguments of a call."""
+Call = Callable[[str, str, Arguments, Mapping[str, Any]], Any]
 """Calls a function of a domain, "" for the module itself, with positional and named arguments."""
 
 _driven_vehicles: list[Call] = []
@@ -129,7 +131,7 @@ def full_name(domain: str, name: str) -> str:
     return ".".join(part for part in ("traci", domain, name) if part)
 
 
-def all_arguments(domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> tuple[Any, ...]:
+def all_arguments(domain: str, name: str, arguments: Arguments, named: Mapping[str, Any]) -> Arguments:
     """The arguments of a call in the order of TraCI's function, defaults too."""
     bound = _signature(domain, name).bind(*arguments, **named)
     bound.apply_defaults()
@@ -170,7 +172,7 @@ class CommandedSpeed:
         self._speed: float | None = None
         self._end_time, self._speed_rate = -1.0, 0.0
 
-    def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
+    def command(self, name: str, time: float, speed: float, values: Arguments) -> None:
         """Process a command of the vehicle domain.
 
         Raises

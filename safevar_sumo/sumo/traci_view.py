@@ -13,6 +13,7 @@ from safevar_sumo.sumo.copies import copied_id
 from safevar_sumo.sumo.perception import SENSED_FUNCTIONS, SensedTraffic
 from safevar_sumo.sumo.traci_module import (
     COMMANDS,
+    Arguments,
     CommandedSpeed,
     all_arguments,
     full_name,
@@ -191,7 +192,7 @@ class TraciView:
         follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)
         return float(min(free_speed, follow_speed))
 
-    def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
+    def call(self, domain: str, name: str, arguments: Arguments, named: Mapping[str, Any]) -> Any:
         """Call a TraCI function in this copy; `domain` is "" for functions of the module itself.
 
         Raises
@@ -215,7 +216,7 @@ class TraciView:
         except (api.TraCIException, api.FatalTraCIError) as error:
             raise real_traci().exceptions.TraCIException(re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))) from None
 
-    def _command(self, name: str, arguments: tuple[Any, ...]) -> None:
+    def _command(self, name: str, arguments: Arguments) -> None:
         if arguments[0] != VUT:
             raise InputError(
                 f"traci.vehicle.{name}",
@@ -251,7 +252,7 @@ class TraciView:
             return sum(len(self._ids(actors)) for actors in SENSED_FUNCTIONS)
         return self._sumo_value(domain, name, arguments)
 
-    def _sensed_value(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+    def _sensed_value(self, domain: str, name: str, arguments: Arguments) -> Any:
         """Another actor's value as the sensors report it."""
         if name not in SENSED_FUNCTIONS[domain]:
             problem = f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures"
@@ -284,12 +285,12 @@ class TraciView:
         names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
         return len(names) if name == "getLastStepVehicleNumber" else names
 
-    def _sumo_value(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+    def _sumo_value(self, domain: str, name: str, arguments: Arguments) -> Any:
         api = self._world.api
         function = getattr(getattr(api, domain) if domain else api, name)
         return _original_ids(function(*(_copied_ids(self._copy, argument) for argument in arguments)))
 
-    def _subscription(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+    def _subscription(self, domain: str, name: str, arguments: Arguments) -> Any:
         """Subscribe, unsubscribe, or return the values of functions subscribed to, as the sensors report them."""
         is_context = "Context" in name
         if name.startswith("get"):

@@ -28,6 +28,9 @@ SPEED_MODE = 32
 # TraCI "set lane change mode": the vehicle never changes lanes.
 LANE_CHANGE_MODE = 0
 
+Api = Any
+"""The module libsumo or traci, which have the same functions."""
+
 
 class Body(NamedTuple):
     """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along`, the direction, is a unit
@@ -41,7 +44,9 @@ class Body(NamedTuple):
     speed: Any
 
     @classmethod
-    def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: Any) -> Body:
+    def behind(
+        cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: FloatArray | float
+    ) -> Body:
         """The body whose front has its middle at `front`."""
         return cls(front - along * (length / 2), along, length, width, speed)
 
@@ -54,7 +59,7 @@ class Body(NamedTuple):
 class SumoWorld:
     """N copies of a network in a running simulation, created by `open_world`. Arrays have shape (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int) -> None:
+    def __init__(self, api: Api, n: int) -> None:
         self.api, self.n = api, n
         self._set_speed, self._get_speed = (
             _api_function(api, "vehicle", "setSpeed"),
@@ -288,7 +293,7 @@ def direction_of(angle: float) -> FloatArray:
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
-def _api_function(api: Any, domain: str, name: str) -> Callable[..., Any]:
+def _api_function(api: Api, domain: str, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
     wrapped = getattr(api, domain) if compiled is None else compiled

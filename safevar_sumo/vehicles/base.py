@@ -55,6 +55,12 @@ class SumoType(NamedTuple):
     tau: FloatArray
 
 
+Prepared = Any
+"""A vehicle's constants of a run, as its `prepare` returns them, of its own type."""
+State = Any
+"""The state of N vehicles, of the model's own type; see `VehicleState`."""
+
+
 class VehicleState(Protocol):
     """The columns that every model's state has, each of shape (N,): speed [m/s]; throttle, brake and gear [-]."""
 
@@ -101,7 +107,7 @@ class Vehicle:
         step: float,
         slope: Slope = LEVEL,
         wet: bool | BoolArray = False,
-    ) -> Any:
+    ) -> Prepared:
         """Constants of a run with a time step of `step` seconds.
 
         `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further
@@ -109,14 +115,14 @@ class Vehicle:
         """
 
     @abstractmethod
-    def sumo_type(self, prepared: Any) -> SumoType:
+    def sumo_type(self, prepared: Prepared) -> SumoType:
         """The SUMO types of the vehicles."""
 
     @abstractmethod
-    def at_rest(self, prepared: Any) -> Any:
+    def at_rest(self, prepared: Prepared) -> State:
         """The state at the start: standing, pedals released."""
 
-    def at_speed(self, prepared: Any, speed: FloatArray) -> Any:
+    def at_speed(self, prepared: Prepared, speed: FloatArray) -> State:
         """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
         raise InputError(
             type(self).__name__,
@@ -124,7 +130,7 @@ class Vehicle:
             "a vehicle with that method, or traffic that departs with speed 0",
         )
 
-    def at_start(self, prepared: Any, speed: FloatArray) -> Any:
+    def at_start(self, prepared: Prepared, speed: FloatArray) -> State:
         """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
         rest, is_rolling = self.at_rest(prepared), speed > 0
         if not is_rolling.any():
@@ -132,28 +138,28 @@ class Vehicle:
         steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))
         return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
 
-    def hold_gear(self, prepared: Any, state: Any, holds: BoolArray) -> Any:
+    def hold_gear(self, prepared: Prepared, state: State, holds: BoolArray) -> State:
         """The state in which vehicles do not change gear where `holds`, shape (N,), is true; the robot of tests at a
         speed needs it.
         """
         return state
 
-    def sensors(self, prepared: Any) -> Sensors | None:
+    def sensors(self, prepared: Prepared) -> Sensors | None:
         """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None if they see
         everything at once.
         """
         return None
 
     @abstractmethod
-    def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
+    def sense(self, prepared: Prepared, state: State, seen: Observation) -> tuple[Observation, State]:
         """What the vehicles' sensors report of an observation, and the state after it."""
 
     @abstractmethod
-    def advance(self, prepared: Any, state: Any, command: Command) -> Any:
+    def advance(self, prepared: Prepared, state: State, command: Command) -> State:
         """The state one simulation step later."""
 
 
-def _select_state(is_rolling: BoolArray, steady: Any, rest: Any) -> Any:
+def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
     """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist of states."""
     if isinstance(steady, tuple):
         columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
@@ -170,16 +176,16 @@ class SensingVehicle(Vehicle):
 
     __slots__ = ()
 
-    def sensors(self, prepared: Any) -> Sensors:
+    def sensors(self, prepared: Prepared) -> Sensors:
         return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
-    def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
+    def sense(self, prepared: Prepared, state: State, seen: Observation) -> tuple[Observation, State]:
         """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
         sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
         return sensed, state._replace(seen=past)
 
 
-def pedals_on_slope(back: Any, drive: FloatArray, brake: FloatArray) -> Command:
+def pedals_on_slope(back: float | FloatArray, drive: FloatArray, brake: FloatArray) -> Command:
     """Pedals that balance the deceleration `back` by the slope, the only resistance, given the accelerations by full
     pedals [m/s^2].
     """
@@ -198,7 +204,7 @@ class _Prepared(NamedTuple):
     """Number of vehicles, the constants that the user's model returned, and its SUMO types after the check."""
 
     n: int
-    constants: Any
+    constants: Prepared
     types: SumoType
 
 
@@ -209,7 +215,7 @@ class _State(NamedTuple):
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    model_state: Any
+    model_state: State
 
 
 class GuardedVehicle(Vehicle):
@@ -331,7 +337,7 @@ class GuardedVehicle(Vehicle):
             )
         return state
 
-    def _checked_state(self, method: str, n: int, model_state: Any) -> _State:
+    def _checked_state(self, method: str, n: int, model_state: State) -> _State:
         columns = {
             name: self._guard.numbers(
                 method, name, self._guard.field(method, model_state, name), (n,), *_LEGAL_RANGES.get(name, ())
