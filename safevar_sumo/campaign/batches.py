@@ -24,7 +24,6 @@ from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, fmus_of, tables_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
-from safevar_sumo.vehicles import CharacteristicSet
 
 BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""
@@ -99,10 +98,8 @@ def evaluate_all(
 
 def ask_why_no_verdict(study: Study, pool: Pool) -> str:
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
-    original = CharacteristicSet.of(study).original[np.newaxis]
-    result = wait_for_result(
-        RetryingPool(pool, study).submit(pack_study(study, inputs_of(study, pool), empty_road=True), original)
-    )
+    work = pack_study(study, inputs_of(study, pool), empty_road=True)
+    result = RetryingPool(pool, study).evaluate_original(work, must_succeed=False)
     return "" if len(result) else next(iter(result.reasons.values()), "")  # a failed simulation has a row
 
 
@@ -129,10 +126,7 @@ def source_digests(study: Study, pool: Pool) -> Files:
         # Without an entry, a file that does not exist: its digest differs.
         files_read = _files_read.get(key, {"": "never read"})
         if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
-            original = CharacteristicSet.of(study).original[np.newaxis]
-            _files_read[key] = dict(
-                wait_for_result(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files
-            )
+            _files_read[key] = dict(RetryingPool(pool, study).evaluate_original(work).files)
         files |= _files_read[key]
     return dict(sorted(files.items()))
 
@@ -165,8 +159,7 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> None:
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / name
     if name in _passed_checks or marker.exists():
         return
-    original = CharacteristicSet.of(study).original[np.newaxis]
-    wait_for_result(pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True))
+    pool.evaluate_original(pack_study(study, inputs, check=True))
     _passed_checks.add(name)
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,6 @@ from queue import SimpleQueue
 from typing import NamedTuple, Protocol
 
 import msgspec
-import numpy as np
 
 from safevar_sumo.campaign.batches import check_code, source_digests, works_for_sumo
 from safevar_sumo.campaign.evaluation import identity_of, pack_study
@@ -31,7 +30,6 @@ from safevar_sumo.campaign.pool import (
     Share,
     WorkerLostError,
     wait_for_next,
-    wait_for_result,
 )
 from safevar_sumo.campaign.retrying import ATTEMPTS, RetryingPool
 from safevar_sumo.campaign.run import all_runs
@@ -152,7 +150,7 @@ def _baseline(
 ) -> Evaluations:
     """Check the study's user code, and evaluate the original vehicle; raises an error if the runs need another one."""
     check_code(study, results.inputs, pool)
-    original = _evaluate_original(study, work, results, pool, observer)
+    original = _evaluate_original(work, results, pool, observer)
     if not original.valid[0]:
         raise InputError(
             study.source,
@@ -262,19 +260,12 @@ def _collect(shares: Iterable[Share], pool: Pool, observer: Observer) -> tuple[d
     return run_results, busy
 
 
-def _evaluate_original(
-    study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer
-) -> Evaluations:
+def _evaluate_original(work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer) -> Evaluations:
     """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails."""
-    setting = CharacteristicSet.of(study).original[np.newaxis]
-
-    def simulate() -> Evaluations:
-        return wait_for_result(pool.submit(work, setting, must_succeed=True))
-
     try:
         journal = results.journal(ORIGINAL)
     except JournalBusyError:  # another process, such as a job of an array, writes this journal
-        return simulate()
+        return pool.evaluate_original(work)
     try:
         if journal.content.tail_size:
             observer.warned(
@@ -283,7 +274,7 @@ def _evaluate_original(
             )
         if journal.content.positions:
             return journal.content.evaluations
-        evaluations = simulate()
+        evaluations = pool.evaluate_original(work)
         journal.append([0], evaluations, evaluations.files)
         return evaluations
     finally:

@@ -13,7 +13,7 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 
 import numpy as np
 
-from safevar_sumo.campaign.pool import Pool, PoolLostError, WorkerLostError
+from safevar_sumo.campaign.pool import Pool, PoolLostError, WorkerLostError, wait_for_result
 from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -37,7 +37,8 @@ class Retries:
 
     def __init__(self, study: Study) -> None:
         self._study, self._failures_in_a_row = study, 0
-        self._characteristics, self._user_code = (CharacteristicSet.of(study), user_code_names(study))
+        self.characteristics = CharacteristicSet.of(study)
+        self._user_code = user_code_names(study)
 
     def evaluate(self, compute: Compute, settings: FloatArray, *, must_succeed: bool = False) -> Iterator[Evaluations]:
         """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after
@@ -80,7 +81,7 @@ class Retries:
         if must_succeed:
             raise failure
         try:
-            compute(self._characteristics.original[np.newaxis])
+            compute(self.characteristics.original[np.newaxis])
         except RETRIED_ERRORS as fault:
             raise EnvironmentFault(f"{failure}; the original vehicle cannot be simulated either: {fault}") from None
         try:
@@ -98,8 +99,8 @@ class Retries:
             outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
             collision_speed=undefined,
             metrics=dict.fromkeys(METRICS, undefined),
-            f_diff=self._characteristics.largest_change(setting),
-            f_num_diff=self._characteristics.number_changed(setting),
+            f_diff=self.characteristics.largest_change(setting),
+            f_num_diff=self.characteristics.number_changed(setting),
             reasons={setting[0].tobytes(): " ".join(str(error).split())},
         )
 
@@ -135,6 +136,11 @@ class RetryingPool:
     def workers(self) -> int:
         """Number of batches that are computed at the same time."""
         return self._pool.workers
+
+    def evaluate_original(self, work: bytes, *, must_succeed: bool = True) -> Evaluations:
+        """The evaluation of the original vehicle of a packed study; by default a failure is an error."""
+        original = self._retries.characteristics.original[np.newaxis]
+        return wait_for_result(self.submit(work, original, must_succeed=must_succeed))
 
     def submit(self, work: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
         """Evaluate k filtered settings of n characteristics, shape (k, n); with `must_succeed` a failure is an error,

@@ -55,9 +55,6 @@ class CellRow(
     target_speed: float | None = None
     has_function_choice: bool = False
 
-    def has_cell(self, column: int) -> bool:
-        return self.range_letters[column] != "-"
-
 
 class CellMatrix(
     Struct,
@@ -301,7 +298,7 @@ class Protocol(
         for matrix in self.matrices:
             for row_number, row in enumerate(matrix.rows):
                 for column, letter in enumerate(row.range_letters):
-                    if row.has_cell(column):
+                    if letter != "-":
                         yield Cell(
                             matrix,
                             row_number,

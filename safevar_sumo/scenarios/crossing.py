@@ -27,7 +27,6 @@ from safevar_sumo.scenarios.euro_ncap import (
     ImpactLocation,
     ProtocolRange,
     SpeedProfile,
-    clear_gap,
     lateral_offset,
 )
 from safevar_sumo.scenarios.target import (
@@ -319,7 +318,8 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         change.
         """
         extent = _Start.of(self).extent
-        ahead, across = np.maximum(trace.gap, 0.0), clear_gap(trace.lateral, (self.vut_width + extent.width) / 2)
+        ahead = np.maximum(trace.gap, 0.0)
+        across = np.maximum(np.abs(trace.lateral) - (self.vut_width + extent.width) / 2, 0.0)
         distance = np.sqrt(ahead * ahead + across * across)
         approach = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
         return Encounter(

@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, NamedTuple
 
-import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import KMH_PER_MS, FloatArray
+from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios.base import Coordinates, Frame, XmlChanges
 
 KMH = 1 / KMH_PER_MS
@@ -195,8 +194,3 @@ def lateral_offset(location: float, width: float) -> float:
     of `width`].
     """
     return (location / 100 - 0.5) * width
-
-
-def clear_gap(distance: FloatArray, half_widths: float) -> FloatArray:
-    """Gap between two bodies whose middles are `distance` apart; 0 where they overlap [m]."""
-    return np.maximum(np.abs(distance) - half_widths, 0.0)

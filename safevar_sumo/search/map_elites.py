@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -11,6 +11,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, IntArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.search.evolution import Probability, TournamentSize
+
+if TYPE_CHECKING:
+    from ribs.archives import GridArchive
 
 MAX_CELLS = 2**16
 """Maximum number of cells of an atlas: with more than 16 characteristics, not every set of changes can be a cell."""
@@ -84,7 +87,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         quality = np.full(problem.evaluations, -np.inf)
         while used < problem.evaluations:
             number, generation_size = min(problem.population, problem.evaluations - used), problem.population
-            elites = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
+            elites = _elites_in(archive)
             parents = settings[self._draw_parents(elites, quality, generation_size, rng)] if len(elites) else None
             # A whole generation, so that a run does not depend on its budget:
             children = self._draw_children(parents, generation_size, problem, rng)
@@ -98,8 +101,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 archive.add((used + valid)[:, np.newaxis].astype(float), quality[used + valid], cells)
             used += number
         evaluations = Evaluations.concatenate(batches)
-        rows = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
-        atlas = evaluations.take(rows)
+        atlas = evaluations.take(_elites_in(archive))
         is_more_severe = problem.scoring.values(atlas)[:, 0] < problem.scoring.values(problem.original)[0, 0]
         return atlas.take(atlas.collided if atlas.collided.any() else is_more_severe)
 
@@ -153,3 +155,8 @@ def _qualities(evaluated: Evaluations, problem: Problem) -> FloatArray:
     first objective.
     """
     return np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])
+
+
+def _elites_in(archive: GridArchive) -> IntArray:
+    """The numbers of the evaluations that an archive holds, in order."""
+    return np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)

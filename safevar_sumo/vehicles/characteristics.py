@@ -219,19 +219,21 @@ class Change(Struct, frozen=True, kw_only=True):
     function: ChangeFunction
 
 
-def _largest_change(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    return characteristics.largest_change(settings)
-
-
-def _number_changed(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    return characteristics.number_changed(settings)
-
-
 CHANGES = {
     change.name: change
     for change in (
-        Change(name="f_diff", title="largest change", unit="fraction", function=_largest_change),
-        Change(name="f_num_diff", title="characteristics changed", unit="-", function=_number_changed),
+        Change(
+            name="f_diff",
+            title="largest change",
+            unit="fraction",
+            function=lambda settings, characteristics: characteristics.largest_change(settings),
+        ),
+        Change(
+            name="f_num_diff",
+            title="characteristics changed",
+            unit="-",
+            function=lambda settings, characteristics: characteristics.number_changed(settings),
+        ),
     )
 }
 
