@@ -32,9 +32,12 @@ LOOP_FUNCTIONS = (
     "step",
 )
 """Functions that begin, advance or end simulations."""
-Arguments = tuple[Any, ...]
-"""Positional arguments of a call."""
-Call = Callable[[str, str, Arguments, Mapping[str, Any]], Any]
+Value = Any
+"""An argument or a result of a function of TraCI."""
+Arguments = tuple[Value, ...]
+Named = Mapping[str, Value]
+"""Named arguments of a call."""
+Call = Callable[[str, str, Arguments, Named], Value]
 """Calls a function of a domain, "" for the module itself, with positional and named arguments."""
 
 _driven_vehicles: list[Call] = []
@@ -106,7 +109,7 @@ class _Domain:
         return partial(_call, self._name, name) if callable(member) and not isinstance(member, type) else member
 
 
-def _call(domain: str, name: str, /, *arguments: Any, **named: Any) -> Any:
+def _call(domain: str, name: str, /, *arguments: Value, **named: Value) -> Value:
     if _driven_vehicles:
         return _driven_vehicles[-1](domain, name, arguments, named)
     refuse_own_loop(domain, name)
@@ -131,7 +134,7 @@ def full_name(domain: str, name: str) -> str:
     return ".".join(part for part in ("traci", domain, name) if part)
 
 
-def all_arguments(domain: str, name: str, arguments: Arguments, named: Mapping[str, Any]) -> Arguments:
+def all_arguments(domain: str, name: str, arguments: Arguments, named: Named) -> Arguments:
     """The arguments of a call in the order of TraCI's function, defaults too."""
     bound = _signature(domain, name).bind(*arguments, **named)
     bound.apply_defaults()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import VUT
@@ -15,6 +14,8 @@ from safevar_sumo.sumo.traci_module import (
     COMMANDS,
     Arguments,
     CommandedSpeed,
+    Named,
+    Value,
     all_arguments,
     full_name,
     real_traci,
@@ -162,7 +163,7 @@ CONTEXT_DOMAINS = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIAB
 INVALID_NUMBER = -1073741824
 """Value that SUMO returns for a property of an actor that is not on the road."""
 
-Variables = dict[int, tuple[str, tuple[Any, ...]]]
+Variables = dict[int, tuple[str, Arguments]]
 """Requested variables, each with its function and that function's arguments after the actor's id."""
 
 
@@ -192,7 +193,7 @@ class TraciView:
         follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)
         return float(min(free_speed, follow_speed))
 
-    def call(self, domain: str, name: str, arguments: Arguments, named: Mapping[str, Any]) -> Any:
+    def call(self, domain: str, name: str, arguments: Arguments, named: Named) -> Value:
         """Call a TraCI function in this copy; `domain` is "" for functions of the module itself.
 
         Raises
@@ -229,7 +230,7 @@ class TraciView:
             speed = float(self._world.api.vehicle.getSpeed(self._vut))
             self.commands.command(name, self.time, speed, arguments[1:])
 
-    def _query(self, domain: str, name: str, /, *given: Any, **named: Any) -> Any:
+    def _query(self, domain: str, name: str, /, *given: Value, **named: Value) -> Value:
         allowed = QUERIES.get(domain, ())
         if name not in allowed:
             legal = (*allowed, *COMMANDS) if domain == "vehicle" else allowed or QUERIES
@@ -252,7 +253,7 @@ class TraciView:
             return sum(len(self._ids(actors)) for actors in SENSED_FUNCTIONS)
         return self._sumo_value(domain, name, arguments)
 
-    def _sensed_value(self, domain: str, name: str, arguments: Arguments) -> Any:
+    def _sensed_value(self, domain: str, name: str, arguments: Arguments) -> Value:
         """Another actor's value as the sensors report it."""
         if name not in SENSED_FUNCTIONS[domain]:
             problem = f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures"
@@ -277,7 +278,7 @@ class TraciView:
         leader = self._traffic.snapshot(self._copy).leader
         return leader if leader and leader[1] <= (dist or speed**2 / (2 * self.commands.nominal_decel)) else None
 
-    def _actors_on_road(self, domain: str, name: str, road: str) -> Any:
+    def _actors_on_road(self, domain: str, name: str, road: str) -> Value:
         """Actors on a lane or edge, or their number, as the sensors report them."""
         snapshot, function = self._traffic.snapshot(self._copy), "getLaneID" if domain == "lane" else "getRoadID"
         persons, vehicles = snapshot.actors["person"], {VUT: snapshot.own, **snapshot.actors["vehicle"]}
@@ -285,12 +286,12 @@ class TraciView:
         names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
         return len(names) if name == "getLastStepVehicleNumber" else names
 
-    def _sumo_value(self, domain: str, name: str, arguments: Arguments) -> Any:
+    def _sumo_value(self, domain: str, name: str, arguments: Arguments) -> Value:
         api = self._world.api
         function = getattr(getattr(api, domain) if domain else api, name)
         return _original_ids(function(*(_copied_ids(self._copy, argument) for argument in arguments)))
 
-    def _subscription(self, domain: str, name: str, arguments: Arguments) -> Any:
+    def _subscription(self, domain: str, name: str, arguments: Arguments) -> Value:
         """Subscribe, unsubscribe, or return the values of functions subscribed to, as the sensors report them."""
         is_context = "Context" in name
         if name.startswith("get"):
@@ -312,8 +313,8 @@ class TraciView:
         self._subscriptions[is_context, domain, actor] = domains[around], dist, variables
         return None
 
-    def _results(self, is_context: bool, domain: str) -> dict[str, dict[Any, Any]]:
-        results: dict[str, dict[Any, Any]] = {}
+    def _results(self, is_context: bool, domain: str) -> dict[str, Value]:
+        results: dict[str, Value] = {}
         for (*kind, actor), (other_domain, dist, variables) in self._subscriptions.items():
             if kind == [is_context, domain] and actor in (("",) if domain == "simulation" else self._ids(domain)):
                 results[actor] = (
@@ -333,14 +334,14 @@ class TraciView:
                 )
         return results
 
-    def _values(self, domain: str, actor: str, variables: Variables) -> dict[int, Any]:
+    def _values(self, domain: str, actor: str, variables: Variables) -> dict[int, Value]:
         return {
             variable: self._query(domain, function, *((actor,) if actor else ()), *arguments)
             for variable, (function, arguments) in variables.items()
         }
 
 
-def _requested_variables(domain: str, requested: Any, parameters: Any) -> Variables:
+def _requested_variables(domain: str, requested: Value, parameters: Value) -> Variables:
     functions = {_constant(name): function for name, function in VARIABLES.items()}
     variables = map(_constant, DEFAULT_VARIABLES[domain]) if requested is None else requested
     result: Variables = {}
@@ -352,14 +353,14 @@ def _requested_variables(domain: str, requested: Any, parameters: Any) -> Variab
     return result
 
 
-def _copied_ids(copy: int, value: Any) -> Any:
+def _copied_ids(copy: int, value: Value) -> Value:
     """Arguments for a copy: every text is an id; default types of SUMO are the same in all copies."""
     if isinstance(value, str):
         return re.sub(r"^(?!DEFAULT_)([:!]?)(?=.)", rf"\g<1>{copy}.", value)
     return type(value)(_copied_ids(copy, element) for element in value) if isinstance(value, list | tuple) else value
 
 
-def _original_ids(value: Any) -> Any:
+def _original_ids(value: Value) -> Value:
     """A result with the ids of the traffic file."""
     if isinstance(value, str):
         return re.sub(r"^([:!]?)\d+\.", r"\1", value)
