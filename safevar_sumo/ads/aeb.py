@@ -93,7 +93,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
-        cruise_speed, cruise_trim = memory.cruise or (self._speed_to_hold(seen), trim_at(nominal, seen))
+        speed_to_hold = seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
+        cruise_speed, cruise_trim = memory.cruise or (speed_to_hold, trim_at(nominal, seen))
         is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, is_threatened)
         has_intervened = memory.intervened | (stage > 0)
@@ -112,9 +113,6 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def warns(self, memory: _Memory) -> BoolArray:
         """Whether each driver is warned now."""
         return memory.warns
-
-    def _speed_to_hold(self, seen: Observation) -> FloatArray:
-        return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
 
     def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
         """The braking stage; it does not fall before the obstacle has left the way of the vehicle."""

@@ -16,7 +16,6 @@ from safevar_sumo.campaign.campaign import (
 )
 from safevar_sumo.campaign.pool import RunKey as RunKey, RunProgress as RunProgress
 from safevar_sumo.campaign.run import (
-    algorithm_class as algorithm_class,
     algorithm_of as algorithm_of,
     all_runs as all_runs,
     files_read_by_algorithms as files_read_by_algorithms,

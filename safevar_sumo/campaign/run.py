@@ -14,7 +14,7 @@ import numpy as np
 from safevar_sumo.campaign.batches import VERIFIED_SETTINGS
 from safevar_sumo.campaign.pool import RunKey, RunProgress, RunResult
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.plugins import Files, Lookup, Member, digests, instance_of, note_inputs, unload_user_modules
+from safevar_sumo.plugins import Files, Lookup, digests, instance_of, note_inputs, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import SPARE_POSITION, Failure, Journal
 from safevar_sumo.search import ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
@@ -55,8 +55,9 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         if table not in ALGORITHMS and table not in search.labels:
             legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
             raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
-    member = algorithm_class(name, study)
-    parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
+    lookup = Lookup(source, study.origin.places)
+    member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
+    parameters = lookup.with_paths(member, search.parameters.get(label, {}), key)
     algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     if isinstance(algorithm, MoCell):
         algorithm.grid_sides(search.population, source)  # raises for a grid of another size
@@ -99,12 +100,6 @@ def make_search(key: RunKey, study: Study, problem: Problem, note_files: Callabl
 def _user_packages(study: Study) -> list[str]:
     """Top-level packages of a study's user algorithms."""
     return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
-
-
-def algorithm_class(name: str, study: Study) -> Member:
-    """The class of an algorithm, by its name in a study."""
-    lookup = Lookup(study.source, study.origin.places)
-    return lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
 
 
 def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
