@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
@@ -234,11 +234,13 @@ def answer_question(
 
 
 def answer_call(
-    compute: Callable[..., Answer], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]
+    compute: Callable[..., Answer], options: type[Options], arguments: JsonObject, *, results_only: bool = False
 ) -> Answer:
-    """Answer a call of a question's function, whose `arguments` are given by name."""
+    """Answer a call of a question's function, whose `arguments` are given by name; the first is the subject."""
     from safevar_sumo.metrics import Unsafe
 
+    source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]
+    subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=results_only)
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))

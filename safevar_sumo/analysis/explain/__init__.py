@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -73,4 +73,4 @@ def explain(
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 
-    return answer_call(explain_failures, study_or_case(source, as_it_is_now=as_it_is_now), ExplainOptions, locals())
+    return answer_call(explain_failures, ExplainOptions, locals())

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.opinion.compute import Opinions
@@ -56,5 +56,4 @@ def opinion(
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    case = study_or_case(source, as_it_is_now=as_it_is_now, results_only=True)
-    return answer_call(ask_for_opinions, case, OpinionOptions, locals())
+    return answer_call(ask_for_opinions, OpinionOptions, locals(), results_only=True)

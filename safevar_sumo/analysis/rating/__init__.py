@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -64,4 +64,4 @@ def rating(
     """
     from safevar_sumo.analysis.rating.compute import rate_variant
 
-    return answer_call(rate_variant, study_or_case(study, as_it_is_now=as_it_is_now), RatingOptions, locals())
+    return answer_call(rate_variant, RatingOptions, locals())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.study import StudyLike
 
@@ -107,4 +107,4 @@ def risk(
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_call(estimate_risk, study_or_case(study, as_it_is_now=as_it_is_now), RiskOptions, locals())
+    return answer_call(estimate_risk, RiskOptions, locals())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -56,4 +56,4 @@ def rules(
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_call(find_rules, study_or_case(study, as_it_is_now=as_it_is_now), RulesOptions, locals())
+    return answer_call(find_rules, RulesOptions, locals())

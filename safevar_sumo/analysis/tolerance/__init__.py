@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -62,4 +62,4 @@ def tolerance(
     """
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
-    return answer_call(find_tolerances, study_or_case(study, as_it_is_now=as_it_is_now), ToleranceOptions, locals())
+    return answer_call(find_tolerances, ToleranceOptions, locals())
