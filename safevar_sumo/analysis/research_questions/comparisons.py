@@ -264,13 +264,13 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs, or fewer than three algorithms.
     """
-    tests, rows = list[JsonObject](), list[JsonObject]()
+    tests, rows = dict[str, JsonObject](), list[JsonObject]()
     for metric, (more_is_better, by_algorithm) in _samples_of_several(case, 3).items():
         blocks = pd.DataFrame(by_algorithm).dropna()
         values = blocks.to_numpy(dtype=float)
         ranks = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
         statistic, p = friedman_test(values)
-        tests.append({"metric": metric, "statistic": statistic, "p_value": p})
+        tests[metric] = {"statistic": statistic, "p_value": p}
         rows += [
             {
                 "setting": case.name,
@@ -283,8 +283,8 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
             }
             for i, name in enumerate(blocks.columns)
         ]
-    tests_by_metric = {test["metric"]: test for test in _add_holm(tests)}
-    return pd.DataFrame([{**row, **tests_by_metric[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
+    _add_holm(list(tests.values()))
+    return pd.DataFrame([row | tests[row["metric"]] for row in rows], columns=RANK_COLUMNS, dtype=object)
 
 
 def _samples_of_several(case: Case, min_algorithms: int) -> Samples:

@@ -37,6 +37,7 @@ from safevar_sumo.analysis.research_questions.statistics import (
 )
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
+from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 if TYPE_CHECKING:
@@ -232,7 +233,7 @@ def draw_changed_characteristics(case: Case) -> Figure:
     """
     import seaborn as sns
 
-    _count_critical_solutions(case)
+    _critical_changes(case)  # raises if there are none
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     table = shares.pivot(index="characteristic", columns="j", values="percent").loc[order, list(shares["j"].unique())]
@@ -260,11 +261,10 @@ def draw_changed_characteristics(case: Case) -> Figure:
 
 def draw_change_sizes(case: Case) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
-    solution_count = _count_critical_solutions(case)
+    changes_of_solutions = _critical_changes(case)
     title = f"{case.name}: changes in critical solutions"
     figure, axes = new_panels(title, len(case.characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
-    changes_by_characteristic = changes_of(case, critical_solutions(case)).T
-    for axis, characteristic, changes in zip(axes, case.characteristics, changes_by_characteristic, strict=True):
+    for axis, characteristic, changes in zip(axes, case.characteristics, changes_of_solutions.T, strict=True):
         low, high = characteristic.lower - characteristic.original, characteristic.upper - characteristic.original
         increases, decreases = changes[changes > 0], changes[changes < 0]
         axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
@@ -277,7 +277,7 @@ def draw_change_sizes(case: Case) -> Figure:
         axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT)
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         axis.locator_params(axis="y", nbins=4, integer=True, min_n_ticks=1)
-    figure.supylabel(f"number of critical solutions (of {solution_count})", fontsize=9)
+    figure.supylabel(f"number of critical solutions (of {len(changes_of_solutions)})", fontsize=9)
     figure.supxlabel(
         "orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
         "each axis spans the characteristic's domain",
@@ -286,14 +286,14 @@ def draw_change_sizes(case: Case) -> Figure:
     return figure
 
 
-def _count_critical_solutions(case: Case) -> int:
-    """Number of critical solutions; raises UnanswerableError if there are none."""
-    count = len(critical_solutions(case))
-    if not count:
+def _critical_changes(case: Case) -> FloatArray:
+    """The changes of the critical solutions, shape (M, n); raises UnanswerableError if there are none."""
+    changes = changes_of(case, critical_solutions(case))
+    if not len(changes):
         raise UnanswerableError(
             case.name, "has no critical solution", "results with solutions that are more unsafe than the original"
         )
-    return count
+    return changes
 
 
 FORMATS = ("png", "pdf", "svg")
