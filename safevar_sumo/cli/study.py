@@ -203,7 +203,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     # Loads more slowly than all other modules.
     from safevar_sumo.analysis.research_questions.comparisons import summary_lines
 
-    names = tuple(study.vehicle.characteristics)
+    names = study.vehicle.characteristics
     solutions = solutions_frame(names, campaign.solutions.items())
     case = build_case(
         study,
@@ -247,7 +247,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
 
 def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) -> WholeTable:
     """The original vehicle, and each algorithm's solutions: their number, collisions, and means of metrics."""
-    original = evaluations_frame(tuple(study.vehicle.characteristics), [(("", 0), campaign.original)])
+    original = evaluations_frame(study.vehicle.characteristics, [(("", 0), campaign.original)])
     searched = {key.algorithm for key in campaign.solutions}
     by_algorithm = {name: solutions[solutions["algorithm"] == name] for name in study.search.labels if name in searched}
     frames = {"original vehicle": original, **by_algorithm}

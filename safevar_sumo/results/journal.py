@@ -35,7 +35,7 @@ ANOTHER_OWNER = "belongs to another study, version or run"
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
-def journal_head(study: str, run: str, characteristics: Sequence[str]) -> JsonObject:
+def journal_head(study: str, run: str, characteristics: Iterable[str]) -> JsonObject:
     """The first line of a journal, what it belongs to: the digest of a study's identity, a run's name; and the names of
     the characteristics.
     """

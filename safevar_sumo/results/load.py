@@ -5,7 +5,7 @@ choice.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -143,7 +143,7 @@ def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, in
 
 
 def _read_journals(
-    folder: Path, manifest: JsonObject, runs: Sequence[tuple[str, int]], characteristics: tuple[str, ...]
+    folder: Path, manifest: JsonObject, runs: Sequence[tuple[str, int]], characteristics: Collection[str]
 ) -> Iterator[tuple[str, int, JournalContent | None]]:
     """Algorithm, number and journal's content of every run; None for a run without a journal."""
     digest = identity_digest(manifest)

@@ -4,7 +4,7 @@ and solutions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -114,7 +114,7 @@ class ResultsDirectory:
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
-        frame = solutions_frame(tuple(self._study.vehicle.characteristics), solutions.items())
+        frame = solutions_frame(self._study.vehicle.characteristics, solutions.items())
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
     def _refuse_another_study(self) -> None:
@@ -152,7 +152,7 @@ def _later_files(directory: Path, study: Study) -> dict[str, str]:
 
 
 def solutions_frame(
-    characteristics: tuple[str, ...], solutions: Iterable[tuple[tuple[str, int], Evaluations]]
+    characteristics: Collection[str], solutions: Iterable[tuple[tuple[str, int], Evaluations]]
 ) -> pd.DataFrame:
     """One row per solution of every run, in a fixed order; columns as in `evaluations_frame`."""
     frame = evaluations_frame(characteristics, solutions)
@@ -161,7 +161,7 @@ def solutions_frame(
 
 
 def evaluations_frame(
-    characteristics: tuple[str, ...], runs: Iterable[tuple[tuple[str, int], Evaluations]]
+    characteristics: Collection[str], runs: Iterable[tuple[tuple[str, int], Evaluations]]
 ) -> pd.DataFrame:
     """One row per evaluation.
 
@@ -243,7 +243,7 @@ def write_imported(
     import pandas as pd
 
     make_directory(path)
-    tables, characteristics = tables_of(study), tuple(study.vehicle.characteristics)
+    tables, characteristics = tables_of(study), study.vehicle.characteristics
     earlier_manifest = _earlier_manifest(path, tables)
     frame = solutions_frame(
         characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()]
@@ -288,7 +288,7 @@ def _earlier_manifest(path: Path, study: JsonObject) -> JsonObject:
     return manifest
 
 
-def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
+def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
     """The imported solutions, without a run column.
 
     Raises
