@@ -40,6 +40,8 @@ def braking_run(speed: float, deceleration: float, gap: float, collision_speed: 
 
 
 RUN = braking_run(10, 5, 12)
+FIRST_SECOND = RUN.trace.time[:, np.newaxis] < 1.0
+COARSE = MetricsTable(ttc_threshold=2.0, sampling_interval=0.2)
 
 
 def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS) -> float:
@@ -58,7 +60,7 @@ def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
     """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is
     undefined.
     """
-    while_it_lasts = RUN.encounter._replace(in_conflict=RUN.trace.time[:, np.newaxis] < 1.0)
+    while_it_lasts = RUN.encounter._replace(in_conflict=FIRST_SECOND)
     assert value("safety_degree", dataclasses.replace(RUN, encounter=while_it_lasts)) == pytest.approx(
         4.5, abs=10 * STEP
     )
@@ -78,7 +80,7 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
 
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
     fine = value("tet", RUN)
-    coarse = value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=0.2))
+    coarse = value("tet", RUN, COARSE)
     assert coarse == pytest.approx(fine, abs=0.2)
     assert coarse / 0.2 == pytest.approx(round(coarse / 0.2))
 
@@ -103,7 +105,7 @@ def test_time_to_collision_ends_with_the_first_standstill() -> None:
 
 
 def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> None:
-    speed = np.where(RUN.trace.time[:, np.newaxis] < 1.0, 0.0, 2.0)
+    speed = np.where(FIRST_SECOND, 0.0, 2.0)
     gap = 20.0 + 0 * speed
     later = dataclasses.replace(
         RUN, trace=dataclasses.replace(RUN.trace, speed=speed), encounter=Encounter(gap, gap, speed, gap > 0)
@@ -125,9 +127,7 @@ def with_end(run: SimulationRuns, after: float) -> SimulationRuns:
 
 @pytest.mark.parametrize("name", ["tet", "tit", "ave_dece"])
 def test_samples_that_are_not_active_do_not_count(name: str) -> None:
-    slower = dataclasses.replace(
-        RUN.trace, speed=np.where(RUN.trace.time[:, np.newaxis] < 1.0, RUN.trace.speed, RUN.trace.speed / 2)
-    )
+    slower = dataclasses.replace(RUN.trace, speed=np.where(FIRST_SECOND, RUN.trace.speed, RUN.trace.speed / 2))
     assert value(name, with_end(RUN, 0.5)) != value(name, RUN) or name == "ave_dece"
     assert value(name, with_end(RUN, 1.0)) == value(name, with_end(dataclasses.replace(RUN, trace=slower), 1.0))
 
@@ -168,7 +168,7 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
 
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", RUN) == pytest.approx(5.0, rel=1e-9)
-    assert value("ave_dece", RUN, MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)
+    assert value("ave_dece", RUN, COARSE) == pytest.approx(5.0)
 
 
 def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_must_have() -> None:
@@ -190,7 +190,7 @@ def comfort(name: str, speed: np.ndarray, until: float = np.inf, collision_speed
     v = speed.reshape(len(speed), -1)
     active = np.broadcast_to((np.arange(len(v)) * SAMPLED <= until)[:, np.newaxis], v.shape)
     runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=active)
-    return OPTIONAL_METRICS[name](runs, MetricsTable(ttc_threshold=2.0))
+    return OPTIONAL_METRICS[name](runs, THRESHOLDS)
 
 
 def sampled(speed: Callable[[np.ndarray], np.ndarray], seconds: float = 6.0) -> np.ndarray:

@@ -275,9 +275,9 @@ def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> N
 
 
 def test_a_network_lies_beside_its_study(mine: Path) -> None:
-    text = 'extends = "smoke"\nname = "it"\n[scenario.parameters]\nnetwork = "mine"\n'
-    (mine.parent / "it.toml").write_text(text)
-    assert assemble(load_study(str(mine.parent / "it.toml"))).scenario.network == str(mine)
+    study = mine.parent / "it.toml"
+    study.write_text('extends = "smoke"\nname = "it"\n[scenario.parameters]\nnetwork = "mine"\n')
+    assert assemble(load_study(str(study))).scenario.network == str(mine)
 
 
 def load_original(study: str) -> np.ndarray:
