@@ -194,7 +194,7 @@ def _simulate(
         encounter=batch.encounter(trace),
         outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
-        contact=contacts.first_contacts(),
+        contact=contacts.first,
         test_speed_error=robot.error,
         warning_ttc=warning_ttc,
     )

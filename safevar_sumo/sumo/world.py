@@ -304,32 +304,30 @@ FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 
 
 class Contacts:
-    """First contacts of N vehicles; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are
+    """First contacts of N vehicles, `first`; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are
     collisions.
     """
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
-        self._is_tested, self._side, self._position_on_side = is_tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
+        self._is_tested, self.first = is_tested, Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan))
 
     def record_collisions(self, world: Any, is_open: BoolArray, scene: Scene) -> dict[int, float]:
         """Process one sample; returns the speeds [m/s] of the vehicles of open runs that collide, by vehicle number."""
         speeds = world.collisions(is_open)
-        new_copies = [copy for copy in speeds if not self._side[copy]]
+        new_copies = [copy for copy in speeds if not self.first.side[copy]]
         if new_copies:
             own, other = world.bodies(new_copies)
             self._locate(new_copies, own, other, scene)
-        return {copy: speed for copy, speed in speeds.items() if not self._is_tested[copy] or self._side[copy] == FRONT}
+        side = self.first.side
+        return {copy: speed for copy, speed in speeds.items() if not self._is_tested[copy] or side[copy] == FRONT}
 
     def _locate(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
         side, age, distance_behind_front = find_touches(own, other)
         lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * age
         is_at_end = (side == FRONT) | (side == REAR)
         share = np.where(is_at_end, lateral / own.width + 0.5, distance_behind_front / own.length)
-        self._side[copies] = side
-        self._position_on_side[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
-
-    def first_contacts(self) -> Contact:
-        return Contact(self._side, self._position_on_side)
+        self.first.side[copies] = side
+        self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
 
 def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:
