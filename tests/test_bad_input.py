@@ -74,6 +74,7 @@ TYPED = [
     ("simulate sun --set tireFric=1..2 --spread", "--spread"),
     ("explain rian", "did you mean 'rain'?"),
     ("explain smoke --unsafe bad", "below=X"),
+    ("explain smoke --solution nsga2:0:0", "has no solutions"),
     ("explain smoke --unsafe below=nan", "below=X"),
     ("explain smoke --unsafe points=1", "not rated"),
     ("opinion smoke", "smoke: is a study and has no solutions"),
