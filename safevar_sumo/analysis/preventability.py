@@ -78,6 +78,13 @@ class Preventability:
         """The share of a category among the simulated collisions; 0 if no collision was simulated."""
         return self.counts.get(category, 0) / max(self.looked_at, 1)
 
+    @property
+    def shares(self) -> dict[str, float]:
+        """The shares of all categories, and `later`, by name; empty if no collision was simulated."""
+        if not self.looked_at:
+            return {}
+        return {by.name.lower(): self.share(by) for by in PreventableBy} | {"later": self.later / self.looked_at}
+
     def to_dict(self) -> JsonObject:
         """The shares, None without a simulated collision, and the competent driver's 95 % interval, for JSON.
 

@@ -48,6 +48,15 @@ class ExplainOptions(Options):
         low=1,
         metavar="N",
     )
+    fits: int = option(
+        20,
+        "Number of vehicle models that fit the published data about as well (sets of [spread]) with which each "
+        "conclusion is drawn again; 0 leaves this out.",
+        kind=int,
+        low=0,
+        high=1000,
+        metavar="N",
+    )
 
 
 @document_options(ExplainOptions)
@@ -58,6 +67,7 @@ def explain(
     unsafe: Criterion | None = None,
     top: int = ExplainOptions.top,
     limit: int = ExplainOptions.limit,
+    fits: int = ExplainOptions.fits,
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,

@@ -196,6 +196,9 @@ class Cause:
     neighbours
         Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
         the simulations would take too long.
+    sets, holds
+        Number of fitted vehicle models (`ExplainOptions.fits`), and with how many of them the cause is one; 0 and 0 of
+        a study with a single model.
     """
 
     changes: dict[str, float]
@@ -206,11 +209,17 @@ class Cause:
     safety_degree: float | None
     end: BoundaryState = BoundaryState.SAFE
     neighbours: Robustness | None = None
+    sets: int = 0
+    holds: int = 0
 
     @property
     def robustness(self) -> float | None:
         """Share of the neighbours of these changes that are unsafe too."""
         return None if self.neighbours is None else self.neighbours.share
+
+    @property
+    def fits_in_words(self) -> str:
+        return f"in {self.holds} of {self.sets} fitted vehicle models"
 
     @property
     def limit(self) -> str:
@@ -225,7 +234,8 @@ class Cause:
     def to_dict(self) -> JsonObject:
         """An entry of `minimal_causes` in `explain --json`."""
         names = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
-        return {name: getattr(self, name) for name in names}
+        across_fits = {"sets": self.sets, "holds": self.holds} if self.sets else None
+        return {name: getattr(self, name) for name in names} | {"across_fits": across_fits}
 
 
 def describe_causes(

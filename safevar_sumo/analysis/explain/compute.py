@@ -5,12 +5,14 @@ robustness.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.across_fits import count_holding, evaluators_of_sets, measure_across_fits
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
 from safevar_sumo.analysis.explain.causes import (
     MinimalCause,
@@ -85,22 +87,28 @@ def explain_failures(
     if not options.solutions:
         reasons = _add_distinct_causes(found, evaluator, sample, reasons, causes, options.top)
     sample_causes = [causes[row] for row in sample]
+    models = evaluators_of_sets(evaluator, options.fits if statistics else 0)
+    preventability = assess_preventability(evaluator, _collisions(study, found.evaluations))
+    changed = characteristics.changed(settings[sample])
+    necessity = necessity_frame(characteristics, changed, sample_causes, len(found.rows))
+    necessary = dict(zip(necessity["characteristic"], necessity["necessary"], strict=True))
     return Explained(
         study=study,
         unsafe=found.unsafe,
         original=original,
         nearest=found.evaluations.take(np.argsort(found.evaluations.f_safe, kind="stable")[:1]),
-        explanations=_explain_rows(found, evaluator, original, causes, reasons),
-        necessity=necessity_frame(
-            characteristics, characteristics.changed(settings[sample]), sample_causes, len(found.rows)
-        ),
+        explanations=_explain_rows(found, evaluator, original, causes, reasons, models),
+        necessity=necessity,
         distinct=count_distinct_causes(characteristics, sample_causes),
         looked_at=len(found.evaluations),
         failures=len(found.rows),
         analysed=len(sample),
         otherwise=found.deviations,
-        preventability=assess_preventability(evaluator, _collisions(study, found.evaluations)),
+        preventability=preventability,
         no_verdict=evaluator.no_verdict,
+        across_fits=measure_across_fits(models, found.evaluations, found.unsafe, necessary, preventability)
+        if models
+        else None,
     )
 
 
@@ -184,9 +192,14 @@ def _add_distinct_causes(
 
 
 def _explain_rows(
-    found: _Found, evaluator: Evaluator, original: Evaluations, causes: CausesByRow, reasons: Reasons
+    found: _Found,
+    evaluator: Evaluator,
+    original: Evaluations,
+    causes: CausesByRow,
+    reasons: Reasons,
+    models: Sequence[Evaluator],
 ) -> tuple[Explanation, ...]:
-    """Explanations of the chosen failures."""
+    """Explanations of the chosen failures; `models` are the fitted vehicle models in which a cause may hold."""
     rows, unsafe, system, rated = list(reasons), found.unsafe, assemble(evaluator.study), is_rated(evaluator.study)
     if not rows:
         return ()
@@ -200,7 +213,11 @@ def _explain_rows(
         settings = np.array([*chosen.settings, *(cause.setting for cause in all_causes)])
         robustnesses = estimate_robustness(evaluator, settings, _time_step(system), unsafe)
     of_causes = [None] * len(all_causes) if rated else robustnesses[len(rows) :]
-    described = iter(describe_causes(evaluator, all_causes, unsafe, of_causes))
+    holds = count_holding(models, all_causes, unsafe)
+    described = iter(
+        replace(cause, sets=len(models), holds=number)
+        for cause, number in zip(describe_causes(evaluator, all_causes, unsafe, of_causes), holds, strict=True)
+    )
     collisions = _collisions(evaluator.study, chosen)
     avoidances = dict(zip(map(bytes, collisions.settings), classify_collisions(evaluator, collisions), strict=True))
     explanations = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from safevar_sumo.analysis.explain.across_fits import AcrossFits
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.robustness import Robustness
@@ -110,6 +111,8 @@ class Explained:
         Shares of the collisions among the evaluated settings that reference drivers avoid.
     no_verdict
         Why simulations tell nothing about the driving system; "" if they do.
+    across_fits
+        Ranges of the shares over the fitted vehicle models; None for a study with a single model.
     """
 
     study: Study
@@ -125,6 +128,7 @@ class Explained:
     otherwise: int
     preventability: Preventability
     no_verdict: str = ""
+    across_fits: AcrossFits | None = None
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -160,6 +164,7 @@ class Explained:
             "changed": by_name["changed"].to_dict(),
             "necessary_interval": by_name[["necessary_lower", "necessary_upper"]].T.to_dict("list"),
             "preventable": self.preventability.to_dict(),
+            "across_fits": None if self.across_fits is None else self.across_fits.to_dict(),
             **driven_entry(self.no_verdict),
         }
         return [*(failure.to_dict() for failure in self.explanations), {"summary": summary}]

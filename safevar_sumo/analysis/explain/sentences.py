@@ -57,6 +57,8 @@ MAX_NECESSARY = 4
 def answer_in_words(result: Explained) -> list[str]:
     """The verdict as a paragraph, the counts, and why and by how little the first failure fails."""
     sentences = [" ".join(verdict_in_words(result)), counts_in_words(result)]
+    if result.across_fits:
+        sentences.append(str(result.across_fits))
     if not result.explanations:
         return sentences
     first = result.explanations[0]
@@ -178,9 +180,11 @@ def finding_in_words(characteristics: CharacteristicSet, failure: Explanation) -
     effect = f"{effect_in_words(failure)} ({failure.name}, {failure.robustness})"
     if cause is None or len(cause.changes) == number:
         return f"{effect} needs all of {number_of(number, 'change')}: {changes}."
-    robustness = "" if cause.neighbours is None else f" ({cause.neighbours})"
+    notes = [] if cause.neighbours is None else [str(cause.neighbours)]
+    notes += [cause.fits_in_words] if cause.sets else []
     needed = f"{_number_in_words(len(cause.changes))} of them suffice{'s' if len(cause.changes) == 1 else ''}"
-    return f"{effect} was found with {_number_in_words(number)} changes: {changes}; {needed}{robustness}."
+    in_brackets = f" ({'; '.join(notes)})" if notes else ""
+    return f"{effect} was found with {_number_in_words(number)} changes: {changes}; {needed}{in_brackets}."
 
 
 def _number_in_words(number: int) -> str:
@@ -277,6 +281,7 @@ def _parts_of_failure(failure: Explanation, result: Explained, subject: str, poi
         yield table
         yield meanings(changed)
         robustness = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
+        robustness += f"They are a cause {cause.fits_in_words}. " if cause.sets else ""
         yield f"{cause.limit} {robustness}{simulate_command(subject, cause.changes, point)}"
     if len(failure.causes) > MAX_CAUSES:
         yield f"... and {len(failure.causes) - MAX_CAUSES} more of the same number of changes (--json has all)."

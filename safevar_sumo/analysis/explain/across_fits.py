@@ -1,0 +1,151 @@
+"""Do conclusions hold with the other vehicle models that fit the published data about as well (sets of [spread])?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.explain.causes import (
+    MinimalCause,
+    find_minimal_causes,
+    necessity_frame,
+    select_affordable_rows,
+)
+from safevar_sumo.analysis.model_spread import studies_of_sets
+from safevar_sumo.analysis.preventability import Preventability, assess_preventability
+from safevar_sumo.analysis.words import number_of, share_in_words
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import Evaluations, FloatArray
+
+MAX_SETTINGS = 400
+"""Maximum number of settings, drawn at random, whose share of unsafe ones is compared between sets."""
+MAX_COLLISIONS = 100
+"""Maximum number of collisions, drawn at random, that the reference drivers meet with each set."""
+MAX_SUBSETS = 1000
+"""Approximate number of simulations for the minimal causes of a random sample of failures with each set."""
+STAGE = "other fitted vehicle models"
+Range = tuple[float, float]
+
+
+class AcrossFits(NamedTuple):
+    """Ranges of shares over the parameter sets of a study's table [spread].
+
+    A range is the share with the study's own parameters, plus the least and the greatest difference that another set
+    makes on a random sample.
+
+    Attributes
+    ----------
+    sets
+        Number of parameter sets, the study's own among them.
+    unsafe
+        Range of the share of settings that are unsafe.
+    necessary
+        Range of the share of failures that need a characteristic, by its name.
+    preventable
+        Range of the share of collisions in each category of drivers, and `later`, by name; empty without a collision.
+    """
+
+    sets: int
+    unsafe: Range
+    necessary: Mapping[str, Range]
+    preventable: Mapping[str, Range]
+
+    def __str__(self) -> str:
+        competent = self.preventable.get("competent_driver")
+        avoided = f"; a competent driver avoids {_in_words(competent)} of the collisions" if competent else ""
+        return (
+            f"With {number_of(self.sets, 'vehicle model')} that fit the published data about as well, "
+            f"{_in_words(self.unsafe)} of the vehicles are unsafe{avoided}."
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """The entry `across_fits` of a summary in JSON: the ranges under the names of the shares."""
+
+        def entry(ends: Range) -> dict[str, object]:
+            return {"sets": self.sets, "range": list(ends)}
+
+        return {
+            "unsafe": entry(self.unsafe),
+            "necessary": {name: entry(ends) for name, ends in self.necessary.items()},
+            "preventable": {name: entry(ends) for name, ends in self.preventable.items()},
+        }
+
+
+def _in_words(ends: Range) -> str:
+    low, high = map(share_in_words, ends)
+    return low if low == high else f"{low} to {high}"
+
+
+def evaluators_of_sets(evaluator: Evaluator, fits: int) -> list[Evaluator]:
+    """An evaluator for each of the first `fits` parameter sets, the study's own first; none for a study without
+    [spread].
+    """
+    return (
+        [evaluator.for_study(study) for study in studies_of_sets(evaluator.study)[:fits]]
+        if (fits and evaluator.study.spread)
+        else []
+    )
+
+
+def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[MinimalCause], unsafe: Unsafe) -> list[int]:
+    """With how many sets each cause holds: its changes alone are unsafe, and safe if any one of them is left out."""
+    if not causes or not evaluators:
+        return [0] * len(causes)
+    original, groups = evaluators[0].characteristics.original, list[FloatArray]()
+    for cause in causes:
+        parts = np.tile(cause.setting, (1 + len(cause.columns), 1))
+        for row, column in enumerate(cause.columns, 1):
+            parts[row, column] = original[column]
+        groups.append(parts)
+    starts = np.cumsum([0, *map(len, groups)])[:-1]
+    counts = np.zeros(len(causes), dtype=int)
+    for evaluator in evaluators:
+        is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
+        counts += is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1)
+    return [int(count) for count in counts]
+
+
+def measure_across_fits(
+    evaluators: Sequence[Evaluator],
+    evaluations: Evaluations,
+    unsafe: Unsafe,
+    necessary: Mapping[str, float],
+    preventability: Preventability,
+) -> AcrossFits:
+    """The ranges of the shares over the sets; the arguments have the shares with the study's own parameters."""
+    own = evaluators[0]
+    order = np.random.default_rng(own.study.search.seed).permutation(len(evaluations))
+    vehicles = evaluations.take(order[:MAX_SETTINGS])
+    failures = evaluations.take(order[unsafe.of(evaluations)[order]])
+    failures = failures.take(select_affordable_rows(failures.settings, own, MAX_SUBSETS))
+    collisions = evaluations.take(order[evaluations.collided[order]][:MAX_COLLISIONS])
+
+    def shares_of(evaluator: Evaluator) -> dict[str, float]:
+        """All shares, with the parameters of a set."""
+        causes = find_minimal_causes(evaluator, failures.settings, unsafe)
+        rows = [row for row, of_failure in enumerate(causes) if of_failure]
+        changed = evaluator.characteristics.changed(failures.settings[rows])
+        frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
+        here = evaluator.evaluate(collisions.settings, STAGE)
+        return {
+            "unsafe": float(np.mean(unsafe.of(evaluator.evaluate(vehicles.settings, STAGE)))),
+            **dict(zip(frame["characteristic"], frame["necessary"], strict=True)),
+            **assess_preventability(evaluator, here.take(here.collided)).shares,
+        }
+
+    samples = [shares_of(evaluator) for evaluator in evaluators]
+
+    def range_of(name: str, share: float) -> Range:
+        differences = [sample[name] - samples[0][name] for sample in samples if name in sample]
+        low, high = (float(np.clip(share + end(differences, default=0.0), 0.0, 1.0)) for end in (min, max))
+        return low, high
+
+    return AcrossFits(
+        len(evaluators),
+        range_of("unsafe", float(np.mean(unsafe.of(evaluations)))),
+        {name: range_of(name, share) for name, share in necessary.items()},
+        {name: range_of(name, share) for name, share in preventability.shares.items()},
+    )
