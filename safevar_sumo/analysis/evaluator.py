@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all, inputs_of
+from safevar_sumo.campaign.batches import VERIFIED_SETTINGS, ask_why_no_verdict, evaluate_all, inputs_of
 from safevar_sumo.campaign.evaluation import pack_study
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool, wait_for_result
@@ -50,10 +50,12 @@ class Evaluator:
         Number of settings simulated so far; of equal settings in one call only one is simulated.
     """
 
-    def __init__(self, study: Study, pool: Pool, progress: Progress = show_no_progress) -> None:
+    def __init__(
+        self, study: Study, pool: Pool, progress: Progress = show_no_progress, verified: int = VERIFIED_SETTINGS
+    ) -> None:
         self.study, self.region = study, region_of(study)
         self.characteristics = self.region.characteristics
-        self._pool, self.progress = pool, progress
+        self._pool, self.progress, self._verified = pool, progress, verified
         self.simulated = 0
 
     def evaluate(self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False) -> Evaluations:
@@ -78,7 +80,7 @@ class Evaluator:
             done += increment
             self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done)
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, self._verified)
         self.simulated += total
         return evaluations
 
@@ -207,9 +209,9 @@ class Evaluator:
         metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)
         return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
-    def for_study(self, study: Study) -> Evaluator:
-        """An evaluator of another study, on the same pool."""
-        return Evaluator(study, self._pool, self.progress)
+    def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
+        """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
+        return Evaluator(study, self._pool, self.progress, self._verified if verified is None else verified)
 
 
 @contextmanager

@@ -56,11 +56,16 @@ def choose_batch_size(study: Study) -> tuple[int, bool]:
 
 
 def evaluate_all(
-    study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None
+    study: Study,
+    settings: FloatArray,
+    pool: Pool,
+    done: Callable[[int], None] = lambda number: None,
+    verified: int = VERIFIED_SETTINGS,
 ) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
 
-    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
+    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO,
+    until `verified` ones of the study have been.
     `done` is called with the number of settings of every finished batch.
     """
     retrying_pool, work = RetryingPool(pool, study), pack_study(study, inputs := inputs_of(study, pool))
@@ -73,7 +78,7 @@ def evaluate_all(
     size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
     starts = range(0, len(distinct_settings), size)
     futures = {retrying_pool.submit(work, distinct_settings[start : start + size]): start for start in starts}
-    sample_size = min(VERIFIED_SETTINGS - _verified_counts.get(work, 0), len(distinct_settings))
+    sample_size = max(min(verified - _verified_counts.get(work, 0), len(distinct_settings)), 0)
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     sumo_future = recorded_future = None
     if is_recorded and len(sample):

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
@@ -32,6 +33,7 @@ from safevar_sumo.analysis.explain.causes import (
 from safevar_sumo.analysis.explain.compute import explain_failures, summarise_failures
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.explain.sentences import effect_in_words, print_explained
+from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -295,6 +297,33 @@ def test_necessary_and_changed_over_failures() -> None:
     assert sampled[["necessary_lower", "necessary_upper"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
     distinct = count_distinct_causes(evaluator.characteristics, causes)
     assert list(zip(distinct["cause"], distinct["failures"], strict=True)) == [(("a up", "b down"), 2), (("c up",), 1)]
+
+
+def test_conclusions_across_fitted_models() -> None:
+    """Own: a up and b down together are unsafe. Second: a up alone. Third: nothing. Fourth: as the own, only wider."""
+    regions = (
+        box,
+        lambda one: one[:, 0] > 8,
+        lambda one: one[:, 0] > 99,
+        lambda one: (one[:, 0] > 7) & (one[:, 1] < 5),
+    )
+    models = [made_up_evaluator(3, region) for region in regions]
+    settings = np.array([[9.0, 1.0, 5.0], [7.5, 1.0, 8.0], [9.0, 8.0, 5.0], [5.0, 5.0, 5.0]])
+    evaluations = models[0].evaluate(settings, "settings")
+    rows = COLLISION.of(evaluations)
+    causes = [cause for of_one in find_minimal_causes(models[0], settings[rows], COLLISION) for cause in of_one]
+    assert count_holding(models, causes, COLLISION) == [
+        sum(
+            region(np.array([[9.0, 1.0, 5.0]]))[0] and not region(np.array([[9.0, 5.0, 5.0], [5.0, 1.0, 5.0]])).any()
+            for region in regions
+        )
+    ] * len(causes)
+    nobody = Preventability(counts={}, collisions=0, later=0)
+    result = measure_across_fits(models, evaluations, COLLISION, {"a": 1.0, "b": 1.0, "c": 0.0}, nobody)
+    shares = [region(settings).mean() for region in regions]
+    assert result.unsafe == (min(shares), max(shares))
+    assert result.necessary == {"a": (1.0, 1.0), "b": (0.0, 1.0), "c": (0.0, 0.0)}
+    assert result.to_dict()["unsafe"] == {"sets": 4, "range": [min(shares), max(shares)]}
 
 
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:

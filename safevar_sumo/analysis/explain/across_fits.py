@@ -80,14 +80,12 @@ def _in_words(ends: Range) -> str:
 
 
 def evaluators_of_sets(evaluator: Evaluator, fits: int) -> list[Evaluator]:
-    """An evaluator for each of the first `fits` parameter sets, the study's own first; none for a study without
-    [spread].
+    """An evaluator for each of the first `fits` parameter sets, the study's own first; none without a table [spread].
+
+    Scene and equations are the study's, so that nothing is simulated in SUMO once more.
     """
-    return (
-        [evaluator.for_study(study) for study in studies_of_sets(evaluator.study)[:fits]]
-        if (fits and evaluator.study.spread)
-        else []
-    )
+    studies = studies_of_sets(evaluator.study)[:fits] if fits and evaluator.study.spread else []
+    return [evaluator.for_study(study, verified=0) for study in studies]
 
 
 def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[MinimalCause], unsafe: Unsafe) -> list[int]:
@@ -121,7 +119,7 @@ def measure_across_fits(
     vehicles = evaluations.take(order[:MAX_SETTINGS])
     failures = evaluations.take(order[unsafe.of(evaluations)[order]])
     failures = failures.take(select_affordable_rows(failures.settings, own, MAX_SUBSETS))
-    collisions = evaluations.take(order[evaluations.collided[order]][:MAX_COLLISIONS])
+    collisions = evaluations.take(order[evaluations.collided[order]][: MAX_COLLISIONS if preventability.shares else 0])
 
     def shares_of(evaluator: Evaluator) -> dict[str, float]:
         """All shares, with the parameters of a set."""
@@ -129,12 +127,12 @@ def measure_across_fits(
         rows = [row for row, of_failure in enumerate(causes) if of_failure]
         changed = evaluator.characteristics.changed(failures.settings[rows])
         frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
-        here = evaluator.evaluate(collisions.settings, STAGE)
-        return {
-            "unsafe": float(np.mean(unsafe.of(evaluator.evaluate(vehicles.settings, STAGE)))),
-            **dict(zip(frame["characteristic"], frame["necessary"], strict=True)),
-            **assess_preventability(evaluator, here.take(here.collided)).shares,
-        }
+        shares = dict(zip(frame["characteristic"], frame["necessary"], strict=True))
+        shares["unsafe"] = float(np.mean(unsafe.of(evaluator.evaluate(vehicles.settings, STAGE))))
+        if len(collisions):
+            here = evaluator.evaluate(collisions.settings, STAGE)
+            shares |= assess_preventability(evaluator, here.take(here.collided)).shares
+        return shares
 
     samples = [shares_of(evaluator) for evaluator in evaluators]
 
