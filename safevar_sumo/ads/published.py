@@ -161,8 +161,6 @@ in speed.
 """
 PASSED_GAP = -0.5
 """Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin to brake for it."""
-RELEASE_GAP = -1.0
-"""Once braking, the policy brakes until the obstacle is this far behind the front bumper [m]."""
 
 
 class _RailsMemory(NamedTuple):
@@ -208,6 +206,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     hesitation
         Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake
         at once.
+    release_gap
+        The policy does not brake for obstacles with smaller gaps, which its camera's picture does not show [m]: it
+        releases the brake and opens the throttle, whether or not the vehicle has stopped.
     """
 
     first_command: UpTo60
@@ -221,6 +222,7 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     throttle: tuple[Throttle, Throttle, Throttle]
     recognition_delay: Delay = 0.0
     hesitation: Delay = 0.0
+    release_gap: Annotated[float, Meta(ge=-1, le=60)] = -1.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _RailsMemory:
         idle = Command(np.zeros(n), np.zeros(n))
@@ -250,10 +252,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
-        is_in_corridor = np.abs(lateral) <= self.corridor
-        starts_braking = is_in_corridor & (gap <= braking_gap) & (gap > PASSED_GAP)
-        keeps_braking = is_in_corridor & was_braking & (gap > RELEASE_GAP)
-        is_braking: BoolArray = starts_braking | keeps_braking
+        is_seen = (np.abs(lateral) <= self.corridor) & (gap > self.release_gap)
+        starts_braking = (gap <= braking_gap) & (gap > PASSED_GAP)
+        is_braking: BoolArray = is_seen & (starts_braking | was_braking)
         return is_braking
 
     def _throttle(self, speed: FloatArray) -> FloatArray:

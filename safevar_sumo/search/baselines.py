@@ -44,6 +44,8 @@ PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Changes a few characteristics of the original vehicle, in ranges that narrow towards less safe settings.
 
+    A setting's score compares it with its generation, and stays (`_scores`).
+
     Parameters
     ----------
     generation
@@ -53,7 +55,7 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     warm_up
         Evaluations before ranges are narrowed or a generation must improve.
     generations_between_updates, generations_without_improvement
-        Number of generations between two updates of the ranges, and number without an improvement after which the
+        Number of generations between two updates of the ranges, and number without a new lowest score after which the
         search ends.
     safety_weight
         Weight of the first objective in the score; the other objectives have weight 1.
@@ -68,28 +70,25 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         ranges = _Ranges(problem)
-        batches: list[Evaluations] = []
-        window: list[Evaluations] = []
-        used = generation = unimproved = 0
+        generations: list[Evaluations] = []
+        scores: list[FloatArray] = []
+        lowest_score = np.inf
+        used = unimproved = last_update = 0
         while used < problem.evaluations and unimproved < self.generations_without_improvement:
-            settings = ranges.draw(min(self.generation, problem.evaluations - used), rng)
-            earlier = Evaluations.concatenate(batches) if batches else None
-            evaluated = yield settings
-            used, generation = used + len(settings), generation + 1
-            batches.append(evaluated)
-            window.append(evaluated)
-            if earlier is not None and len(earlier) >= self.warm_up:
-                unimproved = (
-                    0
-                    if _improves(evaluated, earlier, problem.scoring, self.safety_weight, self.kept)
-                    else unimproved + 1
-                )
-            if used >= self.warm_up and generation % self.generations_between_updates == 0:
-                ranges.narrow(Evaluations.concatenate(window))
-                window = []
-        evaluations = Evaluations.concatenate(batches)
-        valid = evaluations.take(problem.scoring.valid(evaluations))
-        return valid.take(np.argsort(_scores(valid, problem.scoring, self.safety_weight), kind="stable")[: self.kept])
+            evaluated = yield ranges.draw(min(self.generation, problem.evaluations - used), rng)
+            used += len(evaluated)
+            generations.append(evaluated)
+            scores.append(_scores(evaluated, problem.scoring, self.safety_weight))
+            lowest_in_generation = np.nanmin(scores[-1], initial=np.inf)
+            is_improved = lowest_in_generation < lowest_score or used <= self.warm_up
+            unimproved = 0 if is_improved else unimproved + 1
+            lowest_score = min(lowest_score, lowest_in_generation)
+            if used >= self.warm_up and len(generations) % self.generations_between_updates == 0:
+                ranges.narrow(Evaluations.concatenate(generations[last_update:]))
+                last_update = len(generations)
+        best = np.argsort(np.concatenate(scores), kind="stable")[: self.kept]
+        solutions = Evaluations.concatenate(generations).take(best)
+        return solutions.take(problem.scoring.valid(solutions))
 
 
 class _Ranges:
@@ -153,29 +152,15 @@ class _Ranges:
         self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
 
-def _improves(
-    generation: Evaluations,
-    earlier: Evaluations,
-    scoring: Scoring = PUBLISHED_SCORING,
-    safety_weight: float = SAFETY_WEIGHT,
-    kept: int = RESULT_SIZE,
-) -> bool:
-    """Whether the best score of a generation is lower than the worst of the `kept` best earlier scores."""
-    scores = _scores(Evaluations.concatenate([earlier, generation]), scoring, safety_weight)
-    earlier_scores, new_scores = scores[: len(earlier)], scores[len(earlier) :]
-    best = np.sort(earlier_scores[~np.isnan(earlier_scores)])[:kept]
-    new_scores = new_scores[~np.isnan(new_scores)]
-    return bool(new_scores.size and (not best.size or new_scores.min() < best[-1]))
-
-
 def _scores(
     evaluations: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT
 ) -> FloatArray:
-    """The score (6 SD_norm + f_diff + num_norm) / 8, of which the search prefers low values; NaN where invalid.
+    """The scores (6 SD_norm + f_diff + num_norm) / 8 of a generation, of which the search prefers low values; NaN where
+    invalid.
 
-    SD_norm is the safety degree scaled to [0, 1] over `evaluations`; num_norm = (f_num_diff - 1) / (n - 1) for n
-    characteristics. The first of other objectives takes the place of the safety degree; further ones are scaled to [0,
-    1], too.
+    SD_norm is the safety degree scaled to [0, 1] over the generation ("after each generation, the value of each
+    objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n characteristics. The first of other
+    objectives takes the place of the safety degree; further ones are scaled to [0, 1], too.
     """
     values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
     score = safety_weight * _normalise(values[:, 0])
