@@ -33,6 +33,11 @@ SECONDS_BETWEEN_SAVES = 60.0
 )
 @click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
 @click.option(
+    "--repeats",
+    type=click.IntRange(min=1, max=100),
+    help="Number of seeds, each with all trials.  [default: the first study's]",
+)
+@click.option(
     "--starts",
     type=click.IntRange(min=0, max=1000),
     help="Number of additional random starts.  [default: the first study's]",
@@ -109,16 +114,17 @@ def _fit(
     """
     studies = [subject.study for subject in subjects]
     fit, done, lowest_loss, best, last_save = studies[0].fit, 0, 0.0, list(studies), time.monotonic()
+    trials = fit.trials * fit.repeats
 
     def save_best(ending: str) -> None:
-        comment = f"Best of {done} of {fit.trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
+        comment = f"Best of {done} of {trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
         found = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
         _write_studies(targets, studies, found, [comment] * len(studies))
 
     def after_trial(loss: float, best_studies: tuple[Study, ...]) -> None:
         nonlocal done, lowest_loss, best, last_save
         done, lowest_loss, best = done + 1, loss, list(best_studies)
-        show_progress(f"trials, lowest loss {loss:.4f}", done, fit.trials)
+        show_progress(f"trials, lowest loss {loss:.4f}", done, trials)
         if time.monotonic() - last_save > SECONDS_BETWEEN_SAVES:
             save_best("while more are tried")
             last_save = time.monotonic()
@@ -129,7 +135,7 @@ def _fit(
             terminate_as_interrupt(),
             open_progress(True) as show_progress,
         ):
-            show_progress("trials", 0, fit.trials)
+            show_progress("trials", 0, trials)
             return calibrate(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if done:

@@ -20,7 +20,7 @@ from safevar_sumo.reference.effects import error_beyond_spread, is_held_back
 from safevar_sumo.reference.fit_space import MAX_LOSS, FitSpace, FittedParameter, StudyFit, StudyGroup, free_parameters
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.reference.search import CmaSearch, SearchRace, invert
-from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
+from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 START_DEVIATION = 0.02
@@ -89,15 +89,20 @@ class Profiles(NamedTuple):
     limit: float
 
     @classmethod
-    def of(cls, parameters: Sequence[FittedParameter], space: FitSpace, race: SearchRace, alike: float) -> Profiles:
-        """The profiles of a finished race; a trial fits as well as the best up to `alike` times the lowest loss above
-        it.
+    def of(
+        cls, parameters: Sequence[FittedParameter], space: FitSpace, races: Sequence[SearchRace], alike: float
+    ) -> Profiles:
+        """The profiles of finished races; a trial fits as well as the best up to `alike` times the lowest loss above
+        it. The best trials of all races that fit so well are among the sets.
         """
-        limit = race.lowest_loss * (1 + alike)
-        trials = sorted((trial for trial in race.kept if race.lowest_loss < trial[0]), key=lambda trial: trial[0])
-        losses = np.array([race.lowest_loss, *(loss for loss, _ in trials)])
-        places = np.array([race.best_place, *(place for _, place in trials)])
-        return cls(parameters, losses, space.values(places), _distant_trials(places[losses <= limit]), limit)
+        bests = sorted(((race.lowest_loss, race.best_place) for race in races), key=lambda trial: trial[0])
+        limit = bests[0][0] * (1 + alike)
+        rest = [trial for race in races for trial in race.kept if trial[0] > race.lowest_loss]
+        trials = [*bests, *sorted(rest, key=lambda trial: trial[0])]
+        losses, places = np.array([loss for loss, _ in trials]), np.array([place for _, place in trials])
+        alike_trials = np.flatnonzero(losses <= limit)
+        sets = alike_trials[_distant_trials(places[alike_trials], sum(loss <= limit for loss, _ in bests))].tolist()
+        return cls(parameters, losses, space.values(places), sets, limit)
 
     def spread(self, study: int) -> dict[str, list[float]]:
         """Values of each parameter of the study with this index, one for each of the `sets`: the table [spread]."""
@@ -113,10 +118,10 @@ class Profiles(NamedTuple):
         return float(values.min()), float(values.max())
 
 
-def _distant_trials(places: FloatArray) -> list[int]:
-    """Indices of trials that lie as far apart as possible, from the first trial on (farthest-point sampling)."""
-    indices = [0]
-    distances = np.linalg.norm(places - places[0], axis=1)
+def _distant_trials(places: FloatArray, first: int) -> list[int]:
+    """Indices of trials that lie as far apart as possible, the `first` ones among them (farthest-point sampling)."""
+    indices = list(range(min(first, MAX_SETS)))
+    distances = np.linalg.norm(places[:, np.newaxis] - places[indices], axis=2).min(axis=1)
     while len(indices) < min(MAX_SETS, len(places)) and distances.max() > 0:
         indices.append(int(np.argmax(distances)))
         distances = np.minimum(distances, np.linalg.norm(places - places[indices[-1]], axis=1))
@@ -184,22 +189,20 @@ def calibrate(
         for is_test in (False, True)
     )
     space = FitSpace(parameters, [StudyFit(study, data, pool) for study, data in zip(studies, fit_data, strict=True)])
-    race = SearchRace(
-        space.misfits_at, fit.population, fit.trials, lambda loss, place: done(loss, space.studies_at(place))
-    )
-    if not from_scratch and race.try_places([space.own_place()])[0].loss >= MAX_LOSS:
-        names = " and ".join(f"study {study.name!r}" for study in studies)
-        raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
-    rng = np.random.default_rng(fit.seed)
-    max_trials = race.trials_left // (2 * max(fit.starts, 1))
-    searches = [_begin_at_random(race, len(parameters), fit.ensemble, max_trials, rng) for _ in range(fit.starts)]
-    if not from_scratch:
-        population = refining_population(fit.population, len(parameters))
-        searches.append(race.begin(space.own_place(), START_DEVIATION, seed=fit.seed + 1, population=population))
-    race.run(searches)
-    profiles = Profiles.of(parameters, space, race, fit.alike)
-    reached, results = [search.lowest_loss for search in searches if search.lowest_loss < np.inf], []
-    for k, best in enumerate(space.studies_at(race.best_place)):
+    best_loss, best_place = np.inf, space.own_place()
+
+    def after_trial(loss: float, place: FloatArray) -> None:
+        nonlocal best_loss, best_place
+        if loss < best_loss:
+            best_loss, best_place = loss, place
+        done(best_loss, space.studies_at(best_place))
+
+    races, reached = [], list[float]()
+    for seed in range(fit.seed, fit.seed + fit.repeats):
+        races.append(SearchRace(space.misfits_at, fit.population, fit.trials, after_trial))
+        reached += _run_race(races[-1], space, fit, seed, from_scratch)
+    profiles, results = Profiles.of(parameters, space, races, fit.alike), []
+    for k, best in enumerate(space.studies_at(best_place)):
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
@@ -212,7 +215,7 @@ def calibrate(
             Calibration(
                 values,
                 best,
-                race.lowest_loss,
+                best_loss,
                 reached,
                 _measure_agreements(best, fit_data[k], pool),
                 _measure_agreements(best, test_data[k], pool),
@@ -220,6 +223,23 @@ def calibrate(
             )
         )
     return results
+
+
+def _run_race(race: SearchRace, space: FitSpace, fit: FitTable, seed: int, from_scratch: bool) -> list[float]:
+    """Spend a race's trials on searches from random places and from the studies' own; returns their lowest losses."""
+    if not from_scratch and race.try_places([space.own_place()])[0].loss >= MAX_LOSS:
+        names = [f"study {study.name!r}" for study in space.studies_at(space.own_place())]
+        raise SimulationError(
+            f"{' and '.join(names)} cannot be simulated with {'its' if len(names) == 1 else 'their'} own values"
+        )
+    rng, dimension = np.random.default_rng(seed), len(space.own_place())
+    max_trials = race.trials_left // (2 * max(fit.starts, 1))
+    searches = [_begin_at_random(race, dimension, fit.ensemble, max_trials, rng) for _ in range(fit.starts)]
+    if not from_scratch:
+        population = refining_population(fit.population, dimension)
+        searches.append(race.begin(space.own_place(), START_DEVIATION, seed=seed + 1, population=population))
+    race.run(searches)
+    return [search.lowest_loss for search in searches if search.lowest_loss < np.inf]
 
 
 def _check_subjects(subjects: Sequence[FitSubject], from_scratch: bool) -> None:

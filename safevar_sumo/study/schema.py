@@ -222,11 +222,13 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     values and from `starts` random places in the bounds; the worse half gives up after every round. With an `ensemble`
     of 2 or more, each random start is an ensemble Kalman inversion of so many places, and the search begins at its best
     place and in its covariance; all inversions have half the trials at most. A search around known values has a third
-    of the `population`. `seed` is the seed of all random numbers.
+    of the `population`. `seed` is the seed of all random numbers; with `repeats`, all this is repeated with the next
+    seeds, the lowest loss counts, and the best set of every repetition that fits equally well is in the `spread`.
     """
 
     trials: PositiveInt = 1200
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    repeats: Annotated[int, Meta(ge=1, le=100)] = 1
     starts: Annotated[int, Meta(ge=0, le=1000)] = 0
     ensemble: Annotated[int, Meta(ge=0, le=100_000)] = 0
     population: Annotated[int, Meta(ge=4, le=1000)] = 14
