@@ -22,8 +22,7 @@ from safevar_sumo.analysis.evaluator import open_evaluator
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, read_reference
-from safevar_sumo.search import Problem
-from safevar_sumo.search.elitist import Nsga2
+from safevar_sumo.search import Nsga2, Problem
 from safevar_sumo.study import SAFETY_DEGREE, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
