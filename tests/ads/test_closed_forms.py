@@ -94,6 +94,15 @@ def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_
     assert command.throttle[0] == pytest.approx(throttle)
 
 
+@pytest.mark.parametrize(("gap", "speed", "brakes"), [(0.6, 1.0, 1), (0.5, 1.0, 0), (0.4, 0.0, 0), (-0.2, 1.0, 0)])
+def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(gap: float, speed: float, brakes: int) -> None:
+    """Though it braked before, and whether it moves or stands."""
+    ads = world_on_rails(release_gap=0.5)
+    memory = ads.start(1, KNOWN, STEP)._replace(is_braking=np.ones(1, dtype=bool))
+    command, _ = ads.drive(seen(1.0, speed, gap), memory)
+    assert (command.brake[0], command.throttle[0] > 0) == (brakes, not brakes)
+
+
 def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> None:
     ads = world_on_rails(first_command=0.2, latency=0.1)
     memory, throttle = ads.start(1, KNOWN, STEP), []

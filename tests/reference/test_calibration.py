@@ -181,7 +181,7 @@ def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     assert race.best_place == pytest.approx([0.2, 0.2], abs=0.01)
     bounds = [FreeParameter(lower=0.0, upper=upper, unit="-", meaning="place") for upper in (1.0, 10.0)]
     parameters = [FittedParameter("a", (0,), bounds[0]), FittedParameter("b", (1,), bounds[1])]
-    profiles = Profiles.of(parameters, FitSpace(parameters, []), race, 0.04)
+    profiles = Profiles.of(parameters, FitSpace(parameters, []), [race], 0.04)
     for (low, high), whole in ((profiles.interval(0), 0.4), (profiles.interval(1), 4.0)):
         assert 0 <= low < 0.3 * whole, "no more than what is as good, and most of it"
         assert 0.7 * whole < high <= whole
@@ -190,6 +190,12 @@ def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     assert len(sets) == 20
     assert sets[0] == pytest.approx(0.2, abs=0.001)
     assert (min(sets), max(sets)) == pytest.approx(profiles.interval(0), abs=0.1)
+    as_good, worse = (race_in(Bowl(), 8, 8)[0] for _ in range(2))
+    as_good.lowest_loss, as_good.best_place = 1.01, np.array([0.23, 0.2])
+    worse.lowest_loss, worse.best_place = 1.05, np.array([0.9, 0.9])
+    repeated = Profiles.of(parameters, FitSpace(parameters, []), [worse, as_good, race], 0.04)
+    assert repeated.spread(0)["a"][:2] == pytest.approx([0.2, 0.23], abs=0.001), "the bests of all that fit as well"
+    assert 0.9 not in repeated.spread(0)["a"]
 
 
 PLACE = np.array([0.7, 0.2, 0.45])
