@@ -57,8 +57,6 @@ MAX_NECESSARY = 4
 def answer_in_words(result: Explained) -> list[str]:
     """The verdict as a paragraph, the counts, and why and by how little the first failure fails."""
     sentences = [" ".join(verdict_in_words(result)), counts_in_words(result)]
-    if result.across_fits:
-        sentences.append(str(result.across_fits))
     if not result.explanations:
         return sentences
     first = result.explanations[0]
@@ -83,12 +81,12 @@ def answer_in_words(result: Explained) -> list[str]:
 
 
 def counts_in_words(result: Explained) -> str:
-    """The criterion, and how many settings are unsafe by it."""
+    """The criterion, how many settings are unsafe by it, and in which range with other fitted vehicle models."""
     vehicles = number_of(result.looked_at, "different vehicle")
-    unsafe = f"{result.failures} of {vehicles} are unsafe: {result.unsafe.description}."
-    if not result.otherwise:
-        return unsafe
-    return f"{unsafe} {number_of(result.otherwise, 'setting')} with another outcome than recorded."
+    parts = [f"{result.failures} of {vehicles} are unsafe: {result.unsafe.description}."]
+    if result.otherwise:
+        parts.append(f"{number_of(result.otherwise, 'setting')} with another outcome than recorded.")
+    return " ".join([*parts, *([str(result.across_fits)] if result.across_fits else [])])
 
 
 def verdict_in_words(result: Explained) -> list[str]:
