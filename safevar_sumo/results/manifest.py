@@ -19,7 +19,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import DESCRIPTION_KEYS, Study, tables_of
 
 FORMAT = 4
-RESULTS = 6
+RESULTS = 7
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Packages on whose versions a single simulation depends."""
