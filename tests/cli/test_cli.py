@@ -150,7 +150,7 @@ def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], expected
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     result = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
     assert "original" in result.stdout
-    assert "The original vehicle stops, with a safety degree of 1.93 m" in result.stdout
+    assert "The original vehicle stops, with a safety degree of 2.01 m" in result.stdout
     assert "less safe than the original" in result.stdout
     assert (
         "note: dragCoeff = 0.301 differs from the original by less than the filter threshold and was reset to 0.3"

@@ -53,7 +53,7 @@ def test_the_original_vehicle_of_every_shipped_study_drives_to_the_encounter(nam
     [
         (lambda seen: (0, 1), STANDS),
         (lambda seen: (0, 0), STANDS),
-        (lambda seen: (0.02, seen.gap < 5), STANDS.replace("0.0 of", "0.4 of")),
+        (lambda seen: (0.02, seen.gap < 5), STANDS.replace("0.0 of", "0.5 of")),
         (
             lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5),
             "The original vehicle brakes without an obstacle: no verdict.",
