@@ -44,6 +44,8 @@ from safevar_sumo.sumo import assemble, evaluate
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
 from tests.in_process import InlinePool
 
+CAUSE_KEYS = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
+
 
 @pytest.fixture(scope="module")
 def case(slippery: Path) -> Case:
@@ -95,9 +97,10 @@ def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
         for cause in one["minimal_causes"]:
-            assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness"]
+            assert list(cause) == [*CAUSE_KEYS, "across_fits"]
             assert cause["changes"].items() <= one["setting"].items()
-    assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable"]
+            assert 0 <= cause["across_fits"]["holds"] <= cause["across_fits"]["sets"] == 20
+    assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable", "across_fits"]
     preventable = last["summary"]["preventable"]
     shares = ["competent_driver", "full_braking", "nobody"]
     assert list(preventable) == [*shares, "looked_at", "interval_competent_driver", "later"]
@@ -175,13 +178,14 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
-    """It is the answer of `explain`: the same failures, the same cause of each."""
+    """It is the answer of `explain` without the other fitted models: the same failures, the same cause of each."""
+    alone = explain_failures(case, ExplainOptions(fits=0), Evaluator(case.study, InlinePool()))
     original = Evaluator(case.study, InlinePool()).evaluate_original()
     paragraph, count, *others, more = summarise_failures(
         case, original, Evaluator(case.study, InlinePool()), "my results"
     )
     assert_tells_a_manager(paragraph, explained)
-    assert [paragraph, count] == explained.sentences()[:2]
+    assert [paragraph, count] == alone.sentences()[:2]
     assert len(others) >= len(explained.choices)
     for failure in explained.choices:
         (line,) = [
