@@ -149,23 +149,19 @@ def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
-    """Margin on each side with which the band holds the share `BAND_SHARE` of new rows [m per domain width of distance
-    from the original].
+    """Margin on each side with which the band holds the share `BAND_SHARE` of new rows of each file [m per domain width
+    of distance from the original].
 
-    The method is split conformal prediction (Lei et al. 2018). The score of a row is
-    its distance from the band, divided by its `error_distance` from the original setting. All files have the same
-    weight.
+    The method is split conformal prediction (Lei et al. 2018), file by file; the largest margin counts. The score of a
+    row is its distance from the band, divided by its `error_distance` from the original setting.
     """
-    without_error, scores, weights = msgspec.structs.replace(study, model_error={}), [], []
+    without_error, margins = msgspec.structs.replace(study, model_error={}), [0.0]
     for data in references.values():
         distances, published = error_distance(study, data.settings), data.metrics[SAFETY_DEGREE]
         is_usable = np.isfinite(published)
-        if is_usable.any():
+        if number := np.count_nonzero(is_usable):
             lower, upper = band_of(without_error, evaluate_sets(without_error, data.settings[is_usable]))
-            scores.append(_distance_from_band(published[is_usable], lower, upper) / distances[is_usable])
-            weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
-    if not scores:
-        return 0.0
-    all_scores = np.concatenate(scores)
-    share = min(1.0, BAND_SHARE * (1 + 1 / len(all_scores)))  # + 1 for the new row
-    return float(np.quantile(all_scores, share, weights=np.concatenate(weights), method="inverted_cdf"))
+            scores = _distance_from_band(published[is_usable], lower, upper) / distances[is_usable]
+            share = min(1.0, BAND_SHARE * (1 + 1 / number))  # + 1 for the new row
+            margins.append(float(np.quantile(scores, share, method="inverted_cdf")))
+    return max(margins)
