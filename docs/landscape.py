@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--evaluations", type=int, default=5000)
     arguments = parser.parse_args()
     study = load_study(arguments.study)
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study)
     files = [evaluations_of(read_reference(path, characteristics), characteristics) for path in arguments.files]
     published = Evaluations.concatenate(files)
     forest = RandomForestRegressor(TREES, random_state=0, n_jobs=-1).fit(published.settings, published.f_safe)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -130,3 +132,18 @@ def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--repeats", "1", "--out", "best.toml"])
     assert "Best of 1 of 9 trials, while more are tried" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
+
+
+@pytest.mark.slow
+def test_the_published_landscape_is_searched_without_a_simulation(data: Path) -> None:
+    script = Path(__file__).parents[2] / "docs" / "landscape.py"
+    options = ["--runs", "1", "--evaluations", "100"]
+    output = subprocess.run(
+        [sys.executable, script, "sun", data, *options], capture_output=True, text=True, check=True
+    ).stdout
+    rows = {line[:25].strip(): line[25:].split() for line in output.splitlines()[1:]}
+    published = pd.read_csv(data)["SaftyDegree"]
+    assert rows["solutions"][0] == "40.00"
+    assert rows["safety degree, mean [m]"][0] == f"{published.mean():.2f}"
+    assert rows["collisions [%]"][0] == f"{100 * (published <= 0).mean():.1f}0"
+    assert all(1 <= float(number) <= 12 for number in rows["characteristics changed"])
