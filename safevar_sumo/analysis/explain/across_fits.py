@@ -8,24 +8,21 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain.causes import (
-    MinimalCause,
-    find_minimal_causes,
-    necessity_frame,
-    select_affordable_rows,
-)
+from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes, necessity_frame
 from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.preventability import Preventability, assess_preventability
 from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
 
-MAX_SETTINGS = 400
-"""Maximum number of settings, drawn at random, whose share of unsafe ones is compared between sets."""
-MAX_COLLISIONS = 100
-"""Maximum number of collisions, drawn at random, that the reference drivers meet with each set."""
-MAX_SUBSETS = 1000
-"""Approximate number of simulations for the minimal causes of a random sample of failures with each set."""
+MAX_SHARE_SETS = 8
+"""Maximum number of sets with which shares are computed; the first sets lie farthest apart."""
+MAX_VEHICLES = 300
+"""Maximum number of vehicles, drawn at random, that are simulated with each set; the reference drivers meet their
+collisions.
+"""
+MAX_FAILURES = 20
+"""Maximum number of failures, those with the fewest changes, whose minimal causes are found with each set."""
 STAGE = "other fitted vehicle models"
 Range = tuple[float, float]
 
@@ -34,12 +31,12 @@ class AcrossFits(NamedTuple):
     """Ranges of shares over the parameter sets of a study's table [spread].
 
     A range is the share with the study's own parameters, plus the least and the greatest difference that another set
-    makes on a random sample.
+    makes on a sample.
 
     Attributes
     ----------
     sets
-        Number of parameter sets, the study's own among them.
+        Number of parameter sets with which the shares were computed, the study's own among them.
     unsafe
         Range of the share of settings that are unsafe.
     necessary
@@ -116,10 +113,9 @@ def measure_across_fits(
     """The ranges of the shares over the sets; the arguments have the shares with the study's own parameters."""
     own = evaluators[0]
     order = np.random.default_rng(own.study.search.seed).permutation(len(evaluations))
-    vehicles = evaluations.take(order[:MAX_SETTINGS])
-    failures = evaluations.take(order[unsafe.of(evaluations)[order]])
-    failures = failures.take(select_affordable_rows(failures.settings, own, MAX_SUBSETS))
-    collisions = evaluations.take(order[evaluations.collided[order]][: MAX_COLLISIONS if preventability.shares else 0])
+    vehicles = evaluations.settings[order[:MAX_VEHICLES]]
+    failures = evaluations.take(unsafe.of(evaluations))
+    failures = failures.take(np.argsort(failures.f_num_diff, kind="stable")[:MAX_FAILURES])
 
     def shares_of(evaluator: Evaluator) -> dict[str, float]:
         """All shares, with the parameters of a set."""
@@ -128,13 +124,13 @@ def measure_across_fits(
         changed = evaluator.characteristics.changed(failures.settings[rows])
         frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
         shares = dict(zip(frame["characteristic"], frame["necessary"], strict=True))
-        shares["unsafe"] = float(np.mean(unsafe.of(evaluator.evaluate(vehicles.settings, STAGE))))
-        if len(collisions):
-            here = evaluator.evaluate(collisions.settings, STAGE)
+        here = evaluator.evaluate(vehicles, STAGE)
+        shares["unsafe"] = float(np.mean(unsafe.of(here)))
+        if preventability.shares:
             shares |= assess_preventability(evaluator, here.take(here.collided)).shares
         return shares
 
-    samples = [shares_of(evaluator) for evaluator in evaluators]
+    samples = [shares_of(evaluator) for evaluator in evaluators[:MAX_SHARE_SETS]]
 
     def range_of(name: str, share: float) -> Range:
         differences = [sample[name] - samples[0][name] for sample in samples if name in sample]
@@ -142,7 +138,7 @@ def measure_across_fits(
         return low, high
 
     return AcrossFits(
-        len(evaluators),
+        len(samples),
         range_of("unsafe", float(np.mean(unsafe.of(evaluations)))),
         {name: range_of(name, share) for name, share in necessary.items()},
         {name: range_of(name, share) for name, share in preventability.shares.items()},
