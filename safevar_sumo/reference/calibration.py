@@ -112,6 +112,14 @@ class Profiles(NamedTuple):
             if study in parameter.study_indices
         }
 
+    def fitted_values(self, study: int) -> dict[str, FittedValue]:
+        """The best trial's values of the parameters of the study with this index, by key."""
+        return {
+            parameter.key: FittedValue(parameter, float(self.values[0, k]), self.interval(k))
+            for k, parameter in enumerate(self.parameters)
+            if study in parameter.study_indices
+        }
+
     def interval(self, k: int) -> tuple[float, float]:
         """Least and greatest value of parameter k in the trials that fit as well as the best."""
         values = self.values[self.losses <= self.limit, k]
@@ -201,28 +209,17 @@ def calibrate(
     for seed in range(fit.seed, fit.seed + fit.repeats):
         races.append(SearchRace(space.misfits_at, fit.population, fit.trials, after_trial))
         reached += _run_race(races[-1], space, fit, seed, from_scratch)
-    profiles, results = Profiles.of(parameters, space, races, fit.alike), []
-    for k, best in enumerate(space.studies_at(best_place)):
+    profiles = Profiles.of(parameters, space, races, fit.alike)
+
+    def calibration_of(k: int, best: Study) -> Calibration:
+        """The fit of the study with index k, whose fitted parameters are in `best`."""
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
-        values = {
-            parameter.key: FittedValue(parameter, float(profiles.values[0, i]), profiles.interval(i))
-            for i, parameter in enumerate(parameters)
-            if k in parameter.study_indices
-        }
-        results.append(
-            Calibration(
-                values,
-                best,
-                best_loss,
-                reached,
-                _measure_agreements(best, fit_data[k], pool),
-                _measure_agreements(best, test_data[k], pool),
-                profiles,
-            )
-        )
-    return results
+        agreements = [_measure_agreements(best, data[k], pool) for data in (fit_data, test_data)]
+        return Calibration(profiles.fitted_values(k), best, best_loss, reached, *agreements, profiles)
+
+    return [calibration_of(k, best) for k, best in enumerate(space.studies_at(best_place))]
 
 
 def _run_race(race: SearchRace, space: FitSpace, fit: FitTable, seed: int, from_scratch: bool) -> list[float]:

@@ -91,24 +91,7 @@ def replicate(
         _markdown_table(("question", "setting", "published conclusion", "here", "why"), conclusions),
         "",
     ]
-    near = [
-        row
-        for case, _ in pairs
-        if references.get(case.name)
-        for row in compare_with_nearest_rows(case, references[case.name])
-    ]
-    if near:
-        lines += [
-            "## Does the search exploit the model?",
-            "",
-            f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths "
-            "of the domains. "
-            "If the search found holes in the model, the published rows next to its solutions would be as safe "
-            "as others.",
-            "",
-            _markdown_table(list(near[0]), [list(row.values()) for row in near]),
-            "",
-        ]
+    lines += _lines_on_nearest_rows([case for case, _ in pairs], references)
     lines.append("## Tables side by side\n")
     for table in tables:
         lines += [
@@ -119,6 +102,28 @@ def replicate(
             "",
         ]
     return "\n".join(lines)
+
+
+def _lines_on_nearest_rows(cases: Sequence[Case], references: Mapping[str, Sequence[ReferenceData]]) -> list[str]:
+    near = [
+        row
+        for case in cases
+        if references.get(case.name)
+        for row in compare_with_nearest_rows(case, references[case.name])
+    ]
+    if not near:
+        return []
+    return [
+        "## Does the search exploit the model?",
+        "",
+        f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths "
+        "of the domains. "
+        "If the search found holes in the model, the published rows next to its solutions would be as safe "
+        "as others.",
+        "",
+        _markdown_table(list(near[0]), [list(row.values()) for row in near]),
+        "",
+    ]
 
 
 def _head_lines(pairs: Sequence[tuple[Case, Case]], conclusions: Sequence[Conclusion]) -> list[str]:
