@@ -216,8 +216,8 @@ def calibrate(
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
-        agreements = [_measure_agreements(best, data[k], pool) for data in (fit_data, test_data)]
-        return Calibration(profiles.fitted_values(k), best, best_loss, reached, *agreements, profiles)
+        used, held_back = (_measure_agreements(best, data[k], pool) for data in (fit_data, test_data))
+        return Calibration(profiles.fitted_values(k), best, best_loss, reached, used, held_back, profiles)
 
     return [calibration_of(k, best) for k, best in enumerate(space.studies_at(best_place))]
 
