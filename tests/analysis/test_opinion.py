@@ -299,7 +299,7 @@ def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.slow
 def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> None:
     """In ours by its robustness; in the second by the neighbours, here of the smallest change at which it collides."""
-    study = load_study("rain")
+    study = load_study("sun")
     (here,) = judge_causes(study, [judged("nsga2:0:0", WORN_TYRES, 0.99, 0.79)], Unsafe()).opinions
     assert (here.opinion, here.because.split(";")[0]) == (
         "borderline",

@@ -190,11 +190,11 @@ def test_the_shares_do_not_change_with_the_gear_of_the_calibration_drive(monkeyp
     tables = assemble(first_gear).nominal.tables()
     here, names = Evaluator(rain, InlinePool()), assemble(rain).characteristics.names
     settings = np.tile(here.characteristics.original, (27, 1))
-    changed = ("mass", "gearSwitchTime", "max_rpm", "dampRateZeroT_CE", "maxBrakeTorque")
+    changed = ("mass", "gearSwitchTime", "tireFric", "dampRateZeroT_CE", "maxBrakeTorque")
     settings[:, [names.index(name) for name in changed]] = list(
-        itertools.product((2690,), (0.41,), (4900, 5030, 5220), (1.0, 1.01, 1.03), (1200, 1203, 1210))
+        itertools.product((2690,), (0.41,), (1.0, 1.15, 1.3), (1.0, 1.2, 1.5), (1200, 1300, 1400))
     )
-    evaluations = here.evaluate(settings, "less engine drag, weaker brakes")
+    evaluations = here.evaluate(settings, "worse tyres, less engine drag, weaker brakes")
     colliding = evaluations.take(evaluations.collided)
     shipped = classify_collisions(here, colliding)
     assert len(set(shipped)) > 1, "all or none would be no test"
