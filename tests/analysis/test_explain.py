@@ -327,6 +327,8 @@ def test_conclusions_across_fitted_models() -> None:
     shares = [region(settings).mean() for region in regions]
     assert result.unsafe == (min(shares), max(shares))
     assert result.necessary == {"a": (1.0, 1.0), "b": (0.0, 1.0), "c": (0.0, 0.0)}
+    safe = measure_across_fits(models, evaluations.take([3]), COLLISION, {}, nobody)
+    assert (safe.unsafe, safe.necessary) == ((0.0, 0.0), {}), "the original is safe with each"
     assert result.to_dict()["unsafe"] == {"sets": 4, "range": [min(shares), max(shares)]}
 
 

@@ -133,7 +133,8 @@ def measure_across_fits(
     samples = [shares_of(evaluator) for evaluator in evaluators[:MAX_SHARE_SETS]]
 
     def range_of(name: str, share: float) -> Range:
-        differences = [sample[name] - samples[0][name] for sample in samples if name in sample]
+        own_share = samples[0].get(name, share)  # a sample without a failure, or a collision, has no such shares
+        differences = [sample[name] - own_share for sample in samples if name in sample]
         low, high = (float(np.clip(share + end(differences, default=0.0), 0.0, 1.0)) for end in (min, max))
         return low, high
 
