@@ -162,7 +162,11 @@ class Run:
     def missing_settings(self) -> FloatArray:
         """The distinct requested settings without a known evaluation, shape (k, n)."""
         return self._settings[
-            [position - self._requested for key, position in self._positions.items() if key not in self._entries]
+            [
+                position - self._requested
+                for setting, position in self._positions.items()
+                if setting not in self._entries
+            ]
         ]
 
     @property
@@ -177,8 +181,8 @@ class Run:
         while self._positions.keys() <= self._entries.keys():
             spares = [
                 position - self._requested
-                for key, position in self._positions.items()
-                if self._entries[key].position == SPARE_POSITION
+                for setting, position in self._positions.items()
+                if self._entries[setting].position == SPARE_POSITION
             ]
             if spares:
                 self._store(self._evaluations_of(self._settings[spares]), {})

@@ -21,7 +21,9 @@ DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
 Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 MAX_REDRAWS = 10
-"""Maximum number of draws to replace a child equal to an existing individual; then the child is accepted."""
+"""Maximum number of draws for each child, on average over a generation; beyond it, a child that equals an existing
+individual is accepted.
+"""
 MAX_MISSES = 50
 """Maximum number of consecutive draws without a feasible child; the children of the next such draw are repaired."""
 

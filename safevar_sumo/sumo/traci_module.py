@@ -40,18 +40,18 @@ Named = Mapping[str, Value]
 Call = Callable[[str, str, Arguments, Named], Value]
 """Calls a function of a domain, "" for the module itself, with positional and named arguments."""
 
-_driven_vehicles: list[Call] = []
+_active_calls: list[Call] = []
 """The calls of the vehicle whose controller runs at the moment."""
 
 
 @contextmanager
 def bind_traci(call: Call) -> Iterator[None]:
     """Context in which TraCI's functions refer to one vehicle."""
-    _driven_vehicles.append(call)
+    _active_calls.append(call)
     try:
         yield
     finally:
-        _driven_vehicles.pop()
+        _active_calls.pop()
 
 
 @contextmanager
@@ -110,8 +110,8 @@ class _Domain:
 
 
 def _call(domain: str, name: str, /, *arguments: Value, **named: Value) -> Value:
-    if _driven_vehicles:
-        return _driven_vehicles[-1](domain, name, arguments, named)
+    if _active_calls:
+        return _active_calls[-1](domain, name, arguments, named)
     refuse_own_loop(domain, name)
     raise InputError(
         full_name(domain, name),
@@ -184,9 +184,12 @@ class CommandedSpeed:
             If an argument is no legal number.
         """
         for argument, value in zip(COMMANDS[name], values, strict=True):
-            gives_back = value == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-            is_mode = argument != "mode" or value in range(-1, 128)
-            if not (gives_back or (math.isfinite(value) and is_mode and (value >= 0 or argument == "acceleration"))):
+            returns_control = value == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
+            is_legal_mode = argument != "mode" or value in range(-1, 128)
+            if not (
+                returns_control
+                or (math.isfinite(value) and is_legal_mode and (value >= 0 or argument == "acceleration"))
+            ):
                 raise InputError(f"traci.vehicle.{name}", f"{argument} = {value!r}", LEGAL_NUMBERS)
         first, *rest = map(float, values)
         if name == "setSpeedMode":
