@@ -115,7 +115,10 @@ def commands() -> None:
 
 
 def main() -> None:
-    """Run the program; its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input) or 130 (interrupted)."""
+    """Run the program.
+
+    Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`) or 130 (interrupted).
+    """
     warnings.showwarning = lambda message, *_, **__: print_warning(message)  # without its file and line
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file
         faulthandler.enable()  # if compiled code crashes, its line is printed

@@ -32,6 +32,7 @@ from safevar_sumo.cli.arguments import (
     read_changes,
     split_names,
 )
+from safevar_sumo.cli.gate import gated
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
@@ -54,6 +55,7 @@ def add_question(
             as_it_is_now_option,
             jobs_option,
             json_option,
+            gated,
             *further_decorators,
         ]
         for decorator in reversed(decorators):
@@ -63,16 +65,18 @@ def add_question(
     return add
 
 
-def _show(result: Any, as_json: bool, plot: Path | None = None) -> None:
-    """Print an answer, and draw its figure to a file, if one is named."""
+def _show(result: Any, as_json: bool, plot: Path | None = None) -> Any:
+    """Print an answer, and draw its figure to a file, if one is named; returns the answer's JSON."""
+    answer = result.to_dict()
     if as_json:
-        print_json(result.to_dict())
+        print_json(answer)
     else:
         print_answer(Console(), result.study, result.no_verdict, result.sentences())
     if plot is not None:
         from safevar_sumo.analysis.figures import save
 
         save(result.figure(), plot, "--plot")
+    return answer
 
 
 @add_question(
@@ -83,7 +87,7 @@ def _show(result: Any, as_json: bool, plot: Path | None = None) -> None:
 )
 def explain(
     source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any
-) -> None:
+) -> Any:
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change
     is enough, why.
     """
@@ -95,15 +99,17 @@ def explain(
     if out is not None:
         make_directory(out)
     result = answer_question(explain_failures, subject, ExplainOptions(**values), jobs=jobs)
+    answer = result.to_dict()
     if as_json:
-        print_json(result.to_dict())
+        print_json(answer)
     else:
         print_explained(Console(), source, result, point or "", full=full)
     if out is not None:
-        write_whole(out / "causes.json", json.dumps(result.to_dict(), indent=2, allow_nan=False) + "\n")
+        write_whole(out / "causes.json", json.dumps(answer, indent=2, allow_nan=False) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
         save(result.figure(), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
+    return answer
 
 
 @add_question(
@@ -121,7 +127,7 @@ def opinion(
     jobs: int | None,
     as_json: bool,
     unsafe: str | None,
-) -> None:
+) -> Any:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
@@ -132,25 +138,23 @@ def opinion(
     if as_json:
         for note in result.notes:
             print_note(note)
-    _show(result, as_json)
+    return _show(result, as_json)
 
 
 @add_question(ToleranceOptions, "STUDY|DIR", file_option("--plot", "Draw the profiles to this file: png, pdf or svg."))
-def tolerance(
-    source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
-) -> None:
+def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> Any:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
     subject = load_results_or_study(source, point)
     check_output(plot, "--plot")
-    _show(answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs), as_json, plot)
+    return _show(answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs), as_json, plot)
 
 
 @add_question(
     RiskOptions, "STUDY|DIR", file_option("--plot", "Draw the sensitivity indices to this file: png, pdf or svg.")
 )
-def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
+def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> Any:
     """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which
     characteristics decide it.
     """
@@ -163,11 +167,11 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
         print_note("no sensitivity indices: they are not defined for correlated characteristics")
     if result.errors:
         print_warning(f"{result.errors} vehicles could not be simulated and are left out")
-    _show(result, as_json, plot)
+    return _show(result, as_json, plot)
 
 
 @add_question(RulesOptions, "STUDY|DIR")
-def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
+def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> Any:
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of
     a search.
     """
@@ -176,7 +180,7 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
     result = answer_question(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs=jobs)
     if as_json and result.remark:
         print_note(result.remark)
-    _show(result, as_json)
+    return _show(result, as_json)
 
 
 @commands.command(name="rating")
@@ -201,6 +205,7 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
 @as_it_is_now_option
 @jobs_option
 @json_option
+@gated
 def rating(
     source: str,
     changes: tuple[str, ...],
@@ -213,7 +218,7 @@ def rating(
     force: bool,
     jobs: int | None,
     as_json: bool,
-) -> None:
+) -> Any:
     """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.rating.compute import rate_variant, remarks
@@ -232,8 +237,9 @@ def rating(
     result = answer_question(rate_variant, subject, options, jobs=jobs)
     for remark in remarks(result):
         print_note(remark)
+    answer = result.to_dict()
     if as_json:
-        print_json(result.to_dict())
+        print_json(answer)
     else:
         print_rating(Console(), result)
     if matrix and not as_json:
@@ -244,6 +250,7 @@ def rating(
         vehicle = result.variant or result.original
         spreadsheet.fill(vehicle)
         click.echo(f"Spreadsheet of {vehicle.name}: {spreadsheet.output}", err=True)
+    return answer
 
 
 def _refuse_existing(path: Path, flag: str, force: bool) -> None:

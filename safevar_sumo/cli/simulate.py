@@ -33,6 +33,7 @@ from safevar_sumo.cli.arguments import (
     point_option,
     read_changes,
 )
+from safevar_sumo.cli.gate import gated
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
@@ -88,6 +89,7 @@ from safevar_sumo.vehicles import CharacteristicSet
     help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.",
 )
 @json_option
+@gated
 def simulate_command(
     study: str,
     solution: str | None,
@@ -103,7 +105,7 @@ def simulate_command(
     point: str | None,
     spread: bool,
     as_json: bool,
-) -> None:
+) -> Any:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
     target = load_target(study, solution, choice)
     system = assemble(target.study, target.source)
@@ -119,8 +121,7 @@ def simulate_command(
         if trace or plot or animate or gui or spread:
             expected = "one value for each characteristic with --trace, --plot, --animate, --gui or --spread"
             raise InputError("--set", f"{' '.join(changes)} is a sweep", expected)
-        _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
-        return
+        return _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
     if spread:
         studies_of_sets(target.study)  # refuses a study without sets before any simulation
         for name in parameters_outside_sets(target.study):
@@ -140,7 +141,7 @@ def simulate_command(
     if spread:
         settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
         spreads = compute_model_spreads(target.study, settings, point or "")
-    _print_results(target, system, simulation, spreads, as_json)
+    return _print_results(target, system, simulation, spreads, as_json)
 
 
 def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None) -> None:
@@ -183,21 +184,22 @@ def _simulate_sweep(
     names: tuple[str, ...],
     filtered: bool,
     as_json: bool,
-) -> None:
+) -> list[JsonObject]:
+    """Simulate and print a sweep; returns its JSON."""
     settings = system.characteristics.filter(requested_settings) if filtered else requested_settings
     evaluations = evaluate_settings(
         target.study, np.concatenate([system.characteristics.original[np.newaxis], settings])
     )
     no_verdict = why_no_verdict(system)
+    records = [
+        {
+            "study": target.study.name,
+            "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
+            **record(evaluations, row),
+        }
+        for row, setting in enumerate(evaluations.settings.tolist())
+    ]
     if as_json:
-        records = [
-            {
-                "study": target.study.name,
-                "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
-                **record(evaluations, row),
-            }
-            for row, setting in enumerate(evaluations.settings.tolist())
-        ]
         print_json([*records[1:], *summary_entry(no_verdict)])
     else:
         print_heading(Console(), target.study.title, no_verdict)
@@ -208,18 +210,21 @@ def _simulate_sweep(
             f"in {reset_count} of {len(requested_settings)} settings the filter reset small changes; "
             "--no-filter keeps them"
         )
+    return records[1:]
 
 
 def _print_results(
     target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool
-) -> None:
+) -> JsonObject:
+    """Print a simulation; returns its JSON."""
     shows_points = system.matrix and (as_json or system.rater is None)
     results_at_points = simulate_all_points(system, simulation.evaluation.settings) if shows_points else []
+    solution = {} if target.handle is None else {"solution": str(target.handle)}
+    matrix = {"points": [point_record(result) for result in results_at_points]} if results_at_points else {}
+    spread = {"spread": {**spreads[0]._asdict(), "original": spreads[1]._asdict()}} if spreads else {}
+    answer: JsonObject = {**simulation.to_dict(), **solution, **matrix, **spread}
     if as_json:
-        solution = {} if target.handle is None else {"solution": str(target.handle)}
-        matrix = {"points": [point_record(result) for result in results_at_points]} if results_at_points else {}
-        spread = {"spread": {**spreads[0]._asdict(), "original": spreads[1]._asdict()}} if spreads else {}
-        print_json({**simulation.to_dict(), **solution, **matrix, **spread})
+        print_json(answer)
     else:
         print_simulation(Console(), simulation)
         for vehicle, model_spread in zip(("the simulated vehicle", "the original"), spreads, strict=False):
@@ -241,6 +246,7 @@ def _print_results(
             f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
             f"{simulation.setting[name]:g}; --no-filter keeps it"
         )
+    return answer
 
 
 def _rating_command(target: CommandTarget, system: System, simulation: Simulation) -> str:

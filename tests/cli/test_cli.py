@@ -12,6 +12,7 @@ import subprocess
 import sys
 from io import StringIO
 from pathlib import Path
+from unittest.mock import patch
 
 import click
 import msgspec
@@ -24,7 +25,8 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.api.running import CampaignProgress
 from safevar_sumo.campaign import RunKey, RunProgress, all_runs
 from safevar_sumo.cli.arguments import read_changes
-from safevar_sumo.cli.program import COMMANDS, commands
+from safevar_sumo.cli.gate import Condition
+from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal import WholeTable, open_progress
@@ -107,6 +109,54 @@ SUN = CharacteristicSet.of(load_study("sun"))
 
 def simulate(*arguments: str) -> Result:
     return CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["simulate", *arguments])
+
+
+ANSWER = [
+    {"joint": {"factor": 0.25, "kept": True}, "limit": None},
+    {"joint": {"factor": 0.75}},
+    {"interval": [0.1, 0.2]},
+]
+
+
+@pytest.mark.parametrize(
+    ("condition", "fulfilments"),
+    [
+        ("joint.factor < 0.5", ["joint.factor = 0.25 < 0.5"]),
+        ("joint.factor<=0.75", ["joint.factor = 0.25 <= 0.75", "joint.factor = 0.75 <= 0.75"]),
+        ("joint.factor > 0.75", []),
+        ("1.joint.factor >= 7.5e-1", ["1.joint.factor = 0.75 >= 0.75"]),
+        ("interval.1 > 0.1", ["interval.1 = 0.2 > 0.1"]),
+        ("limit > 0", []),
+    ],
+)
+def test_a_gate_compares_numbers_of_the_answer(condition: str, fulfilments: list[str]) -> None:
+    assert list(Condition.parse(condition).fulfilments(ANSWER)) == fulfilments
+
+
+@pytest.mark.parametrize("condition", ["joint.factr > 1", "joint.kept > 0", "joint > 0", "interval.2 > 0", "x > 0"])
+def test_a_gate_refuses_what_is_no_number_of_the_answer(condition: str) -> None:
+    with pytest.raises(InputError, match="--fail-if"):
+        list(Condition.parse(condition).fulfilments(ANSWER))
+
+
+@pytest.mark.parametrize(
+    ("condition", "code", "words"),
+    [
+        ("safety_degree < 99", 3, "failed: safety_degree = "),
+        ("safety_degree < 0.1", 0, ""),
+        ("safty_degree < 1", 2, "did you mean 'safety_degree'?"),
+        ("safety_degree = 1", 2, "with <, <=, > or >= and a number"),
+        ("safety_degree < one", 2, "with <, <=, > or >= and a number"),
+    ],
+)
+def test_a_gate_ends_with_code_3(condition: str, code: int, words: str, capfd: pytest.CaptureFixture[str]) -> None:
+    with (
+        patch("sys.argv", ["safevar-sumo", "simulate", "smoke", "--fail-if", condition]),
+        pytest.raises(SystemExit) as end,
+    ):
+        main()
+    assert end.value.code == code
+    assert words in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
