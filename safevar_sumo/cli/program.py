@@ -24,33 +24,45 @@ from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 if TYPE_CHECKING:
     from safevar_sumo.study import Study
 
-COMMANDS = {
-    "study": ("study", "Search a study; run the same command again to continue where it stopped."),
-    "status": ("study", "Show the progress of a study running in another process: runs, front, collisions, time left."),
-    "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
-    "check": (
-        "catalogue",
-        "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
-    ),
-    "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
-    "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
-    "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
-    "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
-    "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
-    "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
-    "rating": (
-        "questions",
-        "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
-    ),
-    "tables": ("report", "Answer the research questions as tables."),
-    "figures": ("report", "Draw the figures of results."),
-    "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
-    "import": ("reference", "Import published CSV solutions as a results directory."),
-    "validate": ("reference", "Compare a study with reference data, row by row."),
-    "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
-    "calibrate": ("calibrate", "Fit a study's free parameters to reference data."),
+COMMANDS_BY_GROUP = {
+    "From a driving system to a decision": {
+        "study": ("study", "Search a study; run the same command again to continue where it stopped."),
+        "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
+        "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
+        "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
+        "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
+        "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
+    },
+    "More": {
+        "status": (
+            "study",
+            "Show the progress of a study running in another process: runs, front, collisions, time left.",
+        ),
+        "check": (
+            "catalogue",
+            "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
+        ),
+        "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
+        "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
+        "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
+        "rating": (
+            "questions",
+            "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
+        ),
+        "tables": ("report", "Answer the research questions as tables."),
+        "figures": ("report", "Draw the figures of results."),
+    },
+    "Published data": {
+        "import": ("reference", "Import published CSV solutions as a results directory."),
+        "validate": ("reference", "Compare a study with reference data, row by row."),
+        "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
+        "calibrate": ("calibrate", "Fit a study's free parameters to reference data."),
+    },
 }
-"""Each command's module in this folder and its sentence in the help, in the order of the help."""
+"""Each command's module in this folder and its sentence in the help, by the title of its group, in the order of the
+help.
+"""
+COMMANDS = {name: command for group in COMMANDS_BY_GROUP.values() for name, command in group.items()}
 
 
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
@@ -96,8 +108,9 @@ class LazyCommands(click.Group):
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, sentence) for name, (_, sentence) in COMMANDS.items()])
+        for title, group in COMMANDS_BY_GROUP.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, sentence) for name, (_, sentence) in group.items()])
 
 
 def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
