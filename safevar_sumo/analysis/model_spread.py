@@ -163,6 +163,14 @@ def parameters_outside_sets(study: Study) -> list[str]:
     ]
 
 
+def remarks_on_sets(study: Study) -> list[str]:
+    """A sentence for each of the `parameters_outside_sets`."""
+    return [
+        f"[spread] does not vary {name}: the study's value is not the first of its list"
+        for name in parameters_outside_sets(study)
+    ]
+
+
 def with_values(study: Study, values: Mapping[str, float], stated_in: str = "calibration") -> Study:
     """A study with other values of some parameters, named by their keys in the study file; errors name the table
     `stated_in`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -34,44 +35,48 @@ class Condition(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Condition:
         match = FORM.fullmatch(text)
-        try:
-            assert match is not None
-            return cls(match[1], match[2], float(match[3]))
-        except (AssertionError, ValueError):
+        if match is None or not math.isfinite(limit := _number(match[3])):
             expected = '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"'
-            raise InputError("--fail-if", repr(text), expected) from None
+            raise InputError("--fail-if", repr(text), expected)
+        return cls(match[1], match[2], limit)
 
     def fulfilments(self, answer: Any) -> Iterator[str]:
-        """A sentence for each number of the answer for which the condition holds; a note if a number is undefined."""
-        for value in _values(answer, self.key.split("."), self.key):
-            if value is None:
-                print_note(f"--fail-if: {self.key} is undefined here")
-            elif isinstance(value, bool) or not isinstance(value, int | float):
+        """A sentence for each number of the answer for which the condition holds; a note if no number is there."""
+        values = list(_values(answer, self.key.split("."), self.key))
+        if None in values or not values:
+            print_note(f"--fail-if: {self.key} is {'undefined' if values else 'in no element'} here")
+        for value in values:
+            if isinstance(value, bool) or not isinstance(value, int | float | None):
                 raise InputError("--fail-if", f"{self.key} is no number", "the key of a number of the command's JSON")
-            elif OPERATORS[self.operator](value, self.limit):
+            if value is not None and OPERATORS[self.operator](value, self.limit):
                 yield f"{self.key} = {value:g} {self.operator} {self.limit:g}"
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _values(answer: Any, names: Sequence[str], key: str) -> Iterator[Any]:
     """The values under names in the JSON; in a list, an element by its index, or all elements that have the name."""
     if not names:
         yield answer
-    elif isinstance(answer, list) and names[0].isdecimal() and int(names[0]) < len(answer):
-        yield from _values(answer[int(names[0])], names[1:], key)
-    elif isinstance(answer, list):
-        elements = [element for element in answer if isinstance(element, dict) and names[0] in element]
-        if not elements and answer:
-            raise _unknown(names[0], key, {name for element in answer if isinstance(element, dict) for name in element})
-        for element in elements:
-            yield from _values(element, names, key)
-    elif isinstance(answer, dict) and names[0] in answer:
-        yield from _values(answer[names[0]], names[1:], key)
+        return
+    name, *further = names
+    if isinstance(answer, list) and name.isdecimal():
+        if int(name) >= len(answer):
+            raise InputError("--fail-if", f"{key}: there is no element {name}", f"an index below {len(answer)}")
+        nearer = [answer[int(name)]]
     else:
-        raise _unknown(names[0], key, answer if isinstance(answer, dict) else ())
-
-
-def _unknown(name: str, key: str, known: Any) -> InputError:
-    return unknown_name("--fail-if", f"{key}: the command's JSON has no {name!r} there", name, sorted(known))
+        tables = [table for table in (answer if isinstance(answer, list) else [answer]) if isinstance(table, dict)]
+        nearer = [table[name] for table in tables if name in table]
+        if not nearer and answer != []:
+            known = sorted({known for table in tables for known in table})
+            raise unknown_name("--fail-if", f"{key}: the command's JSON has no {name!r} there", name, known)
+    for value in nearer:
+        yield from _values(value, further, key)
 
 
 def gated(command: CommandFunction) -> CommandFunction:

@@ -94,11 +94,14 @@ def explain(
     from safevar_sumo.analysis.explain.compute import explain_failures
     from safevar_sumo.analysis.explain.sentences import print_explained
     from safevar_sumo.analysis.figures import save
+    from safevar_sumo.analysis.model_spread import remarks_on_sets
 
     subject = load_results_or_study(source, point)
     if out is not None:
         make_directory(out)
     result = answer_question(explain_failures, subject, ExplainOptions(**values), jobs=jobs)
+    for remark in remarks_on_sets(result.study) if result.across_fits else []:
+        print_note(remark)
     answer = result.to_dict()
     if as_json:
         print_json(answer)

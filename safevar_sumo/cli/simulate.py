@@ -11,12 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.model_spread import (
-    ModelSpread,
-    compute_model_spreads,
-    parameters_outside_sets,
-    studies_of_sets,
-)
+from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, remarks_on_sets, studies_of_sets
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
@@ -124,8 +119,8 @@ def simulate_command(
         return _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
     if spread:
         studies_of_sets(target.study)  # refuses a study without sets before any simulation
-        for name in parameters_outside_sets(target.study):
-            print_note(f"[spread] does not vary {name}: the study's value is not the first of its list")
+        for remark in remarks_on_sets(target.study):
+            print_note(remark)
     simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
     if target.row is not None and not changes:
         from safevar_sumo.replay.comparison import list_differences

@@ -114,7 +114,7 @@ def simulate(*arguments: str) -> Result:
 ANSWER = [
     {"joint": {"factor": 0.25, "kept": True}, "limit": None},
     {"joint": {"factor": 0.75}},
-    {"interval": [0.1, 0.2]},
+    {"interval": [0.1, 0.2], "pairs": []},
 ]
 
 
@@ -127,6 +127,7 @@ ANSWER = [
         ("1.joint.factor >= 7.5e-1", ["1.joint.factor = 0.75 >= 0.75"]),
         ("interval.1 > 0.1", ["interval.1 = 0.2 > 0.1"]),
         ("limit > 0", []),
+        ("pairs.share > 0", []),
     ],
 )
 def test_a_gate_compares_numbers_of_the_answer(condition: str, fulfilments: list[str]) -> None:
@@ -146,6 +147,7 @@ def test_a_gate_refuses_what_is_no_number_of_the_answer(condition: str) -> None:
         ("safety_degree < 0.1", 0, ""),
         ("safty_degree < 1", 2, "did you mean 'safety_degree'?"),
         ("safety_degree = 1", 2, "with <, <=, > or >= and a number"),
+        ("safety_degree < nan", 2, "with <, <=, > or >= and a number"),
         ("safety_degree < one", 2, "with <, <=, > or >= and a number"),
     ],
 )

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.evaluator import Evaluator, Interval
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes, necessity_frame
 from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.preventability import Preventability, assess_preventability
 from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 
 MAX_SHARE_SETS = 8
 """Maximum number of sets with which shares are computed; the first sets lie farthest apart."""
@@ -24,7 +24,6 @@ collisions.
 MAX_FAILURES = 20
 """Maximum number of failures, those with the fewest changes, whose minimal causes are found with each set."""
 STAGE = "other fitted vehicle models"
-Range = tuple[float, float]
 
 
 class AcrossFits(NamedTuple):
@@ -46,9 +45,9 @@ class AcrossFits(NamedTuple):
     """
 
     sets: int
-    unsafe: Range
-    necessary: Mapping[str, Range]
-    preventable: Mapping[str, Range]
+    unsafe: Interval
+    necessary: Mapping[str, Interval]
+    preventable: Mapping[str, Interval]
 
     def __str__(self) -> str:
         competent = self.preventable.get("competent_driver")
@@ -58,10 +57,10 @@ class AcrossFits(NamedTuple):
             f"{_in_words(self.unsafe)} of the vehicles are unsafe{avoided}."
         )
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """The entry `across_fits` of a summary in JSON: the ranges under the names of the shares."""
 
-        def entry(ends: Range) -> dict[str, object]:
+        def entry(ends: Interval) -> JsonObject:
             return {"sets": self.sets, "range": list(ends)}
 
         return {
@@ -71,7 +70,7 @@ class AcrossFits(NamedTuple):
         }
 
 
-def _in_words(ends: Range) -> str:
+def _in_words(ends: Interval) -> str:
     low, high = map(share_in_words, ends)
     return low if low == high else f"{low} to {high}"
 
@@ -117,30 +116,40 @@ def measure_across_fits(
     failures = evaluations.take(unsafe.of(evaluations))
     failures = failures.take(np.argsort(failures.f_num_diff, kind="stable")[:MAX_FAILURES])
 
-    def shares_of(evaluator: Evaluator) -> dict[str, float]:
-        """All shares, with the parameters of a set."""
+    def shares_of(evaluator: Evaluator) -> Mapping[str, Mapping[str, float]]:
+        """All shares with the parameters of a set, by kind and name."""
         causes = find_minimal_causes(evaluator, failures.settings, unsafe)
         rows = [row for row, of_failure in enumerate(causes) if of_failure]
         changed = evaluator.characteristics.changed(failures.settings[rows])
         frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
-        shares = dict(zip(frame["characteristic"], frame["necessary"], strict=True))
         here = evaluator.evaluate(vehicles, STAGE)
-        shares["unsafe"] = float(np.mean(unsafe.of(here)))
-        if preventability.shares:
-            shares |= assess_preventability(evaluator, here.take(here.collided)).shares
-        return shares
+        avoided = assess_preventability(evaluator, here.take(here.collided)).shares if preventability.shares else {}
+        return {
+            "unsafe": {"": float(np.mean(unsafe.of(here)))},
+            "necessary": dict(zip(frame["characteristic"], frame["necessary"], strict=True)),
+            "preventable": avoided,
+        }
 
     samples = [shares_of(evaluator) for evaluator in evaluators[:MAX_SHARE_SETS]]
 
-    def range_of(name: str, share: float) -> Range:
-        own_share = samples[0].get(name, share)  # a sample without a failure, or a collision, has no such shares
-        differences = [sample[name] - own_share for sample in samples if name in sample]
-        low, high = (float(np.clip(share + end(differences, default=0.0), 0.0, 1.0)) for end in (min, max))
-        return low, high
+    def ranges(kind: str, shares: Mapping[str, float]) -> dict[str, Interval]:
+        return {
+            name: _range_of(share, [sample[kind].get(name) for sample in samples]) for name, share in shares.items()
+        }
 
     return AcrossFits(
-        len(samples),
-        range_of("unsafe", float(np.mean(unsafe.of(evaluations)))),
-        {name: range_of(name, share) for name, share in necessary.items()},
-        {name: range_of(name, share) for name, share in preventability.shares.items()},
+        sets=len(samples),
+        unsafe=ranges("unsafe", {"": float(np.mean(unsafe.of(evaluations)))})[""],
+        necessary=ranges("necessary", necessary),
+        preventable=ranges("preventable", preventability.shares),
     )
+
+
+def _range_of(share: float, samples: Sequence[float | None]) -> Interval:
+    """The range of a share over sets, from its values in each set's sample, the study's own first; None where the
+    sample has no failure, or no collision, that could have the share.
+    """
+    own = share if samples[0] is None else samples[0]
+    differences = [sample - own for sample in samples if sample is not None]
+    low, high = (float(np.clip(share + end(differences, default=0.0), 0.0, 1.0)) for end in (min, max))
+    return low, high
