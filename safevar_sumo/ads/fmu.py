@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.fmu import Description, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.study.schema import Parameters
 
 OBSERVATION_UNITS: Mapping[str, str] = {
     "time": "s",
@@ -77,7 +78,7 @@ class FmuAds(Ads):
         description: Description,
         inputs: Mapping[str, str],
         outputs: Mapping[str, str],
-        parameters: Mapping[str, Any],
+        parameters: Parameters,
         step: float | None,
         guard: Guard,
     ) -> None:

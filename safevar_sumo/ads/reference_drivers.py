@@ -6,13 +6,14 @@ is ours.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import (
     Ads,
+    Memory,
     NonNegativeParameter,
     PositiveParameter,
     Trim,
@@ -62,7 +63,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     cruise_speed: PositiveParameter | None = None
     corridor: PositiveParameter = 1.4
 
-    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n))
 
     def react(

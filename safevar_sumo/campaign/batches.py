@@ -23,7 +23,7 @@ from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, fmus_of, tables_of, user_code_names
-from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
+from safevar_sumo.sumo import Engine, assemble, is_recorded, settings_per_batch
 
 BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""
@@ -52,7 +52,7 @@ def choose_batch_size(study: Study) -> tuple[int, bool]:
     SUMO.
     """
     system = assemble(study, study.source)
-    return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
+    return settings_per_batch(system, Engine.RECORDED), is_recorded(system)
 
 
 def evaluate_all(

@@ -11,14 +11,14 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO, Any
+from typing import IO
 
 import msgspec
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import changed_files, digests, files_named_in, note_inputs, unload_user_modules
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import LAYERS_OF_FILES, RESULTS, evaluation_keys
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -52,7 +52,7 @@ class Task(msgspec.Struct, frozen=True):
 
 def pack_study(
     study: Study,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: JsonObject | None = None,
     *,
     engine: Engine = Engine.RECORDED,
     afresh: bool = False,
@@ -157,7 +157,7 @@ def refuse_changed_files(files: list[str]) -> None:
         )
 
 
-def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
+def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> JsonObject:
     """The layers of a manifest except the study: plain values that are the same in every process.
 
     `resolved` are the tables of the study with all defaults of models and all numbers of the weather; `network` and

@@ -18,7 +18,7 @@ from functools import partial
 from multiprocessing import connection
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from safevar_sumo.campaign.evaluation import Evaluate, evaluate_in_time
 from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError, block_interrupts, defer_interrupts
@@ -61,6 +61,10 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
             pool.close()
 
 
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+
+
 class LocalPool:
     """Computes batches and carries shares in processes. For each process, a thread of this process waits for its
     messages.
@@ -90,13 +94,13 @@ class LocalPool:
                 self._end(worker)
         self._threads.shutdown()
 
-    def _start(self, function: Callable[..., Any], argument: Any, report: Report) -> Future[Any]:
+    def _start(self, function: Callable[..., Result], argument: Argument, report: Report) -> Future[Result]:
         try:
             return self._threads.submit(self._call, function, argument, report)
         except RuntimeError:
             raise PoolLostError("the worker processes are closed down") from None
 
-    def _call(self, function: Callable[..., Any], argument: Any, report: Report) -> Any:
+    def _call(self, function: Callable[..., Result], argument: Argument, report: Report) -> Result:
         """Call a function in this thread's worker; if the worker is lost or `report` fails, the worker is ended."""
         worker: _Worker | None = getattr(self._thread_data, "worker", None)
         if worker is None or not worker.alive:
@@ -111,7 +115,8 @@ class LocalPool:
             raise
         if isinstance(answer, Exception):
             raise answer
-        return answer
+        result: Result = answer
+        return result
 
     def _new_worker(self) -> _Worker:
         for _ in range(START_ATTEMPTS):
@@ -158,7 +163,7 @@ class _Worker:
     def alive(self) -> bool:
         return self._process.is_alive()
 
-    def call(self, function: Callable[..., Any], argument: Any) -> tuple[bool, Any]:
+    def call(self, function: Callable[..., Result], argument: Argument) -> tuple[bool, Any]:
         """Let the process call a function; returns the first message."""
         with suppress(OSError):  # `receive` notices a dead worker
             self._pipe.send((function, argument))

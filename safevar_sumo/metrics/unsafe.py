@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.measures import RATING_POINTS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,7 +110,7 @@ class Unsafe:
         return cls(points=limit) if quantity == "points" else cls(limit)
 
     @classmethod
-    def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
+    def default(cls, original: Tables, outcomes: Any) -> Unsafe:
         """The criterion if none is stated.
 
         In a rated study, a vehicle is unsafe if it has lost at least one of the original's points. In other studies the

@@ -21,6 +21,7 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.plugins.files import audit_hook, file_of_module
 from safevar_sumo.plugins.guard import Guard, completed, contract_of, violation
 from safevar_sumo.study import convert_table
+from safevar_sumo.study.schema import Parameters
 
 
 class Member(NamedTuple):
@@ -92,7 +93,7 @@ class Lookup(NamedTuple):
             raise UserCodeError(self.source, f"{member.guard.name} {reason}", expected, member.guard.definition(""))
         return member._replace(target=completed(member.target, base))
 
-    def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
+    def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
         """Parameters for a member that is user code, in which names of files beside the study's file are absolute
         paths.
 
@@ -167,7 +168,7 @@ def inherit_import_folders(folders: Iterable[str]) -> None:
     _added_folders[:] = folders
 
 
-def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
+def instance_of(member: Member, parameters: Parameters, name: str, key: str, source: str) -> Any:
     """An instance of a class.
 
     Parameters
@@ -194,9 +195,9 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
 
 
 def check_parameters(
-    function: Callable[..., Any],
-    arguments: tuple[Any, ...],
-    parameters: Mapping[str, Any],
+    function: Callable[..., object],
+    arguments: tuple[object, ...],
+    parameters: Parameters,
     name: str,
     key: str,
     source: str,

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.records import FloatArray
+from safevar_sumo.study.schema import Parameters
 
 EURO_NCAP_2026 = "euro_ncap_2026"
 COLOURS = ("green", "yellow", "orange", "brown", "red")
@@ -166,11 +167,11 @@ class Cell(NamedTuple):
         return f"{self.matrix.name}, {self.vut_speed:g} km/h{function}, {column}{variation}"
 
     @property
-    def scenario(self) -> tuple[str, dict[str, Any], bool]:
+    def scenario(self) -> tuple[str, Parameters, bool]:
         """The simulation of the cell: scenario model, parameters, and whether it is by night."""
         test = self.matrix.test_name
         model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
-        parameters: dict[str, Any] = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
+        parameters: Parameters = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
         if self.impact_location is not None:
             parameters["impact_location"] = self.impact_location
         night = self.matrix.light == "night" or self.range_or_layer == NIGHT
@@ -340,5 +341,5 @@ def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
 @lru_cache
 def protocol_of(name: str) -> Protocol:
     """A protocol by its name."""
-    tables: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
+    tables: Parameters = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
     return msgspec.convert(tables, Protocol)

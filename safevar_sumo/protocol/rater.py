@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -146,7 +145,7 @@ def passing_cells(protocol: Protocol, colours: npt.NDArray[np.int8]) -> BoolArra
     return np.asarray((colours != UNKNOWN) & np.where(only_not_red, colours != RED, colours <= nominal))
 
 
-def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
+def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see
     `CellResults`.
     """
@@ -158,7 +157,7 @@ def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]
     )
 
 
-def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:
+def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> CellResults:
     """Join the `rated_quantities` of each cell to the results of all cells for M vehicles."""
     return CellResults(*(np.stack(list(values), axis=1) for values in zip(*quantities, strict=True)))
 

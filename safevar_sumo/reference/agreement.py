@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -16,7 +16,7 @@ from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, new
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.results import evaluation_keys, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, study_names, unit_text
@@ -78,7 +78,7 @@ class Agreement:
     undecided: dict[str, int | None]
     by_predicted: list[Numbers]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """The attributes by name."""
         return asdict(self)
 
@@ -317,6 +317,6 @@ def _read_totals(path: Path) -> dict[str, dict[str, Totals]]:
         raise InputError(path, "holds no totals", "a new file, or one that `validate --totals` has written") from None
 
 
-def _simulation_tables(study: Study) -> dict[str, Any]:
+def _simulation_tables(study: Study) -> JsonObject:
     keys = evaluation_keys(study)
     return {name: keys.get(name) for name in SIMULATION_KEYS}

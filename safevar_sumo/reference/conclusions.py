@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import ANY, change_numbers, changes_of, critical_solutions
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.reference.agreement import rank_correlation
 
 COMPARED_SIDES = HERE, PUBLISHED = "here", "published"
@@ -78,7 +78,7 @@ def _tabulate_change_numbers(cases: Sequence[Case]) -> pd.DataFrame:
     """The table of RQ3.1, which needs no runs here: share of the critical solutions with j changed characteristics
     [%].
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[JsonObject] = []
     for case in cases:
         try:
             counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)

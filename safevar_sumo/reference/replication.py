@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +13,7 @@ import scipy
 
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, are_collisions
 from safevar_sumo.errors import InputError
+from safevar_sumo.records import JsonObject
 from safevar_sumo.reference.conclusions import (
     DIFFERS,
     HERE,
@@ -147,7 +147,7 @@ def _head_lines(pairs: Sequence[tuple[Case, Case]], conclusions: Sequence[Conclu
     return lines
 
 
-def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -> list[dict[str, Any]]:
+def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -> list[JsonObject]:
     """Compare the solutions of each algorithm with the nearest rows of the references, which must be data of the same
     vehicle.
 

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from safevar_sumo.replay.comparison import COLOURS, Comparison
 from safevar_sumo.replay.scene import LANE_KINDS, FlatBody, FlatScene, lane_outlines, lay_out_scene
 from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
 from safevar_sumo.sumo.network import Network, copied_network
+from safevar_sumo.sumo.world import Api
 
 PAUSE = 2.0
 """Pause at the nearest moment and at the end [s]."""
@@ -97,7 +97,7 @@ def show_in_gui(
 
 
 @contextmanager
-def _open_window(network: Network, step: float) -> Iterator[Any]:
+def _open_window(network: Network, step: float) -> Iterator[Api]:
     """Open a window on one copy of a network without traffic; yields TraCI."""
     api = engine_api(Engine.GUI)
     with tempfile.TemporaryDirectory() as folder:
@@ -138,7 +138,7 @@ def _road_origin(scene: FlatScene, row: int) -> tuple[float, float]:
     return ORIGIN, ORIGIN - row * (scene.height + ROAD_SPACING)
 
 
-def _add_actor(api: Any, body: FlatBody) -> None:
+def _add_actor(api: Api, body: FlatBody) -> None:
     """Add an actor, which is a vehicle in sumo-gui; persons only have another shape."""
     name = f"{body.row}.{body.name}"
     colour = COLOURS[body.row] if body.is_vut else PERSON_COLOUR if body.is_person else ACTOR_COLOUR
@@ -154,7 +154,7 @@ def _add_actor(api: Any, body: FlatBody) -> None:
     api.vehicle.setLaneChangeMode(name, 0)
 
 
-def _paint_road(api: Any, scene: FlatScene, row: int) -> None:
+def _paint_road(api: Api, scene: FlatScene, row: int) -> None:
     for i, lane in enumerate(scene.road):
         colour = _rgba({"road": ROAD_COLOUR, "crossing": "#ffffff"}.get(lane.kind, PATH_COLOUR))
         for j, outline in enumerate(lane_outlines(lane, lane.width - 0.1)):
@@ -162,7 +162,7 @@ def _paint_road(api: Any, scene: FlatScene, row: int) -> None:
             api.polygon.add(f"lane.{row}.{i}.{j}", points, colour, fill=True, layer=LANE_KINDS.index(lane.kind))
 
 
-def _show_sample(api: Any, scene: FlatScene, sample: int) -> None:
+def _show_sample(api: Api, scene: FlatScene, sample: int) -> None:
     """Show the actors, the camera and the legend at one sample."""
     comparison, left = scene.comparison, scene.left_ends[sample]
     for body in scene.bodies:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +17,7 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import DESCRIPTION_KEYS, Study, tables_of
+from safevar_sumo.study.schema import Tables
 
 FORMAT = 4
 RESULTS = 7
@@ -122,7 +123,7 @@ def write_whole(path: Path, text: str) -> None:
         raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None
 
 
-def manifest_of(study: Study, identity: Mapping[str, Any]) -> JsonObject:
+def manifest_of(study: Study, identity: Tables) -> JsonObject:
     """The manifest of a study as it is run, without the original vehicle's evaluation.
 
     Parameters
@@ -180,10 +181,10 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
             yield layer, text, not is_harmless
 
 
-def search_extent_of(manifest: JsonObject) -> Any:
+def search_extent_of(manifest: JsonObject) -> tuple[list[str], int, int]:
     """The study keys that decide which runs, of which length, the table of solutions covers."""
     search = manifest["study"]["search"]
-    return [search["algorithms"], search["runs"], search["evaluations"]]
+    return search["algorithms"], search["runs"], search["evaluations"]
 
 
 def write_manifest(directory: Path, manifest: JsonObject) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 import numpy as np
@@ -37,9 +37,13 @@ from safevar_sumo.results.manifest import (
     write_whole,
 )
 from safevar_sumo.study import Study, tables_of, user_code_names
+from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
     import pandas as pd
+
+RunKeyT = TypeVar("RunKeyT", bound=tuple[str, int])
+"""The key of a run: its algorithm and number."""
 
 
 class ResultsDirectory:
@@ -63,11 +67,7 @@ class ResultsDirectory:
     """
 
     def __init__(
-        self,
-        path: Path,
-        study: Study,
-        identity: Mapping[str, Any] = MappingProxyType({}),
-        scoring: Scoring = PUBLISHED_SCORING,
+        self, path: Path, study: Study, identity: Tables = MappingProxyType({}), scoring: Scoring = PUBLISHED_SCORING
     ) -> None:
         self.path, self._study, self.scoring = path, study, scoring
         self.manifest = {**manifest_of(study, identity), "folders": relative_folders(path, study)}
@@ -112,7 +112,7 @@ class ResultsDirectory:
                     f"{self.path / SOLUTIONS}: cannot be removed: {error.strerror}; it is outdated"
                 ) from None
 
-    def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
+    def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
         frame = solutions_frame(self._study.vehicle.characteristics, solutions.items())
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))

@@ -15,7 +15,17 @@ import tomli_w
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, study_path, tables_of
+from safevar_sumo.study.schema import (
+    NAME_PATTERN,
+    Origin,
+    Parameters,
+    SearchTable,
+    Study,
+    StudyLike,
+    Tables,
+    study_path,
+    tables_of,
+)
 from safevar_sumo.study.validation import (
     contradictions,
     contradictions_of_file,
@@ -36,7 +46,7 @@ class _RawStudy(NamedTuple):
     """Unchecked tables of a study, and their origin."""
 
     source: object
-    tables: dict[str, Any]
+    tables: Parameters
     origin: Origin = Origin()
 
 
@@ -77,7 +87,7 @@ def _checked_study(raw: _RawStudy) -> Study:
     return msgspec.structs.replace(study, origin=raw.origin)
 
 
-def _with_fmu(raw: _RawStudy) -> dict[str, Any]:
+def _with_fmu(raw: _RawStudy) -> Parameters:
     """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
     tables = raw.tables
     vehicle = tables.get("vehicle")
@@ -109,7 +119,7 @@ def _with_fmu(raw: _RawStudy) -> dict[str, Any]:
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
-def _with_algorithms(tables: dict[str, Any]) -> dict[str, Any]:
+def _with_algorithms(tables: Parameters) -> Parameters:
     """Move the tables of algorithms, such as [search.nsga2], to `search.parameters`."""
     search = tables.get("search")
     if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
@@ -172,7 +182,7 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     return merged_study._replace(origin=origin)
 
 
-def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: object) -> _RawStudy:
+def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
     """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`."""
     tables = _merge(base.tables, overrides)
     changed_keys = [
@@ -211,7 +221,7 @@ def _model_and_network(table: object) -> object:
     return table.get("model", table), parameters.get("network") if isinstance(parameters, dict) else None
 
 
-def _merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: Tables, overrides: Tables) -> Parameters:
     """Override `base` by `overrides`; another `model` or `distribution`, and the tables `WHOLE_TABLES`, replace a whole
     table.
     """

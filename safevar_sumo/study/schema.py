@@ -25,6 +25,8 @@ FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
+Tables = Mapping[str, Any]
+"""A study's tables, as in a file."""
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 Name = Annotated[
     str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")
@@ -291,9 +293,9 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return self.origin.called or f"study {self.name!r}"
 
 
-def tables_of(study: Study) -> dict[str, Any]:
+def tables_of(study: Study) -> Parameters:
     """A study as plain tables, without its origin and without keys that it does not use."""
-    tables: dict[str, Any] = msgspec.to_builtins(study)
+    tables: Parameters = msgspec.to_builtins(study)
     del tables["origin"]
     if not study.constraints:
         del tables["constraints"]  # so that results from before constraints existed stay the same bytes
@@ -306,7 +308,7 @@ def tables_of(study: Study) -> dict[str, Any]:
     return tables
 
 
-StudyLike = str | Path | Mapping[str, Any] | Study
+StudyLike = str | Path | Tables | Study
 """A study as its name, the path of its file, its tables, or a `Study`."""
 
 

@@ -10,10 +10,11 @@ from operator import getitem
 from typing import Any, TypeVar
 
 import msgspec
+from jsonschema import ValidationError
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
 from safevar_sumo.study.characteristics import CharacteristicTable, constraint_mistakes, variation_mistakes
-from safevar_sumo.study.schema import FMU_KEYS, Study
+from safevar_sumo.study.schema import FMU_KEYS, Parameters, Study, Tables
 
 T = TypeVar("T")
 MAX_MISTAKES = 8
@@ -57,7 +58,7 @@ def raise_mistakes(errors: Iterable[InputError]) -> None:
 
 
 @cache
-def json_schema(table: type) -> dict[str, Any]:
+def json_schema(table: type) -> Parameters:
     """The JSON schema (2020-12) of a record, which describes its tables in TOML or JSON."""
     return msgspec.json.schema(table)
 
@@ -96,7 +97,7 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str = "") -> 
             yield InputError(source, f"{_path_text(path)}{quoted} {message}".removeprefix(": ") + hint)
 
 
-def _leaves(error: Any) -> list[Any]:
+def _leaves(error: ValidationError) -> list[ValidationError]:
     """The errors of the alternative that a value of several alternatives belongs to, or the error itself."""
     tag = error.schema.get("discriminator", {}).get("propertyName")
     others = {
@@ -233,9 +234,7 @@ def missing_parameter(source: object, table: str, name: str) -> InputError:
     )
 
 
-def contradictions_of_file(
-    source: object, stated: Mapping[str, Any], tables: Mapping[str, Any]
-) -> Iterator[InputError]:
+def contradictions_of_file(source: object, stated: Tables, tables: Tables) -> Iterator[InputError]:
     """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its
     study.
     """

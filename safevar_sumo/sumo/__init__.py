@@ -1,6 +1,6 @@
 """Simulation: many settings of a study in one SUMO process."""
 
-from safevar_sumo.sumo.batch import reason_for_sumo, score
+from safevar_sumo.sumo.batch import is_recorded, reason_for_sumo, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import (
     PointResult,
@@ -25,6 +25,7 @@ __all__ = [
     "assemble",
     "evaluate",
     "evaluations_at_worst_points",
+    "is_recorded",
     "models_of",
     "point_record",
     "reason_for_sumo",

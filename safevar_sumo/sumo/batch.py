@@ -30,7 +30,7 @@ from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.perception import PointBatch
-from safevar_sumo.sumo.recorded_world import RecordedWorld
+from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld
 from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -82,6 +82,11 @@ def reason_for_sumo(system: System) -> str:
     return next((reason for reason in scenes_or_reasons if isinstance(reason, str)), "")
 
 
+def is_recorded(system: System, engine: Engine = Engine.RECORDED) -> bool:
+    """Whether the vehicles drive in recorded scenes instead of SUMO."""
+    return engine is Engine.RECORDED and not reason_for_sumo(system)
+
+
 def drive_all(
     system: System,
     settings: FloatArray,
@@ -103,16 +108,13 @@ def drive_all(
         If a user's ADS fails.
     """
     scenarios, options = [point.scenario for point in system.points], step_options(system)
-    if engine is Engine.RECORDED:
-        if watch is None and not reason_for_sumo(system):
-            scenes = record_scenes(scenarios, options)
-            world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
-            return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
-        engine = Engine.LIBSUMO
-    (scenario,) = scenarios
-    with open_world(
-        copied_network(stage_network(scenario), len(settings)), len(settings), engine, options
-    ) as sumo_world:
+    if watch is None and is_recorded(system, engine):
+        scenes = record_scenes(scenarios, options)
+        world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
+        return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
+    (scenario,), n = scenarios, len(settings)
+    in_sumo = Engine.LIBSUMO if engine is Engine.RECORDED else engine
+    with open_world(copied_network(stage_network(scenario), n), n, in_sumo, options) as sumo_world:
         return drive(system, settings, sumo_world, watch, listen)
 
 
@@ -125,7 +127,7 @@ def step_options(system: System) -> tuple[str, ...]:
 def drive(
     system: System,
     settings: FloatArray,
-    world: SumoWorld | RecordedWorld,
+    world: DrivenWorld,
     watch: Watcher | None = None,
     listen: Listener | None = None,
 ) -> SimulationRuns:
@@ -141,7 +143,7 @@ def drive(
 def _simulate(
     system: System,
     settings: FloatArray,
-    world: Any,
+    world: DrivenWorld,
     outcomes: _Outcomes,
     watch: Watcher | None,
     listen: Listener | None,
@@ -155,7 +157,7 @@ def _simulate(
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
     for sample in range(log.length):
-        if watch is not None:
+        if watch is not None and isinstance(world, SumoWorld):
             watch(world)
         speed = world.speeds()
         scene = batch.scene(outcomes.is_open)
@@ -200,7 +202,7 @@ def _simulate(
     )
 
 
-def _insert_vehicles(system: System, settings: FloatArray, world: Any) -> Prepared:
+def _insert_vehicles(system: System, settings: FloatArray, world: DrivenWorld) -> Prepared:
     """Put the vehicles onto the roads; returns their constants."""
     vehicle, n = system.vehicle, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +15,20 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
-from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome, SimulationRuns, finite_or_none
+from safevar_sumo.records import (
+    BoolArray,
+    CellResults,
+    Evaluations,
+    FloatArray,
+    JsonObject,
+    Outcome,
+    SimulationRuns,
+    finite_or_none,
+)
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score, step_options
+from safevar_sumo.sumo.batch import Watcher, drive_all, is_recorded, score, step_options
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.recording import Recording, record_scenes
@@ -52,7 +61,7 @@ class PointResult(NamedTuple):
     runs: SimulationRuns
 
 
-def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
+def point_record(result: PointResult, row: int = 0) -> JsonObject:
     """Plain values of the setting in row `row` of a result; a value is None if it is undefined.
 
     Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted
@@ -120,7 +129,7 @@ def rate_settings(
 
     Traces are dropped, as they would take gigabytes.
     """
-    scored, quantities = dict[str, PointEvaluations](), dict[str, Any]()
+    scored, quantities = dict[str, PointEvaluations](), dict[str, tuple[FloatArray, FloatArray, BoolArray]]()
     for group in _simulate_groups(system, settings, engine):
         for result in group:
             name = result.point.name
@@ -151,7 +160,7 @@ def evaluate_cells(
 
 def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
-    return max(largest_batch(system) // len(system.points), MAX_COPIES) if _is_recorded(system, engine) else MAX_COPIES
+    return max(largest_batch(system) // len(system.points), MAX_COPIES) if is_recorded(system, engine) else MAX_COPIES
 
 
 def largest_batch(system: System) -> int:
@@ -159,14 +168,9 @@ def largest_batch(system: System) -> int:
     return min(MAX_VEHICLES, *(model.max_vehicles or MAX_VEHICLES for model in (system.vehicle, system.ads)))
 
 
-def _is_recorded(system: System, engine: Engine) -> bool:
-    """Whether the vehicles drive in recorded scenes instead of SUMO."""
-    return engine is Engine.RECORDED and not reason_for_sumo(system)
-
-
 def _batch_size(system: System, engine: Engine) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest network."""
-    if _is_recorded(system, engine):
+    if is_recorded(system, engine):
         return largest_batch(system)
     lanes = max(
         number_of_lanes(open_network(network)) for network in {point.scenario.network for point in system.points}
@@ -204,7 +208,7 @@ def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> It
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
-    if _is_recorded(system, engine):
+    if is_recorded(system, engine):
         groups = _group_points(system.points, largest_batch(system) // max(n, 1), step_options(system))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)

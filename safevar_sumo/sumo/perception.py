@@ -14,11 +14,11 @@ import numpy as np
 from safevar_sumo.ads.base import STEP_DECIMALS, DelayLine
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import VUT, Point, Scenario, Scene
-from safevar_sumo.scenarios.base import Frame
+from safevar_sumo.scenarios.base import Frame, ScenarioMemory, World
 from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, scene_of
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
-from safevar_sumo.sumo.recorded_world import RecordedWorld, SampledRecording, absence_error
+from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld, SampledRecording, absence_error
 from safevar_sumo.sumo.world import SumoWorld, begin
 
 LEADER_RANGE = 1000.0  # distance within which SUMO looks for a leader [m]
@@ -66,12 +66,18 @@ RecordT = TypeVar("RecordT", Scene, Observation)
 class PointBatch:
     """A batch of K groups of vehicles, all of the same size; group k drives in the scenario and weather of point k."""
 
-    def __init__(self, points: Sequence[Point], world: Any, n: int) -> None:
+    def __init__(self, points: Sequence[Point], world: DrivenWorld, n: int) -> None:
         self._group_size = size = n // len(points)
         self._points, self._step = points, world.step_length
         self._groups = [slice(k * size, (k + 1) * size) for k in range(len(points))]
-        self._is_recorded, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
-        self._worlds = world.slices if self._is_recorded else [world]
+        self._scenes, self._memories = list[Scene](), list[ScenarioMemory]()
+        self._is_recorded, self._target_observer = isinstance(world, RecordedWorld), None
+        self._worlds: Sequence[World]
+        if isinstance(world, RecordedWorld):
+            self._worlds = world.slices
+            self._target_observer = TargetObserver.of([point.scenario for point in points], world, size)
+        else:
+            self._worlds = [world]
         weathers = [point.weather for point in points]
         self._perceptions = [
             (Perception(weather, self._step), np.repeat([other == weather for other in weathers], size).nonzero()[0])
@@ -80,9 +86,6 @@ class PointBatch:
         ]
         self._vehicle_order = np.argsort(np.concatenate([vehicles for _, vehicles in self._perceptions]))
         self.last_step = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
-        self._target_observer = (
-            TargetObserver.of([point.scenario for point in points], world, size) if self._is_recorded else None
-        )
         if self._target_observer is None:
             self._memories = [
                 begin(point.scenario, scenario_world)

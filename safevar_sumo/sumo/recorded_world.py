@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.recording import Recording, Track
-from safevar_sumo.sumo.world import Body, direction_of
+from safevar_sumo.sumo.world import Body, SumoWorld, direction_of
 from safevar_sumo.vehicles import Sensors
 
 NUMERICAL_EPS = 0.001
@@ -232,7 +232,7 @@ class RecordedWorld:
         self,
         fronts: FloatArray,
         is_open: BoolArray,
-        scene_numbers: Any,
+        scene_numbers: IntArray,
         others: Body,
         persons: BoolArray,
         *,
@@ -278,7 +278,7 @@ class RecordedWorld:
             is_separated |= np.abs((to_other * axis[body]).sum(axis=1)) >= joint_extent / 2 - min_overlap
         yield from zip(body[~is_separated].tolist(), vehicle[~is_separated].tolist(), strict=True)
 
-    def _adjacent_pairs(self, is_open: BoolArray) -> Any:
+    def _adjacent_pairs(self, is_open: BoolArray) -> IntArray:
         """Numbers (scene, actor) of the M actors that vehicles of open runs are beside, now or one step ago; shape (M,
         2).
         """
@@ -317,3 +317,7 @@ def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
 def _body_at(track: Track, sample: int) -> Body:
     along = direction_of(float(track.angle[sample]))
     return Body.behind(track.position[sample], along, track.length, track.width, float(track.speed[sample]))
+
+
+DrivenWorld = SumoWorld | RecordedWorld
+"""A world in which vehicles under test drive."""

@@ -124,7 +124,7 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
     SimulationError
         If SUMO fails.
     """
-    reasons = [_reason_for_sumo(scenario) for scenario in scenarios]
+    reasons = [_reason_against_recording(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
     keys = [
         (scenario, network, tuple(options))
@@ -141,7 +141,7 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
     return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
-def _reason_for_sumo(scenario: Scenario) -> str:
+def _reason_against_recording(scenario: Scenario) -> str:
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
     if not isinstance(scenario, GuardedScenario) and not is_shipped(

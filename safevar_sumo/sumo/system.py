@@ -345,7 +345,7 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
 
 
 def _class_and_creator(
-    kind: str, shipped: Mapping[str, Any], table: ModelTable | VehicleTable, lookup: Lookup, *bases: type
+    kind: str, shipped: Mapping[str, type], table: ModelTable | VehicleTable, lookup: Lookup, *bases: type
 ) -> tuple[Member, Callable[[], Any]]:
     """The class that the table `kind` names, and the function that creates an instance with the table's parameters."""
     traci = f'with ads.kind = "traci" {CONTROLLER_FORMS}' if kind == "ads" else ""

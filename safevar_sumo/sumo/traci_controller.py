@@ -8,7 +8,7 @@ speeds and accelerations are converted to pedal positions of the vehicle model.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from safevar_sumo.sumo.traci_view import TraciView
 from safevar_sumo.sumo.world import current_world
 from safevar_sumo.vehicles import SumoType
 
+Controller = Callable[..., None]
+"""A user's function `step(traci, vehicle_id)`, or an object with such a method and, perhaps, `start`."""
+
 
 class TraciController(Ads):
     """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)`, or a class with `step`.
@@ -33,7 +36,7 @@ class TraciController(Ads):
         Creates a vehicle's controller.
     """
 
-    def __init__(self, create: Callable[[], Any], guard: Guard) -> None:
+    def __init__(self, create: Callable[[], Controller], guard: Guard) -> None:
         self._create, self._guard = create, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
@@ -64,7 +67,7 @@ class TraciController(Ads):
         command = pedals_for(memory.nominal, seen.speed, accelerations, initial_trim)
         return command, memory._replace(initial_trim=initial_trim)
 
-    def _call(self, view: TraciView, method: str, function: Callable[..., Any]) -> None:
+    def _call(self, view: TraciView, method: str, function: Callable[..., None]) -> None:
         with bind_traci(view.call):
             self._guard.call(method, function, traci_module(), VUT)
         if view.last_error is not None:  # the controller caught the error and continued
@@ -76,5 +79,5 @@ class _Memory(NamedTuple):
 
     nominal: Nominal
     traffic: SensedTraffic
-    drivers: list[tuple[TraciView, Callable[..., Any]]]
+    drivers: list[tuple[TraciView, Controller]]
     initial_trim: Trim | None

@@ -16,6 +16,7 @@ from typing import Any
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Nominal
 from safevar_sumo.sumo.engine import Engine, engine_api
+from safevar_sumo.sumo.world import Api
 
 LOOP_FUNCTIONS = (
     "start",
@@ -71,7 +72,7 @@ def substitute_traci() -> Iterator[None]:
 
 
 @cache
-def real_traci() -> Any:
+def real_traci() -> Api:
     """The original module traci, not its substitute for controllers; must be called before controllers run."""
     return engine_api(Engine.TRACI)
 
@@ -89,7 +90,7 @@ class _Module(ModuleType):
         super().__init__(real.__name__, real.__doc__)
         self.__path__, self.__file__, self.__spec__, self._real = real.__path__, real.__file__, real.__spec__, real
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Value:
         if name == "TraCIException":
             return real_traci().exceptions.TraCIException
         real = getattr(self._real, name)
@@ -101,10 +102,10 @@ class _Module(ModuleType):
 class _Domain:
     """A domain of TraCI, such as `traci.vehicle`."""
 
-    def __init__(self, name: str, real: Any) -> None:
+    def __init__(self, name: str, real: Api) -> None:
         self._name, self._real = name, real
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Value:
         member = getattr(self._real, name)
         return partial(_call, self._name, name) if callable(member) and not isinstance(member, type) else member
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import BoolArray, Contact, FloatArray
 from safevar_sumo.scenarios import VUT, Lane, Scenario, Scene
-from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import Sensors, SumoType
 
@@ -169,7 +169,7 @@ class SumoWorld:
         front, along = np.array(domain.getPosition(id_)), direction_of(domain.getAngle(id_))
         return Body.behind(front, along, length, width, domain.getSpeed(id_))
 
-    def _domain_of(self, id_: str) -> Any:
+    def _domain_of(self, id_: str) -> Api:
         return self.api.person if id_ in self.api.person.getIDList() else self.api.vehicle
 
     def end_runs(self, copies: Sequence[int]) -> None:
@@ -261,7 +261,7 @@ class SumoWorld:
             api.removeStage(id_, 0)
 
 
-def begin(scenario: Scenario, world: Any) -> Any:
+def begin(scenario: Scenario, world: Any) -> ScenarioMemory:
     """Start a scenario in a world before its first step, and return the scenario's memory.
 
     Raises

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from safevar_sumo.fmu import (
 from safevar_sumo.plugins import Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
+from safevar_sumo.study.schema import Parameters
 from safevar_sumo.vehicles.base import HIGHEST_SPEED, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
@@ -91,9 +92,7 @@ class FmuVehicle(Vehicle):
 
     UNITS: Mapping[str, str]
 
-    def __init__(
-        self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard
-    ) -> None:
+    def __init__(self, description: Description, units: Mapping[str, str], table: Parameters, guard: Guard) -> None:
         source, self._guard = guard.source, guard
         self._communication_step = description.communication_step(table["step"], source, "vehicle")
         self.UNITS = dict(units)

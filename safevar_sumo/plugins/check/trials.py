@@ -12,7 +12,7 @@ from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
 from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, Results, differences
 from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import Engine, reason_for_sumo
+from safevar_sumo.sumo import Engine, is_recorded
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
@@ -49,7 +49,7 @@ def try_simulations(study: Study) -> Iterator[Failure]:
 
     yield from _try(load, region.characteristics, settings)
     system = _system(study)
-    if ":" in study.scenario.model and not reason_for_sumo(system):
+    if ":" in study.scenario.model and is_recorded(system):
         recorded, in_sumo = (evaluate(system, settings, engine).results for engine in (Engine.RECORDED, Engine.LIBSUMO))
         for row, difference in differences(recorded, in_sumo, ROUNDING):
             yield (
