@@ -71,7 +71,7 @@ class CellMatrix(
     """
 
     test_name: str
-    criterion: Literal["mitigation", "avoidance"]
+    measure: Literal["mitigation", "avoidance"]
     sheet: str
     name_cell: str
     first_cell: str
@@ -307,7 +307,7 @@ class Protocol(
                             range_or_layer=STANDARD if letter == "S" else EXTENDED,
                             condition="",
                             criterion="",
-                            judged_by=WARNING if matrix.is_rated_by_warning(row_number) else matrix.criterion,
+                            judged_by=WARNING if matrix.is_rated_by_warning(row_number) else matrix.measure,
                             target_speed=matrix.target_speeds[column] if row.target_speed is None else row.target_speed,
                         )
 

@@ -66,7 +66,7 @@ class Operators(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     tournament_size: TournamentSize = 2
 
 
-class Variation:
+class Reproduction:
     """Draws offspring. DEAP draws from the global `random`: see `randomness`."""
 
     def __init__(self, operators: Operators, problem: Problem, rng: np.random.Generator) -> None:

@@ -17,8 +17,8 @@ from safevar_sumo.search.base import Problem, Search
 from safevar_sumo.search.evolution import (
     Individual,
     Operators,
+    Reproduction,
     Size,
-    Variation,
     initial_population,
     join_evaluations,
     objectives_of,
@@ -38,13 +38,13 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        variation = Variation(self, problem, rng)
+        reproduction = Reproduction(self, problem, rng)
         offspring, population, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
             used += yield from request_evaluations(offspring, problem)
             valid_offspring = [individual for individual in offspring if not individual.has_failed]
             population = select_survivors(population + valid_offspring, problem.population)
-            offspring = variation.draw_offspring(population, min(problem.population, problem.evaluations - used))
+            offspring = reproduction.draw_offspring(population, min(problem.population, problem.evaluations - used))
         return join_evaluations([individual for individual in population if individual.standing[0] == 0], problem)
 
 
@@ -87,13 +87,15 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     normalised: bool = True
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        variation, size = Variation(self, problem, rng), self.archive or problem.population
+        reproduction, size = Reproduction(self, problem, rng), self.archive or problem.population
         offspring, archive, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
             used += yield from request_evaluations(offspring, problem)
             valid_offspring = [individual for individual in offspring if not individual.has_failed]
             archive = select_archive(archive + valid_offspring, size, normalised=self.normalised)
-            offspring = variation.draw_distinct_offspring(archive, min(problem.population, problem.evaluations - used))
+            offspring = reproduction.draw_distinct_offspring(
+                archive, min(problem.population, problem.evaluations - used)
+            )
         return join_evaluations([individual for individual in archive if individual.standing[0] < 1], problem)
 
 
@@ -224,7 +226,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         neighbours = self._neighbours(problem.population)
-        variation, size = Variation(self, problem, rng), self.archive or problem.population
+        reproduction, size = Reproduction(self, problem, rng), self.archive or problem.population
         cells = initial_population(problem, rng)
         used = yield from request_evaluations(cells, problem)
         archive = update_archive([], cells, size)
@@ -232,9 +234,9 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             valid = [cell for cell in cells if not cell.has_failed]
             set_standings(valid)
             neighbourhoods = [[cells[i] for i in indices if not cells[i].has_failed] for indices in neighbours]
-            with variation.randomness():
+            with reproduction.randomness():
                 offspring = [
-                    variation.draw_child(mates or archive, archive)
+                    reproduction.draw_child(mates or archive, archive)
                     for mates in neighbourhoods[: problem.evaluations - used]
                 ]
             used += yield from request_evaluations(offspring, problem)

@@ -42,12 +42,12 @@ DIGEST_LENGTH = 16
 class Network(NamedTuple):
     """A network as its files are now.
 
-    `roads` is the recipe or the built network; `digests` are those of `roads`, the recipe's sources, traffic and
-    options, by file name.
+    `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the recipe's sources, traffic
+    and options, by file name.
     """
 
     folder: Path
-    roads: str
+    roads_file: str
     digests: tuple[tuple[str, str], ...]
 
     def path(self, name: str) -> Path:
@@ -56,7 +56,7 @@ class Network(NamedTuple):
     @property
     def is_built(self) -> bool:
         """Whether the user built the network; otherwise netconvert builds it."""
-        return self.roads.endswith(NETWORK_ENDING)
+        return self.roads_file.endswith(NETWORK_ENDING)
 
 
 def open_network(network: str, source: str = NETWORK_KEY) -> Network:
@@ -75,12 +75,12 @@ def open_network(network: str, source: str = NETWORK_KEY) -> Network:
             f"there is no network {network!r}{did_you_mean(network, names)}",
             f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
         )
-    folder, roads = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
-    names = [roads, *_sources_of(folder / roads), TRAFFIC_FILE, OPTIONS_FILE]
+    folder, roads_file = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
+    names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
     for name in names:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
-    return Network(folder, roads, tuple((name, _digest((folder / name).read_bytes())) for name in names))
+    return Network(folder, roads_file, tuple((name, _digest((folder / name).read_bytes())) for name in names))
 
 
 def is_shipped(network: str) -> bool:
@@ -147,8 +147,8 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
         If netconvert fails for another reason, or the cache cannot be written.
     """
     size = round_up(n)
-    roads = cache_folder(network, size, _road_digests(network))
-    traffic = cache_folder(network, n, [dict(network.digests)[TRAFFIC_FILE]])
+    roads = cache_folder_name(network, size, _road_digests(network))
+    traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE]])
     return CopiedNetwork(
         ensure_cached(roads, NETWORK_FILE, partial(_copy_roads, network, size)),
         ensure_cached(traffic, TRAFFIC_FILE, partial(_copy_demand, network, n)),
@@ -159,8 +159,8 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
 def built_network(network: Network) -> Path:
     """The file of the original network, which netconvert or the user built; raises the errors of `copied_network`."""
     if network.is_built:
-        return network.path(network.roads)
-    return ensure_cached(cache_folder(network, 0, _road_digests(network)), NETWORK_FILE, partial(_build, network))
+        return network.path(network.roads_file)
+    return ensure_cached(cache_folder_name(network, 0, _road_digests(network)), NETWORK_FILE, partial(_build, network))
 
 
 @cache
@@ -184,7 +184,7 @@ def round_up(n: int) -> int:
         size *= 10
 
 
-def cache_folder(network: Network, n: int, digests: Sequence[str]) -> str:
+def cache_folder_name(network: Network, n: int, digests: Sequence[str]) -> str:
     """Name of the folder in the cache for `n` copies that are made from files with these digests."""
     name = re.sub(r"[^a-zA-Z0-9_.-]", "_", network.folder.name)  # SUMO splits file names at commas
     return f"{name}-{n}-{_digest(' '.join([*digests, sumo_version(), _code_digest()]).encode())}"
@@ -232,7 +232,7 @@ def _copy_demand(network: Network, n: int, into: Path) -> None:
 def _build(network: Network, into: Path) -> None:
     file = into / NETWORK_FILE
     exit_code, errors = run_program(
-        network.folder, "netconvert", "-c", network.roads, "-o", str(file), "--no-warnings", "true"
+        network.folder, "netconvert", "-c", network.roads_file, "-o", str(file), "--no-warnings", "true"
     )
     if exit_code < 0 or "bad_alloc" in errors or ("Could not" in errors and "output" in errors):
         raise EnvironmentFault(f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}")

@@ -20,7 +20,7 @@ from safevar_sumo.sumo.network import (
     TRAFFIC_FILE,
     Network,
     built_network,
-    cache_folder,
+    cache_folder_name,
     copied_network,
     is_shipped,
     open_network,
@@ -124,7 +124,9 @@ def _check_files(network: Network) -> None:
     for source in () if network.is_built else sorted(network.folder.glob("*.???.xml")):
         if source.name not in sources and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", source.name):
             raise InputError(
-                source, f"is not used: {network.roads} does not name it", f"sources that {network.roads} names"
+                source,
+                f"is not used: {network.roads_file} does not name it",
+                f"sources that {network.roads_file} names",
             )
 
 
@@ -182,7 +184,7 @@ def _lanes_of_vut(traffic: ElementTree.Element, roads: ElementTree.Element) -> l
 
 def _warnings_file(network: Network) -> Path:
     """A file with SUMO's warnings about a network that SUMO has loaded; raises the errors of `check_network`."""
-    folder = cache_folder(network, 0, [digest for _, digest in network.digests])
+    folder = cache_folder_name(network, 0, [digest for _, digest in network.digests])
     return ensure_cached(f"tried-{folder}", WARNINGS_FILE, partial(_try_network, network))
 
 

@@ -71,7 +71,7 @@ def block(sheet, frame, name: str) -> list[str]:
         "[[blocks]]",
         f'test = "{test}"',
         *([f'light = "{light}"'] if light else []),
-        f'criterion = "{criterion(name)}"',
+        f'measure = "{measure(name)}"',
         f'sheet = "{sheet.title}"',
         f'label = "A{top - 2}"',
         f'first = "{sheet.cell(top, left).coordinate}"',
@@ -84,7 +84,7 @@ def block(sheet, frame, name: str) -> list[str]:
     ]
 
 
-def criterion(name: str) -> str:
+def measure(name: str) -> str:
     return {"mitigation or avoidance": "mitigation", "avoidance": "avoidance"}[
         data_model.get_criteria_for_test(name).value
     ]
