@@ -34,6 +34,12 @@ benchmark: .venv/installed-test
 	$(INSTALL) .
 	touch $@
 
+# ASAM's checks of OpenSCENARIO and OpenDRIVE need older versions of libraries than this package: their own environment.
+.venv/installed-asam: tests/replay/asam.txt .venv/installed
+	$(RUN) -m venv .venv/asam
+	.venv/asam/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
+	touch $@
+
 .venv/installed-%: .venv/installed
 	$(INSTALL) ".[$*]"
 	touch $@

@@ -38,6 +38,7 @@ COMMANDS_BY_GROUP = {
             "study",
             "Show the progress of a study running in another process: runs, front, collisions, time left.",
         ),
+        "export": ("evidence", "Write a solution for CARLA, or as OpenSCENARIO and OpenDRIVE."),
         "check": (
             "catalogue",
             "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",

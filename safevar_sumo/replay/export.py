@@ -1,0 +1,197 @@
+"""A solution's simulation as files for other simulators: OpenSCENARIO XML and OpenDRIVE, or a script for CARLA."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import EnvironmentFault, InputError
+from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
+from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
+from safevar_sumo.replay.comparison import Comparison
+from safevar_sumo.results import make_directory, write_whole
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.network import Network, built_network, run_program
+
+TARGETS = ("carla", "openscenario")
+ROAD, SCENARIO, SCRIPT, VEHICLE = "road.xodr", "scenario.xosc", "run_in_carla.py", "vehicle.json"
+BLUEPRINT = "vehicle.lincoln.mkz*2017"
+"""The Lincoln MKZ of CARLA 0.9.10 (`mkz2017`) and of later versions (`mkz_2017`)."""
+CARLA_PHYSICS = {
+    "max_rpm": "max_rpm",
+    "dampRateFullT": "damping_rate_full_throttle",
+    "dampRateZeroT_CE": "damping_rate_zero_throttle_clutch_engaged",
+    "dampRateZeroT_CD": "damping_rate_zero_throttle_clutch_disengaged",
+    "gearSwitchTime": "gear_switch_time",
+    "clutchStrength": "clutch_strength",
+    "mass": "mass",
+    "dragCoeff": "drag_coefficient",
+}
+"""Characteristics by the attribute of CARLA's `VehiclePhysicsControl` with the same meaning and unit."""
+CARLA_WHEELS = {
+    "tireFric": "tire_friction",
+    "dampRate": "damping_rate",
+    "radius": "radius",
+    "maxBrakeTorque": "max_brake_torque",
+}
+"""Characteristics by the attribute of each `WheelPhysicsControl`; CARLA's radius is in cm, as the characteristic is."""
+WHEELBASE = 0.58
+"""Assumed wheelbase over the vehicle's length, with equal overhangs [-]."""
+HEIGHTS = {"pedestrian": 1.8, "bicycle": 1.7, "car": 1.5}
+"""Assumed heights [m]; SUMO has no third dimension."""
+BICYCLE_WIDTH = 1.0
+"""Width below which a vehicle is a bicycle [m]."""
+DISALLOWED = {"outline": ("id", "fillType", "outer", "closed", "laneType"), "cornerLocal": ("id",)}
+"""Attributes of a later OpenDRIVE that netconvert writes into its version 1.4, whose schema has none of them."""
+
+
+class Poses(NamedTuple):
+    """Samples of an actor on the road, shape (T,): time [s], middle x and y [m], and heading counter-clockwise from x
+    [rad].
+    """
+
+    name: str
+    kind: str
+    length: float
+    width: float
+    time: FloatArray
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+
+    @property
+    def height(self) -> float:
+        return HEIGHTS[self.kind]
+
+    @property
+    def to_axle(self) -> float:
+        """Distance of the rear axle behind the middle [m]; OpenSCENARIO places a vehicle by this axle, a person by its
+        middle.
+        """
+        return 0.0 if self.kind == "pedestrian" else self.length * WHEELBASE / 2
+
+    def places(self, behind: float = 0.0) -> list[tuple[float, float, float, float]]:
+        """Time, x, y and heading of the point so far behind the middle."""
+        x, y = self.x - behind * np.cos(self.heading), self.y - behind * np.sin(self.heading)
+        return list(zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True))
+
+
+def poses_of(comparison: Comparison) -> list[Poses]:
+    """All actors of the changed vehicle's run, or of the original's if nothing is changed, until its end; the vehicle
+    under test is the first.
+    """
+    row, actors = comparison.rows[-1], []
+    end = comparison.moments[row].end + 1
+    time = np.round(comparison.runs.trace.time[:end], TIME_DECIMALS)
+    for name, track in sorted(comparison.tracks.items(), key=lambda item: item[0] != VUT):
+        x, y = track.x[:end, row], track.y[:end, row]
+        here = np.isfinite(x)
+        if not here.any():
+            continue
+        heading = np.deg2rad(90.0 - track.angle[:end, row])
+        kind = "pedestrian" if track.is_person else "bicycle" if track.width < BICYCLE_WIDTH else "car"
+        to_middle = 0.0 if track.is_person else track.length / 2
+        x, y = x - to_middle * np.cos(heading), y - to_middle * np.sin(heading)
+        samples = (values[here] for values in (time, x, y, heading))
+        actors.append(Poses(name, kind, track.length, track.width, *samples))
+    return actors
+
+
+def open_drive(network: Network) -> str:
+    """The network as OpenDRIVE 1.4, by netconvert, without the time of the conversion.
+
+    Raises
+    ------
+    EnvironmentFault
+        If netconvert fails.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = ("-s", str(built_network(network)), "--opendrive-output", ROAD, "-o", "net.xml")
+        exit_code, errors = run_program(Path(folder), "netconvert", *arguments)
+        if exit_code != 0:
+            raise EnvironmentFault(f"{network.folder}: netconvert writes no OpenDRIVE: {errors}")
+        root = ElementTree.parse(Path(folder) / ROAD).getroot()
+    for element in root.iter():
+        for name in DISALLOWED.get(element.tag, ("date",) if element.tag == "header" else ()):
+            element.attrib.pop(name, None)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+def carla_physics(setting: Mapping[str, float], source: str) -> dict[str, dict[str, float]]:
+    """The values of CARLA's physics and of each wheel, by attribute.
+
+    Raises
+    ------
+    InputError
+        If a characteristic has no counterpart in CARLA, or one of CARLA's has no characteristic.
+    """
+    names = {**CARLA_PHYSICS, **CARLA_WHEELS}
+    if without := [name for name in setting if name not in names]:
+        problem = (
+            f"{', '.join(without)} of its vehicle {'has' if len(without) == 1 else 'have'} no counterpart in CARLA"
+        )
+        raise InputError(source, problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`")
+    if missing := [name for name in names if name not in setting]:
+        raise InputError(
+            source, f"its vehicle has no {', '.join(missing)}", "the vehicle `carla`, or `to=openscenario`"
+        )
+    tables = {"physics": CARLA_PHYSICS, "wheels": CARLA_WHEELS}
+    return {table: {to: setting[name] for name, to in pairs.items()} for table, pairs in tables.items()}
+
+
+def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float]], handle: str) -> JsonObject:
+    """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings counter-clockwise) and
+    pedals.
+    """
+    row, trace = comparison.rows[-1], comparison.runs.trace
+    vut, *others = poses_of(comparison)
+    samples = slice(0, comparison.moments[row].end + 1)
+    return {
+        "solution": handle,
+        "title": comparison.title,
+        "verdict": comparison.verdict(row),
+        "blueprint": BLUEPRINT,
+        **physics,
+        "step": trace.step,
+        "start": dict(zip(("x", "y", "heading"), vut.places()[0][1:], strict=True)),
+        "start_speed": float(trace.speed[0, row]),
+        "route": [place[1:3] for place in vut.places()],
+        "pedals": [
+            {"throttle": throttle, "brake": brake}
+            for throttle, brake in zip(trace.throttle[samples, row], trace.brake[samples, row], strict=True)
+        ],
+        "actors": [
+            {"name": actor.name, "kind": actor.kind, "length": actor.length, "places": actor.places()}
+            for actor in others
+        ],
+    }
+
+
+def export(comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, Mapping[str, float]]) -> None:
+    """Write the last run of a comparison for one of `TARGETS` into a new directory; `physics` is for CARLA only."""
+    road, scene = open_drive(comparison.network), carla_scene(comparison, physics, handle) if to == "carla" else {}
+    if to == "carla":
+        script = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")
+        files = {SCRIPT: script, VEHICLE: json.dumps(scene, indent=1, allow_nan=False) + "\n"}
+    else:
+        actors = poses_of(comparison)
+        files = {
+            SCENARIO: template_environment()
+            .get_template(f"{SCENARIO}.j2")
+            .render(
+                title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
+                road=ROAD,
+                actors=actors,
+                end=max(float(actor.time[-1]) for actor in actors),
+                wheelbase=WHEELBASE,
+            )
+        }
+    make_directory(out)
+    for name, text in {**files, ROAD: road}.items():
+        write_whole(out / name, text)

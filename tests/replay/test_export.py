@@ -1,0 +1,222 @@
+"""Exported solutions: second libraries read the same places, lanes and values as the simulation has."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+from safevar_sumo.replay.comparison import Comparison, compare_setting
+from safevar_sumo.results import write_imported
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import system_at_point
+from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import refused, run
+from tests.made_up import made_up_evaluations
+
+ASAM = Path(sys.prefix) / "asam" / "bin"
+SCENES = {
+    "pedestrian_crossing": ("rain", ""),
+    "crossing": ("euro_ncap_pedestrian", "CPNCO, speed 30, clear"),
+    "along": ("euro_ncap_pedestrian", "CPLA, speed 40, clear"),
+    "car_to_car": ("euro_ncap_car_to_car", "CCRm, speed 40, impact_location 50, clear"),
+    "lead_vehicle_stopped": ("lgsvl", ""),
+}
+HANDLE = ("--solution", "made:0:0")
+WITHOUT_CARLA = "CARLA's client has wheels for Linux and Python 3.10 to 3.12"
+
+
+def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]:
+    """Results with one solution: the original, a tenth of each domain away from it."""
+    study = load_study(study_name)
+    system = assemble(study)
+    characteristics = system.characteristics
+    middle = (characteristics.lower + characteristics.upper) / 2
+    setting = characteristics.original + np.sign(middle - characteristics.original) * 0.1 * (
+        characteristics.upper - characteristics.lower
+    )
+    undefined = dict.fromkeys(("tet", "tit", "ave_dece"), np.array([np.nan]))
+    solutions = made_up_evaluations(
+        [1.0], settings=setting[np.newaxis], metrics={"safety_degree": np.array([1.0]), **undefined}
+    )
+    write_imported(folder / "results", study, {"made": solutions}, {"safety_degree": 1.0}, {"made": "made.csv"})
+    return folder / "results", system, setting
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, marks=() if name in ("crossing", "lead_vehicle_stopped") else pytest.mark.slow)
+        for name in SCENES
+    ],
+)
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Comparison]:
+    study, point = SCENES[request.param]
+    results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
+    out, chosen = results.with_name("out"), ("--point", point) if point else ()
+    run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
+    at_point = system_at_point(system, point, "") if point else system
+    return out, compare_setting(load_study(study), at_point, setting)
+
+
+def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:
+    xosc = pytest.importorskip("scenariogeneration.xosc")
+    out, comparison = exported
+    scenario, row = xosc.ParseOpenScenario(str(out / "scenario.xosc")), comparison.rows[-1]
+    samples = slice(0, comparison.moments[row].end + 1)
+    boxes = {item.name: item.entityobject.boundingbox for item in scenario.entities.scenario_objects}
+    groups = scenario.storyboard.stories[0].acts[0].maneuvergroup
+    assert {group.actors.actors[0].entity for group in groups} == comparison.tracks.keys()
+    for group in groups:
+        name = group.actors.actors[0].entity
+        track, box = comparison.tracks[name], boxes[name]
+        trajectory = group.maneuvers[0].events[0].action[0].action.trajectory
+        places = trajectory.shapes.positions
+        x, y, heading = (np.array([getattr(place, axis) for place in places], dtype=float) for axis in "xyh")
+        assert np.allclose(trajectory.shapes.time, comparison.runs.trace.time[samples], rtol=0, atol=1e-9)
+        front = 0.0 if track.is_person else box.center.x + box.boundingbox.length / 2
+        assert np.abs(x + front * np.cos(heading) - track.x[samples, row]).max() < 0.01
+        assert np.abs(y + front * np.sin(heading) - track.y[samples, row]).max() < 0.01
+        if name == "vut":
+            travelled = comparison.runs.trace.position[samples, row]
+            assert np.abs(np.hypot(x - x[0], y - y[0]) - (travelled - travelled[0])).max() < 0.01
+
+
+def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[Path, Comparison]) -> None:
+    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
+    out, comparison = exported
+    road, row = carla.Map("road", (out / "road.xodr").read_text()), comparison.rows[-1]
+    track, lanes = comparison.tracks["vut"], [lane for lane in comparison.road if lane.kind == "road"]
+    for sample in range(comparison.moments[row].end + 1):
+        x, y, angle = (float(values[sample, row]) for values in (track.x, track.y, track.angle))
+        place = carla.Location(x, -y, 0.0)
+        waypoint = road.get_waypoint(place, project_to_road=False)
+        assert waypoint is not None
+        assert waypoint.lane_type == carla.LaneType.Driving
+        assert any(np.isclose(waypoint.lane_width, lane.width, atol=0.01) for lane in lanes)
+        assert np.isclose(np.cos(np.deg2rad(waypoint.transform.rotation.yaw - (angle - 90))), 1, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
+    if not ASAM.is_dir() and os.environ.get("SAFEVAR_ASAM") != "required":
+        pytest.skip("make .venv/installed-asam installs ASAM's checks")
+    out, _ = exported
+    for kind, program, file in (("xodr", "qc_opendrive", "road.xodr"), ("xosc", "qc_openscenario", "scenario.xosc")):
+        report, config = out.with_name(f"{kind}.xqar"), out.with_name(f"{kind}.xml")
+        config.write_text(
+            f'<Config><Param name="InputFile" value="{out / file}"/><CheckerBundle application="{kind}Bundle">'
+            f'<Param name="resultFile" value="{report}"/></CheckerBundle></Config>'
+        )
+        subprocess.run([ASAM / program, "-c", config], check=True, capture_output=True)
+        states = re.findall(r'<Checker status="(\w+)" checkerId="(\w+)"', report.read_text())
+        assert ("completed", f"check_asam_{kind}_xml_valid_schema") in states
+        assert not any(state == "error" for state, _ in states)
+        assert "<Issue " not in report.read_text()
+
+
+@pytest.fixture
+def for_carla(tmp_path: Path) -> tuple[Path, np.ndarray]:
+    results, _, setting = results_of("rain", tmp_path)
+    run("export", str(results), *HANDLE, "--to", "carla", "--out", str(tmp_path / "out"))
+    return tmp_path / "out", setting
+
+
+def script_in(folder: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("run_in_carla", folder / "run_in_carla.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_carla_gets_all_twelve_values_in_its_units(for_carla: tuple[Path, np.ndarray]) -> None:
+    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
+    folder, setting = for_carla
+    script, scene = script_in(folder), json.loads((folder / "vehicle.json").read_text())
+    empty = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl() for _ in range(4)])
+    physics = script.apply_values(empty, scene)
+    assert len(physics.wheels) == 4
+    wheel_values = [
+        [wheel.tire_friction, wheel.damping_rate, wheel.radius, wheel.max_brake_torque] for wheel in physics.wheels
+    ]
+    body_values = [
+        physics.max_rpm,
+        physics.damping_rate_full_throttle,
+        physics.damping_rate_zero_throttle_clutch_engaged,
+        physics.damping_rate_zero_throttle_clutch_disengaged,
+        physics.gear_switch_time,
+        physics.clutch_strength,
+        physics.mass,
+        physics.drag_coefficient,
+    ]
+    for wheel in wheel_values:  # in the order of the paper's table; float32 in CARLA
+        assert np.allclose([*body_values, *wheel], setting, rtol=1e-6, atol=0)
+    assert 30 < wheel_values[0][2] < 40, "centimetres"
+
+
+def test_carla_gets_pedals_places_and_walker(for_carla: tuple[Path, np.ndarray]) -> None:
+    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
+    folder, setting = for_carla
+    script, scene = script_in(folder), json.loads((folder / "vehicle.json").read_text())
+    comparison = compare_setting(load_study("rain"), assemble(load_study("rain")), setting)
+    control, end = script.pedals(scene, 3), comparison.moments[-1].end
+    assert control.throttle == pytest.approx(comparison.runs.trace.throttle[3, -1])
+    assert script.pedals(scene, end + 9).brake == pytest.approx(comparison.runs.trace.brake[end, -1])
+    vut, (walker,) = comparison.tracks["vut"], scene["actors"]
+    start = script.place(**scene["start"])
+    assert start.location.x == pytest.approx(vut.x[0, -1] - vut.length / 2)
+    assert start.location.y == pytest.approx(-vut.y[0, -1])
+    _, x, y, _ = walker["places"][10]
+    step = script.walk(walker["places"], 10, scene["step"], carla.Location(x, -y, 0))
+    assert step.speed == pytest.approx(1.8, abs=0.01)
+    assert np.sign(step.direction.y) == -np.sign(walker["places"][11][2] - y), "y points to the right in CARLA"
+
+
+def test_the_script_drives_the_whole_record(for_carla: tuple[Path, np.ndarray]) -> None:
+    """Calls only: no server was at hand."""
+    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
+    folder, _ = for_carla
+    script, scene = script_in(folder), json.loads((folder / "vehicle.json").read_text())
+    vehicle, walker, world = MagicMock(), MagicMock(), MagicMock()
+    world.spawn_actor.side_effect = [vehicle, walker, MagicMock()]
+    vehicle.get_physics_control.return_value = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl()] * 4)
+    vehicle.get_velocity.return_value = carla.Vector3D()
+    walker.get_location.return_value = carla.Location()
+    assert script.play(world, scene, None) is None
+    assert vehicle.apply_control.call_count == world.tick.call_count == len(scene["pedals"]) + script.SETTLING
+    (physics,), _ = vehicle.apply_physics_control.call_args
+    assert physics.mass == pytest.approx(scene["physics"]["mass"])
+    assert walker.set_transform.call_count == len(scene["pedals"])
+    assert vehicle.destroy.called
+
+
+def test_bad_input_is_refused(tmp_path: Path) -> None:
+    results, _, _ = results_of("rain", tmp_path)
+    out = tmp_path / "out"
+    common = ("export", str(results), "--to", "carla", "--out")
+    refused(*common, str(out), "--solution", "made:0:7", message=("there is no solution made:0:7", "expected"))
+    refused(*common, str(results), *HANDLE, message=("--out", f"{results} exists", "a new directory"))
+    refused(*common, str(out), *HANDLE, "--point", "nowhere", message=("--point", "nowhere"))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("study", "without"), [("wear", "treadDepth, brakeTorque"), ("lgsvl", "wheelMass, maxRpm, minRpm")]
+)
+def test_a_vehicle_without_counterpart_is_refused(tmp_path: Path, study: str, without: str) -> None:
+    results, _, _ = results_of(study, tmp_path)
+    out = tmp_path / "out"
+    message = (without, "no counterpart in CARLA", "--to openscenario")
+    refused("export", str(results), *HANDLE, "--to", "carla", "--out", str(out), message=message)
+    assert not out.exists()
