@@ -35,6 +35,7 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "model_error",
     "variation",
     "correlations",
+    "limits",
 )
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")

@@ -6,6 +6,7 @@ from safevar_sumo.study.characteristics import (
     unit_text as unit_text,
 )
 from safevar_sumo.study.file import load_study as load_study, write_study as write_study
+from safevar_sumo.study.limits import Limit as Limit, limits_of as limits_of
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,

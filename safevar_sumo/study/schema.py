@@ -19,6 +19,7 @@ from safevar_sumo.study.characteristics import (
     Distribution,
     PositiveNumber,
 )
+from safevar_sumo.study.limits import Limit
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
@@ -259,7 +260,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameter, the study's own value first; `model_error` is the model's further error, by metric, for a vehicle that
     differs from the original by the full width of a domain; `variation` and `correlations` state how characteristics
     vary in the world, by name: uniformly by default; `constraints` are conditions that the characteristics of one
-    vehicle satisfy together.
+    vehicle satisfy together; `limits` are the values, by name, up to which characteristics may wear in service.
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
@@ -285,6 +286,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     variation: dict[str, Distribution] = {}
     correlations: list[Correlation] = []
     constraints: list[Constraint] = []
+    limits: dict[str, Limit] = {}
     origin: Origin = Origin()
 
     @property
@@ -297,8 +299,9 @@ def tables_of(study: Study) -> Parameters:
     """A study as plain tables, without its origin and without keys that it does not use."""
     tables: Parameters = msgspec.to_builtins(study)
     del tables["origin"]
-    if not study.constraints:
-        del tables["constraints"]  # so that results from before constraints existed stay the same bytes
+    for name in ("constraints", "limits"):
+        if not tables[name]:
+            del tables[name]  # so that results from before these tables existed stay the same bytes
     for name in ("vehicle", "ads", "scenario"):
         if tables[name].get("kind") != "fmu":
             kept_keys = () if name == "vehicle" else ("kind",)

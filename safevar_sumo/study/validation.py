@@ -14,6 +14,7 @@ from jsonschema import ValidationError
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
 from safevar_sumo.study.characteristics import CharacteristicTable, constraint_mistakes, variation_mistakes
+from safevar_sumo.study.limits import limit_mistakes
 from safevar_sumo.study.schema import FMU_KEYS, Parameters, Study, Tables
 
 T = TypeVar("T")
@@ -171,6 +172,7 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
                 yield InputError(source, f"{name}.{key}: {table.model!r} is no FMU", "no such key")
     yield from variation_mistakes(source, characteristics, study.variation, study.correlations)
     yield from constraint_mistakes(source, characteristics, study.constraints)
+    yield from limit_mistakes(source, characteristics, study.limits, "limits.")
     for name, bounds in study.calibration.items():
         if bounds.lower >= bounds.upper:
             problem = f"calibration.{name!r}: lower = {bounds.lower} and upper = {bounds.upper}"
