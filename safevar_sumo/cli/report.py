@@ -90,11 +90,14 @@ def _print_notes(notes: list[str]) -> None:
 @click.option(
     "--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ..."
 )
+@click.option("--paper", is_flag=True, help="With the research questions of the paper, as tables and figures.")
 @point_option
 @as_it_is_now_option
 @jobs_option
-def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
-    """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
+def report(
+    directories: tuple[str, ...], out: Path, only: str | None, paper: bool, point: str | None, jobs: int | None
+) -> None:
+    """Write one self-contained page about the results directories DIR...: first what to hand over, then the details."""
     from safevar_sumo.report import make_report
     from safevar_sumo.terminal import open_progress
 
@@ -102,7 +105,7 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, point: str
     sections = split_names(only) if only is not None else ()
     with open_progress(True) as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())
+        page = make_report(directories, sections, jobs, progress, point=point, paper=paper, as_it_is_now=as_it_is_now())
     for warning in caught:
         print_warning(warning.message)
     write_whole(out, page)

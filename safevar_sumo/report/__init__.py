@@ -21,6 +21,7 @@ def report(
     *results: Results | str | Path,
     out: str | Path | None = None,
     only: Sequence[str] = (),
+    paper: bool = False,
     point: str | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,
@@ -36,7 +37,9 @@ def report(
     out
         File to write the page to, if any.
     only
-        Names of sections from `SECTIONS`, such as "verdict"; all sections by default.
+        Names of sections from `SECTIONS`, such as "verdict"; by default all but the research questions.
+    paper
+        With the research questions, as tables and figures.
     point
         Name of a point of the study's matrix: the page is about this point only, without the research questions, which
         need whole studies.
@@ -65,7 +68,7 @@ def report(
     """
     directories = [source.directory if isinstance(source, Results) else source for source in results]
     with open_progress(progress) as show_progress:
-        page = make_report(directories, only, jobs, show_progress, point=point, as_it_is_now=as_it_is_now)
+        page = make_report(directories, only, jobs, show_progress, point=point, paper=paper, as_it_is_now=as_it_is_now)
     if out is not None:
         write_whole(Path(out), page)
     return page

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,9 +21,15 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
+from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.sumo.system import System, assemble
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from safevar_sumo.analysis.explain.result import Explanation
 
 SAMPLED_VEHICLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""
@@ -97,6 +103,10 @@ class ReportInput:
         """
         comparison = compare_setting(self.case.study, self.system, setting)
         return comparison, {**player_data(lay_out_scene(comparison)), "point": comparison.point}
+
+    def draw_failure(self, failure: Explanation) -> Figure:
+        """The figure of a failure beside the original vehicle."""
+        return draw_comparison(compare_setting(self.case.study, self.system, np.array(list(failure.setting.values()))))
 
     def anchor(self, *parts: object) -> str:
         """The HTML anchor of an element of the page, in this study's section."""

@@ -46,7 +46,9 @@ from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.input import ReportInput, page_options, read_inputs
 from safevar_sumo.report.sections import (
+    GENERAL_LIMITS,
     describe_agreement,
+    describe_failure,
     describe_limits,
     describe_tested_system,
     make_cause_sections,
@@ -145,7 +147,9 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
     }
 
 
-def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str]) -> list[tuple[str, str]]:
+def commands_to_reproduce(
+    inputs: Sequence[ReportInput], questions: Sequence[str], *, paper: bool
+) -> list[tuple[str, str]]:
     """What the commands reproduce, and the commands that give the numbers of the page, which answers `questions`."""
     commands = []
     for data in inputs:
@@ -165,7 +169,7 @@ def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str
             options = f"--most-severe --plot it.png --animate it.html{flag}"
             simulate = f"{PROGRAM_COMMAND} simulate {shlex.quote(directory)} {options}"
             commands.append(("A replay, with figure and animation", simulate))
-    if any(data.point for data in inputs):
+    if not paper:
         return commands
     directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
     return [
@@ -201,6 +205,7 @@ def make_report(
     progress: Progress = show_no_progress,
     *,
     point: str | None = None,
+    paper: bool = False,
     as_it_is_now: bool = False,
 ) -> str:
     """Make the page about results in directories; parameters, warnings and errors are those of
@@ -210,13 +215,14 @@ def make_report(
     if unknown_name is not None:
         hint = did_you_mean(unknown_name, SECTIONS)
         raise InputError("only", f"there is no section {unknown_name!r}{hint}", f"some of {','.join(SECTIONS)}")
-    if point is not None and "questions" in only:
-        legal = "sections other than questions with `point`"
-        raise InputError("only", "the research questions are about whole studies", legal)
+    if point is not None and (paper or "questions" in only):
+        raise InputError(
+            "point", "the research questions are about whole studies", "the page without them, or no `point`"
+        )
     sections = {
         name: heading
         for name, heading in SECTIONS.items()
-        if (not only or name in only) and not (point is not None and name == "questions")
+        if name in only or (not only and (paper or name != "questions"))
     }
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:
@@ -241,7 +247,8 @@ def make_report(
         studies=data_of_studies,
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
-        commands=commands_to_reproduce(inputs, questions) if "reproduce" in sections else [],
+        commands=commands_to_reproduce(inputs, questions, paper=bool(cases)) if "reproduce" in sections else [],
+        general_limits=GENERAL_LIMITS,
         player=player_files(),
         js=_web_file("report.js"),
     )
@@ -254,6 +261,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
     if {"verdict", "causes"} & {*sections} and len(data.case.solutions):
         explain = partial(explain_failures, statistics="causes" in sections)
         explained = answer_question(explain, data.case, options["explain"], jobs=jobs, progress=progress)
+    choices = explained.choices if explained else []
     replays = replay_solutions(data, explained, progress) if "causes" in sections else []
     answers = {
         name: answer_question(compute, data.case, options[name], jobs=jobs, progress=progress)
@@ -277,6 +285,9 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         "title": data.case.study.title,
         "anchor": data.anchor(),
         "replays": replays,
+        "limits": None,
+        "failures": [describe_failure(data, failure) for failure in choices],
+        "picture": _picture("failure", data.draw_failure(choices[0])) if choices and "verdict" in sections else None,
         "different": different,
         "agreement": describe_agreement(data.case.study),
         "no_verdict": why_no_verdict(data.system),

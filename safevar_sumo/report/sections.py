@@ -21,7 +21,7 @@ from safevar_sumo.analysis.model_spread import compute_model_spreads
 from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.tolerance.answer import Tolerance
-from safevar_sumo.analysis.words import number_of, points_in_words
+from safevar_sumo.analysis.words import number_of, points_in_words, question_command
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, JsonObject, Outcome
@@ -43,19 +43,24 @@ NO_VALUE = "–"  # noqa: RUF001
 
 
 def make_verdict(data: ReportInput, explained: Explained | None, tolerance: Tolerance | None) -> JsonObject:
-    """The verdict: the sentences of `explain`, key figures, and the failures that they name."""
+    """The verdict: the sentences of `explain`, key figures, and the commands that repeat the study and the failure."""
+    commands = [question_command(name, str(data.directory), data.point) for name in ("explain", "tolerance")]
     if explained is None:
-        return {"sentences": ["No solution was found."], "is_bad": False, "key_figures": [], "failures": []}
+        return {"sentences": ["No solution was found."], "is_bad": False, "key_figures": [], "commands": commands}
     sentences = [explained.no_verdict] if explained.no_verdict else verdict_in_words(explained)
+    if explained.choices and explained.choices[0].handle:
+        simulate = question_command("simulate", str(data.directory), data.point)
+        commands.append(f"{simulate} --solution {explained.choices[0].name} --plot it.png")
     return {
         "sentences": [*sentences, counts_in_words(explained)],
         "is_bad": explained.failures > 0,
         "key_figures": _key_figures(data, explained, tolerance),
-        "failures": [_describe_failure(data, failure) for failure in explained.choices],
+        "commands": commands,
     }
 
 
-def _describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
+def describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
+    """A failure that the verdict names: its effect, size and changes."""
     setting, matrix = np.array(list(failure.setting.values())), data.system.matrix
     largest = float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
     return {
@@ -305,4 +310,4 @@ def describe_limits(data: ReportInput, explained: Explained | None) -> JsonObjec
         degrees = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]
         spreads = compute_model_spreads(case.study, np.stack(settings), data.point)
         spread = list(zip(("original vehicle", *handles), degrees, spreads, strict=True))
-    return {"general_limits": GENERAL_LIMITS, "remarks": remarks, "published": published, "spread": spread}
+    return {"remarks": remarks, "published": published, "spread": spread}

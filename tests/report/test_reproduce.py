@@ -27,7 +27,7 @@ def first_command(study: Study) -> list[str]:
     one: Any = SimpleNamespace(
         directory=Path("its results"), point="", later_changes=(), case=SimpleNamespace(study=study, has_runs=True)
     )
-    return shlex.split(commands_to_reproduce([one], [])[0][1])
+    return shlex.split(commands_to_reproduce([one], [], paper=True)[0][1])
 
 
 @pytest.mark.parametrize("changes", [{"name": "pilot"}, {"step_length": 0.02}])
@@ -53,7 +53,7 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
     monkeypatch.setattr(report_input, "SAMPLED_VEHICLES", 300)
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
-    page = make_report([place], jobs=2)
+    page = make_report([place], paper=True, jobs=2)
     commands_of_page = [shlex.split(html.unescape(line)) for line in re.findall("<code>(python -m .*?)</code>", page)]
     printed = {typed[3]: typed[3:] for typed in commands_of_page}
     assert {"explain", "tolerance", "risk", "rules", "simulate", "tables", "figures"} <= set(printed)
