@@ -1,17 +1,33 @@
-"""Commands that hand results on: `export` for other simulators."""
+"""Commands that hand results on: `export` to other simulators, `evidence` to a reader, who runs `verify`."""
 
 from __future__ import annotations
 
+from collections import Counter
+from hashlib import file_digest
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
+from rich.console import Console
 
-from safevar_sumo.cli.arguments import as_it_is_now_option, load_target, point_option
-from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.arguments import (
+    as_it_is_now_option,
+    check_output,
+    directories_argument,
+    jobs_option,
+    json_option,
+    load_target,
+    point_option,
+)
+from safevar_sumo.cli.program import commands, print_json
 from safevar_sumo.errors import InputError
 from safevar_sumo.sumo.matrix import system_at_point
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import WholeTable, open_progress, print_text
+
+if TYPE_CHECKING:
+    from safevar_sumo.report.verification import Verification
 
 
 @commands.command()
@@ -37,3 +53,77 @@ def export(directory: str, solution: str, point: str | None, to: str, out: Path)
     comparison = compare_setting(subject.study, at_point, np.array(subject.setting))
     files.export(comparison, to, out, solution, physics)
     click.echo(f"{to}: {out}")
+
+
+@commands.command()
+@directories_argument
+@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="PACK.zip", help="The pack to write.")
+@click.option("--explain", "questions", flag_value="explain", multiple=True, help="With the causes of failures.")
+@click.option("--tolerance", "questions", flag_value="tolerance", multiple=True, help="With the tolerances.")
+@click.option("--risk", "questions", flag_value="risk", multiple=True, help="With the share of unsafe vehicles.")
+@click.option("--rating", "questions", flag_value="rating", multiple=True, help="With the rating, of a rated study.")
+@click.option("--digests-only", is_flag=True, help="Leave your code and files out; the pack then has their digests.")
+@jobs_option
+def evidence(
+    directories: tuple[str, ...], out: Path, questions: tuple[str, ...], digests_only: bool, jobs: int | None
+) -> None:
+    """Pack results DIR... with their study, answers and dossier, so that anybody can make every number again."""
+    from safevar_sumo.report.evidence import Maker
+    from safevar_sumo.report.pack import write_pack
+
+    check_output(out, "--out", (".zip",))
+    with open_progress(True) as progress:
+        maker = Maker(questions, digests_only, jobs, progress)
+        description = maker.make(directories)
+    write_pack(out, description, maker.files)
+    click.echo(f"Evidence: {out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {file_digest_of(out)})")
+
+
+@commands.command()
+@click.argument("pack", type=click.Path(path_type=Path), metavar="PACK.zip")
+@click.option("--sample", type=click.IntRange(1), metavar="N", help="Only N claims, drawn at random.")
+@click.option("--search", is_flag=True, help="Repeat the whole search, too.")
+@click.option("--run-code", is_flag=True, help="Let user code of the pack run.")
+@jobs_option
+@json_option
+def verify(pack: Path, sample: int | None, search: bool, run_code: bool, jobs: int | None, as_json: bool) -> None:
+    """Make every claim of a pack of evidence again and compare: exit code 0 if all are the same, else 1."""
+    from safevar_sumo.report import verification
+
+    with open_progress(True) as progress:
+        result = verification.verify(pack, sample, search=search, run_code=run_code, jobs=jobs, progress=progress)
+    if as_json:
+        print_json({"pack": str(pack), "sha256": file_digest_of(pack), **result.to_dict()})
+    else:
+        print_verification(Console(), result)
+    if result.count(verification.SAME) < len(result.claims):
+        click.get_current_context().exit(1)
+
+
+def file_digest_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+MAX_ROWS = 30
+"""Number of claims that differ, of each kind, that the terminal shows."""
+
+
+def print_verification(console: Console, result: Verification) -> None:
+    """Print a row for each answer, a row for all the same solutions together, and a row for each that is not the
+    same.
+    """
+    table, number = WholeTable("study", "claim", "verdict", "in the pack", "here"), Counter[tuple[str, ...]]()
+    for claim in result.claims:
+        kind = (claim.study, f"{claim.claim.partition(' ')[0]}s", claim.verdict)
+        is_row = claim.claim.startswith(("solution ", "setting "))
+        number[kind] += is_row
+        if not is_row or (claim.verdict != "same" and number[kind] <= MAX_ROWS):
+            table.add_row(*claim)
+    for (study, kinds, verdict), count in number.items():
+        if count:
+            table.add_row(study, f"{count} {kinds} together", verdict, "", "")
+    console.print(table)
+    same, differ = result.count("same"), result.count("differs")
+    rest = len(result.claims) - same - differ
+    print_text(console, f"{len(result.claims)} claims: {same} same, {differ} differ, {rest} cannot be made here.")

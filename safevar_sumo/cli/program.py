@@ -38,6 +38,8 @@ COMMANDS_BY_GROUP = {
             "study",
             "Show the progress of a study running in another process: runs, front, collisions, time left.",
         ),
+        "evidence": ("evidence", "Pack results, answers and a dossier, so that anybody can make every number again."),
+        "verify": ("evidence", "Make every claim of a pack of evidence again, and compare."),
         "export": ("evidence", "Write a solution for CARLA, or as OpenSCENARIO and OpenDRIVE."),
         "check": (
             "catalogue",

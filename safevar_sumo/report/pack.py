@@ -1,0 +1,149 @@
+"""A pack of evidence: a zip archive of plain files, with a digest of each; reading one refuses what no pack holds."""
+
+from __future__ import annotations
+
+import stat
+import sys
+import zipfile
+import zlib
+from collections.abc import Mapping
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path, PurePosixPath
+from typing import Any, NoReturn
+
+import msgspec
+from msgspec import Struct
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.output import whole_file
+from safevar_sumo.results import RESULTS
+from safevar_sumo.results.manifest import PACKAGES, SIMULATORS
+
+FORMAT = 1
+DESCRIPTION = "pack.json"
+MAX_BYTES = 1_000_000_000
+"""Largest size of a pack's files together, unpacked."""
+MAX_FILES = 10_000
+PACK = "a file that the command `evidence` has written, unchanged"
+"""What an error about a pack expects."""
+
+
+class PackedAnswer(Struct, frozen=True, forbid_unknown_fields=True):
+    """An answer's question, the options with which it was computed, and the command that prints the same bytes."""
+
+    question: str
+    options: dict[str, Any]
+    command: str
+
+
+class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
+    """One results directory in a pack: its folder there, what its search found, its answers, the runs that have ended,
+    and the names of the user's files.
+    """
+
+    folder: str
+    name: str
+    counts: dict[str, int]
+    answers: list[PackedAnswer]
+    runs: list[tuple[str, int]]
+    code: list[str]
+
+
+class Description(Struct, frozen=True, forbid_unknown_fields=True):
+    """The file `pack.json`: versions, studies, and the digest of every other file; `digest` is that of this file's own
+    content.
+    """
+
+    format: int
+    results: int
+    versions: dict[str, str]
+    digests_only: bool
+    studies: list[PackedStudy]
+    contents: dict[str, str] = {}
+    digest: str = ""
+
+
+def describe(studies: list[PackedStudy], digests_only: bool) -> Description:
+    """The description of studies packed by this version."""
+    versions = {**{name: version(name) for name in PACKAGES}, "python": sys.version.split()[0]}
+    return Description(FORMAT, RESULTS, versions, digests_only, studies)
+
+
+def write_pack(path: Path, description: Description, files: Mapping[str, bytes]) -> None:
+    """Write a pack; equal contents give equal bytes."""
+    contents = {name: sha256(files[name]).hexdigest() for name in sorted(files)}
+    described = msgspec.structs.replace(description, contents=contents, digest="")
+    described = msgspec.structs.replace(described, digest=_digest(described))
+    texts = {DESCRIPTION: msgspec.json.format(msgspec.json.encode(described), indent=1) + b"\n", **files}
+    with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
+        for name in sorted(texts):
+            entry = zipfile.ZipInfo(name)  # of 1980, on every day
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            archive.writestr(entry, texts[name])
+
+
+def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
+    """Read a pack into memory.
+
+    Raises
+    ------
+    InputError
+        If the file is no pack, damaged, too large, written by another version, or holds paths that leave it.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_entries(path, archive.infolist())
+            files = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror or error}", PACK) from None
+    except (zipfile.BadZipFile, ValueError, RuntimeError, NotImplementedError, EOFError, zlib.error) as error:
+        _refuse(path, f"is no zip archive, or damaged: {error}")
+    if DESCRIPTION not in files:
+        _refuse(path, f"holds no {DESCRIPTION}")
+    try:
+        described = msgspec.json.decode(files.pop(DESCRIPTION), type=Description)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        _refuse(path, f"{DESCRIPTION} is damaged: {error}")
+    _check_version(path, described)
+    if described.digest != _digest(described):
+        _refuse(path, f"{DESCRIPTION} was changed: its digest differs")
+    for name in sorted({*described.contents, *files}):
+        if name not in files or described.contents.get(name) != sha256(files[name]).hexdigest():
+            problem = "is missing" if name not in files else "was changed: its digest differs"
+            _refuse(path, f"{name} {problem if name in described.contents else 'does not belong to the pack'}")
+    return described, files
+
+
+def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse entries before any of them is unpacked."""
+    names = [entry.filename for entry in entries]
+    for entry in entries:
+        name = entry.filename
+        if name.startswith("/") or ".." in PurePosixPath(name).parts or "\\" in name or ":" in name:
+            _refuse(path, f"the path {name!r} leaves the pack")
+        if stat.S_ISLNK(entry.external_attr >> 16):
+            _refuse(path, f"{name!r} is a symbolic link")
+    if len(names) > MAX_FILES or len(names) != len(set(names)):
+        _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
+    if (size := sum(entry.file_size for entry in entries)) > MAX_BYTES:
+        _refuse(path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_BYTES / 1e9:g} are allowed")
+
+
+def _check_version(path: Path, described: Description) -> None:
+    here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
+    other = [f"{name} {described.versions.get(name)}" for name in here if described.versions.get(name) != here[name]]
+    if other or (described.format, described.results) != (FORMAT, RESULTS):
+        raise InputError(
+            path,
+            f"was made with {', '.join(other) or f'format {described.format} and results {described.results}'}",
+            f"a pack of this version: {', '.join(f'{name} {number}' for name, number in here.items())}",
+        )
+
+
+def _digest(described: Description) -> str:
+    return sha256(msgspec.json.encode(msgspec.structs.replace(described, digest=""))).hexdigest()
+
+
+def _refuse(path: Path, problem: str) -> NoReturn:
+    raise InputError(path, problem, PACK)

@@ -1,0 +1,296 @@
+"""Packs of evidence: every claim is made again, and whatever was changed in one is named."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from safevar_sumo.report import pack as packs
+from safevar_sumo.report.pack import DESCRIPTION, Description, read_pack, write_pack
+from safevar_sumo.results import load_runs
+from tests.in_process import refused, run
+
+MINE = """
+from pathlib import Path
+from safevar_sumo.ads import ScalarAds
+
+
+class Mine(ScalarAds):
+    def __init__(self, limits):
+        self.gap = float(Path(limits).read_text())
+
+    def drive(self, seen):
+        return (0.0, 1.0) if seen.gap < self.gap else (0.4, 0.0)
+"""
+STUDY = """
+extends = "smoke"
+name = "mine"
+[ads]
+model = "mine:Mine"
+parameters = { limits = "limits.txt" }
+[search]
+algorithms = ["rs"]
+population = 5
+evaluations = 20
+runs = 1
+"""
+
+
+@pytest.fixture(scope="module")
+def pack(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("pack") / "pack.zip"
+    run("evidence", str(slippery), "--out", str(out), "--explain")
+    return out
+
+
+@pytest.fixture(scope="module")
+def bare(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A pack without answers."""
+    out = tmp_path_factory.mktemp("bare") / "bare.zip"
+    run("evidence", str(slippery), "--out", str(out))
+    return out
+
+
+@pytest.fixture
+def mine(in_tmp: Path) -> Path:
+    """Results of a study with user code, which reads a file."""
+    (in_tmp / "there").mkdir()
+    for name, text in {"mine.py": MINE, "mine.toml": STUDY, "limits.txt": "6.0"}.items():
+        (in_tmp / "there" / name).write_text(text)
+    return searched_here(in_tmp / "there")
+
+
+def searched_here(folder: Path) -> Path:
+    run("study", str(folder / "mine.toml"), "--out", str(folder / "results"), "--quiet", "--jobs", "1")
+    return folder / "results"
+
+
+def changed(source: Path, target: Path, name: str, change: Callable[[str], str], *, sealed: bool = True) -> str:
+    """Change a file of a pack, by default with new digests; returns the path of the changed pack."""
+    description, files = read_pack(source)
+    if name == DESCRIPTION:
+        text = msgspec.json.encode(description).decode()
+        assert change(text) != text
+        write_pack(target, msgspec.json.decode(change(text), type=Description), files)
+        return str(target)
+    (path,) = [path for path in files if path.endswith(name)]
+    before = files[path].decode()
+    assert change(before) != before
+    if sealed:
+        write_pack(target, description, {**files, path: change(before).encode()})
+        return str(target)
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for entry in old.infolist():
+            new.writestr(entry, change(before) if entry.filename == path else old.read(entry))
+    return str(target)
+
+
+def digit_of(pattern: str) -> Callable[[str], str]:
+    """A change of the last digit of what the pattern's group matches first."""
+
+    def change(text: str) -> str:
+        match = re.search(pattern, text)
+        assert match is not None, pattern
+        end = match.end(1)
+        return f"{text[: end - 1]}{(int(text[end - 1]) + 1) % 10}{text[end:]}"
+
+    return change
+
+
+def not_same(*arguments: str) -> list[dict[str, str]]:
+    """The claims that `verify` does not find the same; it must end with exit code 1."""
+    result = json.loads(run("verify", *arguments, "--json", expect=1).stdout)
+    assert result["same"] < result["claims"]
+    return [claim for claim in result["table"] if claim["verdict"] != "same"]
+
+
+@pytest.mark.slow
+def test_every_claim_is_the_same_in_another_folder(pack: Path, slippery: Path, in_tmp: Path) -> None:
+    result = json.loads(run("verify", str(pack), "--json").stdout)
+    solutions = len(load_runs(slippery).solutions)
+    assert result["claims"] == result["same"] == len(result["table"])
+    names = [claim["claim"] for claim in result["table"]]
+    assert sum(name.startswith("solution ") for name in names) == solutions
+    assert "answer explain" in names
+    assert any(name.startswith("setting explain.") for name in names)
+
+
+@pytest.mark.slow
+def test_the_packed_answer_has_the_bytes_that_its_command_prints(pack: Path, slippery: Path) -> None:
+    description, files = read_pack(pack)
+    (study,) = description.studies
+    (answer,) = study.answers
+    assert answer.command == "python -m safevar_sumo explain results/slippery --json"
+    printed = run(*answer.command.replace("results/slippery", str(slippery)).split()[3:]).stdout
+    assert files[f"{study.folder}/answers/explain.json"].decode() == printed
+
+
+@pytest.mark.slow
+def test_a_changed_claim_differs(pack: Path, tmp_path: Path) -> None:
+    path = changed(pack, tmp_path / "it.zip", "explain.json", digit_of(r'"robustness": 0\.(\d+)'))
+    (claim,) = not_same(path)
+    assert claim["claim"] == "answer explain"
+    assert "robustness" in claim["packed"]
+    assert "robustness" in claim["here"]
+    path = changed(pack, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"limit":(\d+)'))
+    assert {claim["claim"] for claim in not_same(path)} == {"answer explain"}
+
+
+def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: Path) -> None:
+    run("evidence", str(slippery), "--out", str(tmp_path / "again.zip"))
+    assert bare.read_bytes() == (tmp_path / "again.zip").read_bytes()
+
+
+def test_a_changed_solution_differs_and_is_named(bare: Path, tmp_path: Path) -> None:
+    path = changed(bare, tmp_path / "it.zip", "solutions.csv", digit_of(r"\n(?:[^,]*,){14}-?\d+\.(\d+)"))
+    (claim,) = not_same(path)
+    assert claim["claim"] == "solution nsga2:0:0"
+    assert claim["packed"].split()[0] == claim["here"].split()[0] == "f_safe"
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "claims"),
+    [
+        ("study.toml", r"tyre_friction = 0\.(\d+)", {"study"}),
+        pytest.param("manifest.json", r'"results": (\d)', {"inputs"}, marks=pytest.mark.slow),
+        ("manifest.json", r'"f_num_diff": (\d)', {"original vehicle"}),
+        pytest.param(DESCRIPTION, r'"solutions":(\d+)', {"number of solutions and runs"}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_changed_digit_differs_and_is_named(
+    bare: Path, tmp_path: Path, name: str, pattern: str, claims: set[str]
+) -> None:
+    assert {claim["claim"] for claim in not_same(changed(bare, tmp_path / "it.zip", name, digit_of(pattern)))} == claims
+
+
+def test_digits_beyond_the_last_bit_are_damage(bare: Path, tmp_path: Path) -> None:
+    path = changed(
+        bare, tmp_path / "it.zip", "manifest.json", lambda text: text.replace(".5,", ".5000000000000000001,", 1)
+    )
+    refused("verify", path, message=("1-slippery is damaged", "manifest.json was edited"))
+
+
+@pytest.mark.slow
+def test_a_changed_study_is_another_study_throughout(bare: Path, tmp_path: Path) -> None:
+    change = digit_of(r'"tyre_friction": 0\.(\d)')
+    claims = not_same(changed(bare, tmp_path / "it.zip", "manifest.json", change))
+    assert {"inputs", "study"} <= {claim["claim"] for claim in claims}
+    (named,) = [claim for claim in claims if claim["claim"] == "inputs"]
+    assert "tyre_friction" in named["here"]
+
+
+@pytest.mark.parametrize("name", ["solutions.csv", "study.toml", "manifest.json"])
+def test_a_change_without_new_digests_is_damage(bare: Path, tmp_path: Path, name: str) -> None:
+    path = changed(bare, tmp_path / "it.zip", name, digit_of(r"\.(\d+)"), sealed=False)
+    refused("verify", path, message=(path, f"{name} was changed", "expected"))
+
+
+def test_packs_of_other_versions_and_missing_files_are_refused(bare: Path, tmp_path: Path) -> None:
+    path = changed(bare, tmp_path / "it.zip", DESCRIPTION, lambda text: text.replace('"libsumo":"', '"libsumo":"0.'))
+    refused("verify", path, message=(path, "made with libsumo 0.", "a pack of this version"))
+    path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"format":(\d+)'))
+    refused("verify", path, message=(path, "made with format"))
+    with zipfile.ZipFile(bare) as old, zipfile.ZipFile(tmp_path / "less.zip", "w") as new:
+        for entry in old.infolist()[:-2]:
+            new.writestr(entry, old.read(entry))
+    refused("verify", str(tmp_path / "less.zip"), message=("less.zip", "holds no pack.json"))
+    with zipfile.ZipFile(tmp_path / "more.zip", "w") as new, zipfile.ZipFile(bare) as old:
+        for entry in old.infolist():
+            new.writestr(entry, old.read(entry))
+        new.writestr("extra.py", "import os")
+    refused("verify", str(tmp_path / "more.zip"), message=("extra.py does not belong to the pack",))
+    refused("verify", str(tmp_path / "none.zip"), message=("none.zip", "cannot be read", "evidence"))
+
+
+@pytest.mark.parametrize("name", ["../out.py", "/tmp/out.py", "a/../../out.py", "C:\\out.py"])
+def test_paths_that_leave_the_pack_are_refused(in_tmp: Path, name: str) -> None:
+    with zipfile.ZipFile("it.zip", "w") as archive:
+        archive.writestr(name, "x")
+    refused("verify", "it.zip", message=("it.zip", "leaves the pack"))
+    assert os.listdir() == ["it.zip"]
+
+
+def test_links_bombs_and_other_files_are_refused(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = zipfile.ZipInfo("link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile("link.zip", "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+    refused("verify", "link.zip", message=("'link' is a symbolic link",))
+    Path("text.zip").write_text("no archive")
+    refused("verify", "text.zip", message=("is no zip archive",))
+    zeros = bytes(10_000_000)
+    monkeypatch.setattr(packs, "MAX_BYTES", len(zeros) - 1)
+    with zipfile.ZipFile("bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("zeros", zeros)
+    refused("verify", "bomb.zip", message=("unpacked it has",))
+
+
+@pytest.mark.slow
+def test_ten_gigabytes_of_zeros_are_refused_at_once(in_tmp: Path) -> None:
+    with (
+        zipfile.ZipFile("bomb.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("zeros", "w", force_zip64=True) as file,
+    ):
+        for _ in range(10_000):
+            file.write(bytes(1_000_000))
+    refused("verify", "bomb.zip", message=("unpacked it has 10.0 GB, at most 1 are allowed",))
+
+
+def test_user_code_runs_only_when_told(mine: Path, in_tmp: Path) -> None:
+    run("evidence", str(mine), "--out", "it.zip")
+    for file in ("mine.py", "limits.txt"):
+        (mine.parent / file).unlink()
+    refused("verify", "it.zip", message=("would run code", "mine.py", "limits.txt", "--run-code"))
+    result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
+    assert result["same"] == result["claims"] > 4
+    path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
+    refused("verify", path, "--run-code", message=("code/limits.txt is not the file of the study's identity",))
+    assert sorted(os.listdir()) == ["it.zip", "other.zip", "there"]
+
+
+@pytest.mark.slow
+def test_a_pack_of_digests_holds_no_code(mine: Path, in_tmp: Path) -> None:
+    run("evidence", str(mine), "--out", "it.zip", "--digests-only")
+    with zipfile.ZipFile("it.zip") as archive:
+        assert not any("mine.py" in name or "limits" in name for name in archive.namelist())
+    claims = not_same("it.zip", "--run-code")
+    assert {claim["verdict"] for claim in claims} == {"cannot be made here"}
+    assert all("mine.py" in claim["here"] for claim in claims)
+
+
+def test_a_study_that_names_code_outside_the_pack_is_user_code_too(bare: Path, tmp_path: Path) -> None:
+    path = changed(
+        bare,
+        tmp_path / "it.zip",
+        "manifest.json",
+        lambda text: re.sub(r'("ads": \{\s*"model": )"\w+"', r'\1"antigravity:fly"', text, count=1),
+    )
+    refused("verify", path, message=("ads.model = 'antigravity:fly'", "--run-code"))
+
+
+def test_a_sample_of_the_claims(bare: Path) -> None:
+    assert "5 claims: 5 same, 0 differ, 0 cannot be made here." in run("verify", str(bare), "--sample", "5").stdout
+    assert json.loads(run("verify", str(bare), "--sample", "3", "--json").stdout)["claims"] == 3
+
+
+@pytest.mark.slow
+def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
+    result = json.loads(run("verify", str(bare), "--search", "--json").stdout)
+    assert result["table"][-1]["claim"] == "search"
+    assert result["same"] == result["claims"]
+    path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"evaluations":(\d+)'))
+    assert [claim["claim"] for claim in not_same(path, "--search")] == ["search"]
+
+
+def test_bad_input_is_refused(slippery: Path, tmp_path: Path) -> None:
+    refused("evidence", str(slippery), "--out", str(tmp_path / "it.tar"), message=("--out", "it.tar", ".zip"))
+    refused("evidence", str(tmp_path), "--out", str(tmp_path / "it.zip"), message=("is not a results directory",))
+    assert not list(tmp_path.iterdir())
