@@ -1,3 +1,5 @@
+from .analysis.compare import compare as compare
+from .analysis.compare.answer import SystemComparison as SystemComparison
 from .analysis.explain import explain as explain
 from .analysis.explain.causes import Cause as Cause
 from .analysis.explain.result import Explained as Explained, Explanation as Explanation
@@ -21,7 +23,7 @@ from .errors import InputError as InputError, SafevarError as SafevarError, Simu
 from .metrics import Criterion as Criterion, Unsafe as Unsafe
 from .records import Outcome as Outcome
 from .replay.animation import animate as animate
-from .replay.comparison import Comparison as Comparison, compare as compare
+from .replay.comparison import Comparison as Comparison, compare_with_original as compare_with_original
 from .replay.figure import draw_comparison as draw_comparison
 from .replay.gui import show_in_gui as show_in_gui
 from .report import make_report as make_report, report as report

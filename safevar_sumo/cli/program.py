@@ -52,6 +52,10 @@ COMMANDS_BY_GROUP = {
             "questions",
             "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
         ),
+        "compare": (
+            "questions",
+            "Compare two studies or results: what is unsafe in one of them only, limits, ratings.",
+        ),
         "tables": ("report", "Answer the research questions as tables."),
         "figures": ("report", "Draw the figures of results."),
     },

@@ -1,15 +1,17 @@
-"""Commands that simulate many settings to answer a question: explain, opinion, tolerance, risk, rules, rating."""
+"""Commands that simulate many settings to answer a question, such as explain, tolerance, risk and compare."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
+from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
@@ -184,6 +186,26 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
     if as_json and result.remark:
         print_note(result.remark)
     return _show(result, as_json)
+
+
+@add_question(
+    CompareOptions,
+    "A",
+    click.argument("other", metavar="B"),
+    file_option("--plot", "Draw safety degrees and limits of both to this file: png, pdf or svg."),
+)
+def compare(
+    source: str, other: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
+) -> Any:
+    """Compare two systems, A and B, studies or results directories: simulate the same settings in both, and say which
+    are unsafe in one of them only.
+    """
+    from safevar_sumo.analysis.compare.compute import compare_systems
+
+    subjects = [load_results_or_study(one, point) for one in (source, other)]
+    check_output(plot, "--plot")
+    compute = partial(compare_systems, other=subjects[1])
+    return _show(answer_question(compute, subjects[0], CompareOptions(**values), jobs=jobs), as_json, plot)
 
 
 @commands.command(name="rating")

@@ -192,7 +192,7 @@ def superscript_powers(text: str) -> str:
     return text.replace("^2", "²").replace("^3", "³")
 
 
-def compare(
+def compare_with_original(
     study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
 ) -> Comparison:
     """Simulate one setting beside the original vehicle, in this process; in a matrix, at the setting's worst point.

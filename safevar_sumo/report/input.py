@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
@@ -45,6 +46,7 @@ def page_options() -> JsonObject:
         ToleranceOptions(),
         RiskOptions(samples=SAMPLED_VEHICLES),
         RulesOptions(samples=SAMPLED_VEHICLES),
+        CompareOptions(),
     )
     return {options.question: options for options in all_options}
 

@@ -18,6 +18,7 @@ from urllib.parse import quote
 import pandas as pd
 from markupsafe import Markup
 
+from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.rating import RatingOptions
@@ -148,7 +149,7 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
 
 
 def commands_to_reproduce(
-    inputs: Sequence[ReportInput], questions: Sequence[str], *, paper: bool
+    inputs: Sequence[ReportInput], questions: Sequence[str], *, paper: bool, is_compared: bool
 ) -> list[tuple[str, str]]:
     """What the commands reproduce, and the commands that give the numbers of the page, which answers `questions`."""
     commands = []
@@ -169,9 +170,12 @@ def commands_to_reproduce(
             options = f"--most-severe --plot it.png --animate it.html{flag}"
             simulate = f"{PROGRAM_COMMAND} simulate {shlex.quote(directory)} {options}"
             commands.append(("A replay, with figure and animation", simulate))
+    directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
+    if is_compared:
+        flags = f" --point {shlex.quote(inputs[0].point)}" if inputs[0].point else ""
+        commands.append(("The comparison", f"{PROGRAM_COMMAND} compare {directories}{flags}"))
     if not paper:
         return commands
-    directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
     return [
         *commands,
         ("The tables of RQ1 to RQ3", f"{PROGRAM_COMMAND} tables {directories}"),
@@ -187,6 +191,7 @@ SECTIONS = {
     "tolerance": "Tolerances",
     "risk": "Share of unsafe vehicles",
     "rules": "Failure regions",
+    "compare": "The two systems compared",
     "questions": "Research questions",
     "trust": "Limits and trust",
     "reproduce": "How to reproduce every number",
@@ -219,12 +224,13 @@ def make_report(
         raise InputError(
             "point", "the research questions are about whole studies", "the page without them, or no `point`"
         )
-    sections = {
-        name: heading
-        for name, heading in SECTIONS.items()
-        if name in only or (not only and (paper or name != "questions"))
-    }
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
+    if len(inputs) != 2 and "compare" in only:
+        raise InputError("only", f"compare needs two results, and there are {len(inputs)}", "two results directories")
+    left_out = {*([] if paper else ["questions"]), *(["compare"] if len(inputs) != 2 else [])}
+    sections = {
+        name: heading for name, heading in SECTIONS.items() if name in only or (not only and name not in left_out)
+    }
     for data in inputs:
         for change in data.later_changes:
             warn(f"{data.directory}: {change}")
@@ -245,9 +251,12 @@ def make_report(
         title=f"Safety report: {names}",
         sections=sections,
         studies=data_of_studies,
+        comparison=_comparison_data(inputs, jobs, progress) if "compare" in sections else {},
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
-        commands=commands_to_reproduce(inputs, questions, paper=bool(cases)) if "reproduce" in sections else [],
+        commands=commands_to_reproduce(inputs, questions, paper=bool(cases), is_compared="compare" in sections)
+        if "reproduce" in sections
+        else [],
         general_limits=GENERAL_LIMITS,
         player=player_files(),
         js=_web_file("report.js"),
@@ -306,6 +315,24 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
             if name != "rules" and not result.to_frame().empty
         },
         **{name: make() for name, make in makers.items() if name in sections},
+    }
+
+
+def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: Progress) -> JsonObject:
+    """The page's data about two studies side by side; why they cannot be compared, if so."""
+    a, b = (data.case for data in inputs)
+    try:
+        result = answer_question(
+            partial(compare_systems, other=b), a, page_options()["compare"], jobs=jobs, progress=progress
+        )
+    except InputError as error:
+        return {"sentences": [f"{error.problem}."]}
+    return {
+        "sentences": [superscript_powers(part) for part in result.sentences() if isinstance(part, str)],
+        "figure": {
+            **_picture("compare", result.figure()),
+            "table": table_data(result.limits_frame().set_index("characteristic"), "Limits side by side"),
+        },
     }
 
 

@@ -1,0 +1,276 @@
+"""The answer on two systems: what is unsafe in one of them only, as JSON, table, sentences and a figure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from rich.table import Table
+
+from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, VERMILION, escape_dollars, new_figure
+from safevar_sumo.analysis.research_questions.answer import WEATHER, Answer
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
+from safevar_sumo.analysis.research_questions.tables import as_json
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
+from safevar_sumo.analysis.words import number_of, two_decimals
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
+from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.terminal import WholeTable, meanings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+VERDICTS = {"only_a_unsafe": "only A unsafe", "only_b_unsafe": "only B unsafe", "both": "both unsafe", "": "both safe"}
+"""Verdicts on a setting, by the key of their number in the JSON; the last has none."""
+SOURCES = {"a": "solutions of A", "b": "solutions of B", "sample": "common sample"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """One of the systems.
+
+    Attributes
+    ----------
+    evaluations
+        Of the compared settings.
+    limits
+        Scans of each characteristic alone, in the study's order.
+    points
+        The original's points in the rating; None unless both systems are rated.
+    """
+
+    study: Study
+    original: Evaluations
+    evaluations: Evaluations
+    limits: list[OneAtATimeScan]
+    points: float | None
+    no_verdict: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SystemComparison:
+    """The same settings in two systems, A and B.
+
+    Attributes
+    ----------
+    settings
+        One row for each setting: its values, its `source` (a key of `SOURCES`), and of solutions `algorithm`, `run`
+        and `solution`.
+    p, a12
+        The signed-rank test of the safety degree (of the points, if rated), paired by `test_unit`, and the probability
+        that it is greater in A than in B (Vargha and Delaney); None without pairs.
+    weather
+        The table `weather` of the research questions, if the systems differ in the weather alone.
+    """
+
+    a: Side
+    b: Side
+    unsafe: Unsafe
+    settings: pd.DataFrame
+    p: float | None
+    a12: float | None
+    test_unit: str
+    test_size: int
+    weather: pd.DataFrame | None
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def study(self) -> Study:
+        return self.a.study
+
+    @property
+    def no_verdict(self) -> str:
+        """Why simulations tell nothing about a driving system; empty if they do."""
+        return " ".join(dict.fromkeys(filter(None, (self.a.no_verdict, self.b.no_verdict))))
+
+    @property
+    def _limits(self) -> list[tuple[OneAtATimeScan, OneAtATimeScan]]:
+        """Both scans of each characteristic, in A's order."""
+        of_b = {one.characteristic.name: one for one in self.b.limits}
+        return [(one, of_b[one.characteristic.name]) for one in self.a.limits]
+
+    @cached_property
+    def _frame(self) -> pd.DataFrame:
+        columns: JsonObject = {}
+        for name, side in (("a", self.a), ("b", self.b)):
+            columns[f"outcome_{name}"] = side.evaluations.outcome
+            columns[f"{SAFETY_DEGREE}_{name}"] = side.evaluations.f_safe
+            columns[f"unsafe_{name}"] = self.unsafe.of(side.evaluations)
+        is_valid = self.a.evaluations.valid & self.b.evaluations.valid
+        return self.settings.assign(**columns)[is_valid].reset_index(drop=True)
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each setting that both systems could simulate.
+
+        Columns: those of `settings`, and for each system, with the suffix `_a` or `_b`, `outcome`, `safety_degree` [m,
+        or -m/s] and `unsafe`.
+        """
+        return self._frame.copy()
+
+    def counts(self, source: str = "") -> dict[str, int]:
+        """Number of different settings by verdict, in the order of `VERDICTS`; of one source, or of all."""
+        frame = self._frame[self._frame["source"] == source] if source else self._frame
+        frame = frame.drop_duplicates(list(self.study.vehicle.characteristics))
+        a, b = frame["unsafe_a"].astype(bool), frame["unsafe_b"].astype(bool)
+        return {name: int(where.sum()) for name, where in zip(VERDICTS, (a & ~b, b & ~a, a & b, ~a & ~b), strict=True)}
+
+    def to_dict(self) -> JsonObject:
+        """The JSON of `compare`."""
+        counts = self.counts()
+        answer: JsonObject = {
+            **driven_entry(self.no_verdict),
+            "a": self.a.study.name,
+            "b": self.b.study.name,
+            "criterion": str(self.unsafe),
+            "settings": sum(counts.values()),
+            **{name: count for name, count in counts.items() if name},
+            "p": self.p,
+            "a12": self.a12,
+            "limits": [
+                {"characteristic": a.characteristic.name, "unit": a.characteristic.unit, "a": a.safe, "b": b.safe}
+                for a, b in self._limits
+            ],
+        }
+        if self.original_differences:
+            answer["originals"] = {name: _original_facts(side) for name, side in (("a", self.a), ("b", self.b))}
+        if self.a.points is not None:
+            answer["rating"] = {"a": self.a.points, "b": self.b.points}
+        if self.weather is not None:
+            answer[WEATHER] = json.loads(as_json([Answer(WEATHER, self.weather, ())]))
+        return answer
+
+    @property
+    def original_differences(self) -> list[str]:
+        """How the original vehicles differ: in their values, and in what they do; empty if they do not."""
+        texts = []
+        for a, b in ((one.characteristic, other.characteristic) for one, other in self._limits):
+            if a.original != b.original:
+                texts.append(f"{a.name} {a.text(a.original)} in A, {b.text(b.original)}{b.suffix} in B")
+        a_facts, b_facts = ({**_original_facts(side), "values": None} for side in (self.a, self.b))
+        if a_facts != b_facts:
+            ends = (f"{facts['outcome']}, SD {two_decimals(facts[SAFETY_DEGREE])}" for facts in (a_facts, b_facts))
+            texts.append(" in A, ".join(ends) + " in B")
+        return texts
+
+    def __repr__(self) -> str:
+        counts = self.counts()
+        return (
+            f"<Comparison of {self.a.study.name} with {self.b.study.name}, unsafe {self.unsafe}: only in A "
+            f"{counts['only_a_unsafe']}, only in B {counts['only_b_unsafe']} of {sum(counts.values())} settings>"
+        )
+
+    def sentences(self) -> Iterator[str | Table]:
+        """What is unsafe in which system, the test, the limits side by side, and the rating."""
+        counts = self.counts()
+        yield f"A: {self.a.study.name}. B: {self.b.study.name}: {self.b.study.title}."
+        yield f"Unsafe: {self.unsafe.description}."
+        if self.original_differences:
+            yield f"The original vehicles differ: {'; '.join(self.original_differences)}."
+        yield (
+            f"Of {sum(counts.values())} settings, {counts['only_a_unsafe']} are unsafe in A only, "
+            f"{counts['only_b_unsafe']} in B only and {counts['both']} in both."
+        )
+        table = WholeTable("settings", right=("number", *VERDICTS.values()), title="The same settings in both systems")
+        for source, words in SOURCES.items():
+            if number := sum((of_source := self.counts(source)).values()):
+                table.add_row(words, str(number), *map(str, of_source.values()))
+        yield table
+        yield self._test_in_words()
+        frame = self.limits_frame()
+        limits = WholeTable(
+            frame.columns[0], right=frame.columns[1:], title="Limits of each alone, all others as in the original"
+        )
+        for row in frame.itertuples(index=False):
+            limits.add_row(*map(str, row))
+        yield limits
+        if self.a.points is not None and self.b.points is not None:
+            yield f"Rating of the original vehicles: {self.a.points:.2f} points in A, {self.b.points:.2f} in B."
+        if self.weather is not None:
+            yield self._weather_in_words(self.weather)
+        yield meanings(one.characteristic for one in self.a.limits)
+        failed = len(self.settings) - len(self._frame)
+        failures = (f"{number_of(failed, 'setting')} left out, which one of the systems could not simulate",)
+        yield from (f"note: {remark}." for remark in (*self.remarks, *(failures if failed else ())))
+
+    def limits_frame(self) -> pd.DataFrame:
+        """The limits side by side, as texts."""
+        rows = [
+            (
+                f"{both[0].characteristic.name} [{both[0].characteristic.unit}]",
+                *(f"{one.characteristic.original:g}" for one in both),
+                *("nowhere" if one.safe is None else "{:.5g} to {:.5g}".format(*one.safe) for one in both),
+            )
+            for both in self._limits
+        ]
+        return pd.DataFrame(rows, columns=["characteristic", "original A", "original B", "safe in A", "safe in B"])
+
+    def _test_in_words(self) -> str:
+        quantity = "safety degree" if self.a.points is None else "rating points"
+        pairs = number_of(self.test_size, self.test_unit)
+        if self.p is None or self.a12 is None:
+            return "There is no pair of results to test."
+        of_what = ", each with the mean of its solutions" if self.test_unit == "run" else " of the sample"
+        return (
+            f"{quantity.capitalize()}, paired over {pairs}{of_what}: p = {self.p:.2g} (signed ranks; "
+            f"{'' if self.p < ALPHA else 'not '}significant at {ALPHA:g}), A12 = {self.a12:.2f} "
+            f"({magnitude_of(self.a12)}; above 0.5: greater in A)."
+        )
+
+    def _weather_in_words(self, weather: pd.DataFrame) -> Table:
+        """The same numbers as `tables --rq weather`."""
+        names = weather[["setting", "other"]].iloc[0].to_list()
+        heads = [f"{quantity} {name}" for quantity in ("%", "rank", "increase", "decrease") for name in names]
+        table = WholeTable("characteristic", right=heads, title="What critical solutions change, as in tables")
+        for row in weather.drop(columns=["setting", "other", "difference"]).itertuples(index=False):
+            table.add_row(str(row[0]), *("-" if pd.isna(value) else f"{value:.4g}" for value in row[1:]))
+        return table
+
+    def figure(self) -> Figure:
+        """The safety degree of every setting in B over that in A, and each characteristic's limits side by side."""
+        title = f"A: {self.a.study.name}; B: {self.b.study.name} (unsafe: {self.unsafe})"
+        height = 2.4 + 0.28 * len(self.a.limits)
+        figure, ((points, bars),) = new_figure(title, rows=1, columns=2, size=(7.2, height))
+        frame = self._frame
+        a, b = (frame[f"unsafe_{side}"].to_numpy(dtype=bool) for side in "ab")
+        for mask, colour, label in zip(
+            (~a & ~b, a & b, a & ~b, b & ~a),
+            (GREY, SKY_BLUE, BLUE, VERMILION),
+            [VERDICTS[key] for key in ("", "both", "only_a_unsafe", "only_b_unsafe")],
+            strict=True,
+        ):
+            x, y = (frame[f"{SAFETY_DEGREE}_{side}"][mask] for side in "ab")
+            points.scatter(x, y, s=4, color=colour, label=label, linewidths=0, rasterized=True)
+        points.axline((0, 0), slope=1, color="black", linewidth=0.6)
+        points.set(xlabel="safety degree in A [m, below 0: -m/s]", ylabel="safety degree in B [m, below 0: -m/s]")
+        points.legend(fontsize=FONT - 1, markerscale=2)
+        limits = self._limits[::-1]
+        for row, both in enumerate(limits):
+            lower, width = both[0].characteristic.lower, both[0].characteristic.upper - both[0].characteristic.lower
+            for side, one, colour, shift in zip("AB", both, (BLUE, VERMILION), (0.2, -0.2), strict=True):
+                low, high = ((end - lower) / width for end in one.safe or (lower, lower))
+                label = f"safe in {side}" if row == 0 else ""
+                bars.barh(row + shift, high - low, left=low, height=0.36, color=colour, label=label)
+        names = [escape_dollars(one.characteristic.name) for one, _ in limits]
+        bars.set_yticks(np.arange(len(names)), names)
+        bars.set(xlabel="share of A's domain [-]")
+        bars.grid(visible=False, axis="y")
+        figure.legend(
+            *bars.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT
+        )
+        return figure
+
+
+def _original_facts(side: Side) -> JsonObject:
+    names = side.study.vehicle.characteristics
+    return {
+        "outcome": str(side.original.outcome[0]),
+        SAFETY_DEGREE: finite_or_none(side.original.f_safe[0]),
+        "values": {name: row.original for name, row in names.items()},
+    }

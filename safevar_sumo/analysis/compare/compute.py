@@ -1,0 +1,180 @@
+"""Simulates the same settings in two systems: all solutions of both, and a sample of their common domain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.compare import CompareOptions
+from safevar_sumo.analysis.compare.answer import Side, SystemComparison
+from safevar_sumo.analysis.evaluator import MAX_REJECTIONS, Evaluator, sobol_points
+from safevar_sumo.analysis.rating.compute import rate
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.changes import compare_weathers, find_weather_pairs
+from safevar_sumo.analysis.research_questions.statistics import compare_samples, fewest_runs, signed_rank_test
+from safevar_sumo.analysis.subject import study_in
+from safevar_sumo.analysis.tolerance.scans import scan
+from safevar_sumo.analysis.words import number_of
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import handles_of
+from safevar_sumo.study import SAFETY_DEGREE, Study
+
+SAMPLE = "sample"
+RUN_COLUMNS = ["source", "algorithm", "run"]
+
+
+def compare_systems(
+    subject: Study | Case, options: CompareOptions, evaluator: Evaluator, *, other: Study | Case
+) -> SystemComparison:
+    """Compare two systems by one criterion. The filter of small changes is not applied: its thresholds are a search's.
+
+    Raises
+    ------
+    InputError
+        If the systems have other characteristics or no common domain, or `unsafe` cannot be used for both.
+    SimulationError
+        If an original vehicle cannot be simulated.
+    """
+    subjects, evaluators = (subject, other), (evaluator, evaluator.for_study(study_in(other)))
+    sets = [one.characteristics for one in evaluators]
+    names = list(sets[0].names)
+    _require_same_characteristics(*(one.study for one in evaluators))
+    orders = [[names.index(name) for name in one.names] for one in sets]
+    lower = np.max([one.lower[np.argsort(order)] for one, order in zip(sets, orders, strict=True)], axis=0)
+    upper = np.min([one.upper[np.argsort(order)] for one, order in zip(sets, orders, strict=True)], axis=0)
+    if (lower > upper).any():
+        name = names[int(np.argmax(lower > upper))]
+        raise InputError(
+            evaluators[1].study.source,
+            f"{name}: the domains of the two studies do not overlap",
+            "studies with a common domain of each characteristic",
+        )
+    solutions = [
+        _solutions_of(source, one, names) for source, one in zip("ab", subjects, strict=True) if isinstance(one, Case)
+    ]
+    sample = pd.DataFrame(_common_sample(evaluators, orders, lower, upper, options.samples), columns=names)
+    settings = pd.concat([*solutions, sample.assign(source=SAMPLE)], ignore_index=True)
+    outside = ~((settings[names] >= lower) & (settings[names] <= upper)).all(axis=1)
+    settings = settings[~outside].reset_index(drop=True)
+    values = settings[names].to_numpy(dtype=float)
+    evaluations = [
+        one.evaluate(values[:, order], f"settings in {side}")
+        for one, order, side in zip(evaluators, orders, "AB", strict=True)
+    ]
+    originals = [one.evaluate_original() for one in evaluators]
+    unsafe = _criterion(options.unsafe, evaluators, evaluations, originals)
+    both_rated = all(is_rated(one.study) for one in evaluators)
+    p, a12, unit, number = _test(settings, evaluations, RATING_POINTS.name if both_rated else SAFETY_DEGREE)
+    columns = list(range(len(names)))
+    sides = [
+        Side(
+            study=one.study,
+            original=original,
+            evaluations=evaluated,
+            limits=scan(one, columns, unsafe),
+            points=rate(one, {}).original.points if both_rated else None,
+            no_verdict=one.no_verdict,
+        )
+        for one, original, evaluated in zip(evaluators, originals, evaluations, strict=True)
+    ]
+    left_out = number_of(int(outside.sum()), "solution")
+    return SystemComparison(
+        a=sides[0],
+        b=sides[1],
+        unsafe=unsafe,
+        settings=settings,
+        p=p,
+        a12=a12,
+        test_unit=unit,
+        test_size=number,
+        weather=_weather_table(subjects),
+        remarks=(f"{left_out} outside the other system's domain left out",) if outside.any() else (),
+    )
+
+
+def _require_same_characteristics(a: Study, b: Study) -> None:
+    units = [{name: row.unit for name, row in study.vehicle.characteristics.items()} for study in (a, b)]
+    if units[0] == units[1]:
+        return
+    ours, theirs = (
+        ", ".join(f"{name} [{unit}]" for name, unit in one.items() if another.get(name) != unit) or "none"
+        for one, another in (units, units[::-1])
+    )
+    raise InputError(
+        b.source,
+        f"cannot be compared: characteristics of {a.name!r} alone: {ours}; of {b.name!r} alone: {theirs}",
+        "studies with the same characteristics in the same units",
+    )
+
+
+def _solutions_of(source: str, case: Case, names: list[str]) -> pd.DataFrame:
+    """Settings of the solutions with the columns of `RUN_COLUMNS`, if there are runs, and `solution`, the handle."""
+    frame = case.solutions
+    kept = frame[[*names, *(name for name in RUN_COLUMNS if name in frame and case.has_runs)]]
+    return kept.assign(source=source, solution=list(map(str, handles_of(frame))))
+
+
+def _common_sample(
+    evaluators: tuple[Evaluator, Evaluator], orders: list[list[int]], lower: FloatArray, upper: FloatArray, number: int
+) -> FloatArray:
+    """`number` settings that cover the common domain evenly and satisfy the constraints of both studies; fewer where
+    hardly any do.
+    """
+    factor = 1
+    while True:
+        settings = lower + sobol_points(number * factor, len(lower), 0) * (upper - lower)
+        for evaluator, order in zip(evaluators, orders, strict=True):
+            if evaluator.region:
+                settings = settings[evaluator.region.feasible(settings[:, order])]
+        if len(settings) >= number or factor >= MAX_REJECTIONS:
+            return settings[:number]
+        factor *= 2
+
+
+def _criterion(
+    text: str | None,
+    evaluators: tuple[Evaluator, Evaluator],
+    evaluations: list[Evaluations],
+    originals: list[Evaluations],
+) -> Unsafe:
+    """The stated criterion, or the default of all vehicles of both systems, with the limit of the first original."""
+    if text is not None:
+        return next(iter([one.parse_criterion(text) for one in evaluators]))
+    original = originals[0]
+    if not all(is_rated(one.study) for one in evaluators):
+        metrics = {name: values for name, values in original.metrics.items() if name != RATING_POINTS.name}
+        original = replace(original, metrics=metrics)
+    return Unsafe.default_among(Evaluations.concatenate([*evaluations, originals[1]]), original)
+
+
+def _test(
+    settings: pd.DataFrame, evaluations: list[Evaluations], column: str
+) -> tuple[float | None, float | None, str, int]:
+    """The paired test and A12 of a metric, with the paired unit and its number: each run's mean over its solutions, or
+    each setting of the sample if there are fewer runs than the test needs.
+    """
+    frame = settings[[name for name in RUN_COLUMNS if name in settings]].assign(
+        **{side: one.column(column) for side, one in zip("ab", evaluations, strict=True)}
+    )
+    frame = frame[np.logical_and.reduce([one.valid for one in evaluations])].dropna(subset=["a", "b"])
+    pairs, unit = frame[frame["source"] == SAMPLE][["a", "b"]], "setting"
+    if "run" in frame:
+        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[["a", "b"]].mean()
+        if len(means) >= fewest_runs("RQ1"):
+            pairs, unit = means, "run"
+    a, b = pairs["a"].to_numpy(dtype=float), pairs["b"].to_numpy(dtype=float)
+    return signed_rank_test(a - b, 0.0).p_value, compare_samples(a, b).effect_size, unit, len(pairs)
+
+
+def _weather_table(subjects: tuple[Study | Case, Study | Case]) -> pd.DataFrame | None:
+    """The table `weather` of the research questions, if the systems differ in the weather alone."""
+    cases = [one for one in subjects if isinstance(one, Case)]
+    try:
+        return compare_weathers(*find_weather_pairs(cases)[0]) if len(cases) == 2 else None
+    except UnanswerableError:
+        return None
