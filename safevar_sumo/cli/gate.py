@@ -1,4 +1,6 @@
-"""The gate `--fail-if "KEY > X"`: a condition on a number of a command's own JSON; exit code 3 if it holds."""
+"""Gates, which end a command with exit code 3: `--fail-if "KEY > X"`, if this holds for a number of the command's own
+JSON; and what a command itself finds broken.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +18,8 @@ from safevar_sumo.cli.program import print_note
 from safevar_sumo.errors import InputError, unknown_name
 
 GATE_EXIT_CODE = 3
+FAILURES_KEY = "safevar_sumo.failures"
+"""Key of the sentences in a command's context that end it with this exit code."""
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
     "<=": operator.le,
@@ -42,7 +46,7 @@ class Condition(NamedTuple):
 
     def fulfilments(self, answer: Any) -> Iterator[str]:
         """A sentence for each number of the answer for which the condition holds; a note if no number is there."""
-        values = list(_values(answer, self.key.split("."), self.key))
+        values = _values(answer, self.key.split("."), self.key)
         if None in values or not values:
             print_note(f"--fail-if: {self.key} is {'undefined' if values else 'in no element'} here")
         for value in values:
@@ -59,24 +63,29 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _values(answer: Any, names: Sequence[str], key: str) -> Iterator[Any]:
+def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:
     """The values under names in the JSON; in a list, an element by its index, or all elements that have the name."""
-    if not names:
-        yield answer
-        return
-    name, *further = names
-    if isinstance(answer, list) and name.isdecimal():
-        if int(name) >= len(answer):
-            raise InputError("--fail-if", f"{key}: there is no element {name}", f"an index below {len(answer)}")
-        nearer = [answer[int(name)]]
-    else:
-        tables = [table for table in (answer if isinstance(answer, list) else [answer]) if isinstance(table, dict)]
-        nearer = [table[name] for table in tables if name in table]
-        if not nearer and answer != []:
+    values = [answer]
+    for name in names:
+        lists = [value for value in values if isinstance(value, list)]
+        if name.isdecimal() and lists:
+            if int(name) >= len(shortest := min(lists, key=len)):
+                problem = f"{key}: there is no element {name}"
+                raise InputError("--fail-if", problem, f"an index below {len(shortest)}")
+            values = [value[int(name)] for value in lists]
+            continue
+        elements = [element for value in values for element in (value if isinstance(value, list) else [value])]
+        tables = [element for element in elements if isinstance(element, dict)]
+        if elements and not any(name in table for table in tables):
             known = sorted({known for table in tables for known in table})
             raise unknown_name("--fail-if", f"{key}: the command's JSON has no {name!r} there", name, known)
-    for value in nearer:
-        yield from _values(value, further, key)
+        values = [table[name] for table in tables if name in table]
+    return values
+
+
+def fail(sentence: str) -> None:
+    """End the command with exit code 3 after its answer, and with this sentence."""
+    click.get_current_context().meta.setdefault(FAILURES_KEY, []).append(sentence)
 
 
 def gated(command: CommandFunction) -> CommandFunction:
@@ -86,7 +95,8 @@ def gated(command: CommandFunction) -> CommandFunction:
     def run(*arguments: Any, conditions: tuple[str, ...], **options: Any) -> None:
         parsed = [Condition.parse(text) for text in conditions]
         answer = command(*arguments, **options)
-        sentences = [sentence for condition in parsed for sentence in condition.fulfilments(answer)]
+        sentences = click.get_current_context().meta.get(FAILURES_KEY, [])
+        sentences += [sentence for condition in parsed for sentence in condition.fulfilments(answer)]
         for sentence in sentences:
             click.echo(f"failed: {sentence}", err=True)
         if sentences:

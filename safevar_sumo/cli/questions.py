@@ -34,7 +34,7 @@ from safevar_sumo.cli.arguments import (
     read_changes,
     split_names,
 )
-from safevar_sumo.cli.gate import gated
+from safevar_sumo.cli.gate import fail, gated
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
@@ -153,7 +153,10 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
 
     subject = load_results_or_study(source, point)
     check_output(plot, "--plot")
-    return _show(answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs), as_json, plot)
+    result = answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs)
+    for sentence in result.broken_limits:
+        fail(sentence)
+    return _show(result, as_json, plot)
 
 
 @add_question(

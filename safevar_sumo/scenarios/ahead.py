@@ -297,6 +297,10 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
         """NHTSA's pre-crash type."""
         return TESTS[self.test].pre_crash
 
+    def obstacle(self) -> str:
+        """The target, which moves in the vehicle's direction."""
+        return f"{super().obstacle()} ahead"
+
     @property
     def duration(self) -> float:
         """Length of a run [s]."""

@@ -241,6 +241,10 @@ class Scenario:
         """Remarks for the user on the scenario's parameters."""
         return []
 
+    def obstacle(self) -> str:
+        """What the vehicle hits in a collision, in words."""
+        return OBSTACLES.get(self.pre_crash, "what is in its way")
+
 
 SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
 """Dimensions of a test matrix that are the rows or columns of its tables."""
@@ -269,6 +273,18 @@ class PreCrash(StrEnum):
     LEAD_STOPPED = "lead vehicle stopped"
     LEAD_SLOWER = "lead vehicle moving at lower constant speed"
     LEAD_DECELERATING = "lead vehicle decelerating"
+
+
+OBSTACLES: Mapping[str, str] = {
+    PreCrash.PEDESTRIAN_AFTER_MANOEUVRE: "a crossing pedestrian",
+    PreCrash.PEDESTRIAN: "a pedestrian",
+    PreCrash.CYCLIST: "a cyclist",
+    PreCrash.STRAIGHT_PATHS: "a crossing vehicle",
+    PreCrash.LEAD_STOPPED: "a standing vehicle",
+    PreCrash.LEAD_SLOWER: "a slower vehicle ahead",
+    PreCrash.LEAD_DECELERATING: "a braking vehicle ahead",
+}
+"""What is in the way, by the pre-crash type."""
 
 
 def distance_in_words(scenario: Scenario, safety_degree: float) -> str:

@@ -237,6 +237,12 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         """NHTSA's pre-crash type."""
         return PRE_CRASH[self.parameter("target")]
 
+    def obstacle(self) -> str:
+        """The target, and where it comes from."""
+        target = self.parameter("target")
+        start = "behind a parked car" if self.parameter("hidden") else f"the {self.parameter('side')} side"
+        return f"{'an' if target == 'adult' else 'a'} {target} from {start}"
+
     @property
     def test_speed(self) -> float:
         """Speed that the vehicle holds until it brakes [m/s]."""

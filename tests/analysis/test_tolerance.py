@@ -16,7 +16,7 @@ from safevar_sumo import risk, rules, tolerance
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.rules.compute import Rule, Rules
-from safevar_sumo.analysis.tolerance import ToleranceOptions, compute
+from safevar_sumo.analysis.tolerance import ToleranceOptions, boxes
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.metrics import Unsafe
@@ -168,12 +168,12 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
         ("MIN_FACTOR", 1e-3),
         ("MAX_UNSAFE_SHARE", 0.03),
     ):
-        monkeypatch.setattr(compute, name, value)
+        monkeypatch.setattr(boxes, name, value)
     q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
     for seed in range(seeds):
         seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
         evaluator = Evaluator(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
-        result = compute.find_safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)), np.zeros((0, 2)))
+        result = boxes.find_safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)), np.zeros((0, 2)))
         wrong += result.unsafe_at_most < q
     assert 0 < wrong <= 0.05 * seeds
 

@@ -38,6 +38,17 @@ class ToleranceOptions(Options):
         ),
     )
     pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
+    limits: tuple[str, ...] = option(
+        (),
+        "A limit in the characteristic's unit, beside those of [limits] in STUDY: find how far all others may go then, "
+        "and end with exit code 3 if a limit is not kept; may be repeated.",
+        metavar='"NAME >= X"',
+        form="repeated",
+        python=(
+            'Limits such as `"treadDepth >= 3"`, in the unit of the characteristic, beside those of `[limits]` in the '
+            "study: all other characteristics get the largest box that is safe with these."
+        ),
+    )
 
 
 @document_options(ToleranceOptions)
@@ -47,6 +58,7 @@ def tolerance(
     unsafe: Criterion | None = None,
     characteristics: Sequence[str] | None = None,
     pairs: bool = ToleranceOptions.pairs,
+    limits: Sequence[str] = ToleranceOptions.limits,
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
@@ -13,11 +13,12 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.sentences import situation_in_words
 from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
 from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
+from safevar_sumo.analysis.tolerance.sheet import Ends, Failure, LimitRow, LimitsSheet
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import SAFETY_DEGREE, Limit, Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, constraints_in_words, meanings
@@ -26,6 +27,8 @@ from safevar_sumo.vehicles import Characteristic
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from safevar_sumo.analysis.tolerance.joint import JointLimits
 
 MAX_PAIRS = 12
 """Maximum number of pairs in the table."""
@@ -53,6 +56,9 @@ class SafeBox(NamedTuple):
 class Tolerance:
     """How far characteristics may go: each by itself (`alone`), two together (`pairs`, None if not requested), and all
     (`joint`).
+
+    `limits` are those that the user specified, `together` the box with them, None without limits or without a box;
+    `first_failures` are evaluations of what fails first beyond the limit of a characteristic, by name.
     """
 
     study: Study
@@ -62,6 +68,41 @@ class Tolerance:
     pairs: list[Pair] | None
     joint: SafeBox
     no_verdict: str = ""
+    limits: Mapping[str, Limit] = field(default_factory=dict)
+    together: JointLimits | None = None
+    first_failures: Mapping[str, Evaluations] = field(default_factory=dict)
+
+    @property
+    def sheet(self) -> LimitsSheet:
+        """The limits sheet."""
+        rows, original = [], self.original.settings
+        points = assemble(self.study).points
+        for scan, one in ((scan, scan.characteristic) for scan in self.alone):
+            together: Ends = (None, None)
+            if self.together is not None:
+                together = self.together.box[one.name]
+            elif self.joint.factor:
+                below, above = one.original - one.lower, one.upper - one.original
+                together = one.original - self.joint.factor * below, one.original + self.joint.factor * above
+            run = self.first_failures.get(one.name)
+            rows.append(
+                LimitRow(
+                    characteristic=one,
+                    alone=scan.safe or (None, None),
+                    together=together,
+                    specified=self.limits.get(one.name),
+                    together_is_safe=self.together is None or self.together.kept,
+                    first_failure=None
+                    if run is None
+                    else Failure.of(run, points, self.unsafe, alone=int((run.settings != original).sum()) == 1),
+                )
+            )
+        return LimitsSheet(self.study.name, rows)
+
+    @property
+    def broken_limits(self) -> list[str]:
+        """A sentence for each limit that is not kept."""
+        return [f"limit of {row.characteristic.name}: {row.verdict}" for row in self.sheet.rows if not row.kept]
 
     @property
     def unsafe_pairs(self) -> list[Pair]:
@@ -105,8 +146,15 @@ class Tolerance:
             index=pd.Index([scan.characteristic.name for scan in self.alone], name="characteristic"),
         ).reset_index()
 
-    def to_dict(self) -> JsonObject:
-        """The JSON of `tolerance`."""
+    def to_dict(self) -> JsonObject | list[JsonObject]:
+        """The JSON of `tolerance`; with limits a list that ends with the limits' records."""
+        record = self._to_record()
+        if not self.limits:
+            return record
+        joint = {"joint": None} if self.together is None else self.together.to_dict()
+        return [record, *self.sheet.to_dict(), joint]
+
+    def _to_record(self) -> JsonObject:
         return {
             "study": self.study.name,
             **driven_entry(self.no_verdict),
@@ -142,7 +190,12 @@ class Tolerance:
         yield table
         if len(worst) > MAX_PAIRS:
             yield f"... and {len(worst) - MAX_PAIRS} more (--json has all)."
-        yield from map(_losses_in_words, self.alone) if is_rated(self.study) else [self._box_in_words()]
+        yield self.sheet.table()
+        yield "\n".join(self.sheet.sentences())
+        if is_rated(self.study):
+            yield from map(_losses_in_words, self.alone)
+        else:
+            yield self._box_in_words() if self.together is None else self._together_in_words()
 
     def _box_in_words(self) -> str:
         box = self.joint
@@ -161,6 +214,20 @@ class Tolerance:
             f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
             f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of {which} are unsafe"
             f"{' or cannot be simulated' if box.failed else ''}."
+        )
+
+    def _together_in_words(self) -> str:
+        assert self.together is not None
+        box = self.together
+        confidence = f"with {100 * CONFIDENCE:.0f} % confidence at most {100 * box.at_most:.2f} %"
+        if not box.kept:
+            return (
+                f"The limits are not kept: {box.unsafe} of {box.samples} settings drawn at random within them, all "
+                f"other characteristics as in the original, are unsafe; {confidence} of all are."
+            )
+        return (
+            "With the specified limits, the limits with all others at theirs are the largest box by volume that was "
+            f"found. None of {box.samples} settings drawn at random in it is unsafe; {confidence} of all are."
         )
 
     def figure(self) -> Figure:

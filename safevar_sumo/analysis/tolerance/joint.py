@@ -1,0 +1,361 @@
+"""The largest box in which characteristics may vary together while some are held to limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from safevar_sumo.analysis.evaluator import Evaluator, Interval, sobol_points
+from safevar_sumo.analysis.tolerance.boxes import (
+    FIRST_SEARCH_POINTS,
+    STEP_BACK,
+    plan_test,
+    random_settings,
+    settings_in_box,
+)
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject
+from safevar_sumo.study import Limit
+
+PARTS, ROUNDS = 8, 3
+"""Parts into which each round divides an interval between a safe and an unsafe setting."""
+BALANCING_ROUNDS = 4
+"""Rounds that balance the sides of a box before its first search."""
+WIDER = 0.04
+"""Share of its domain by which a side of the box is widened in search of something unsafe."""
+SLAB_POINTS = 64
+"""Number of Sobol points, and of corners, at which the room beside a box is searched."""
+MAX_ROUNDS = 40
+"""Maximum number of times that a box is searched, and of tests of boxes."""
+LEAST_SHARE, BEYOND_REACH = 4 / PARTS**ROUNDS, 2.0
+"""A side that must shrink below this share of its extent cannot make a setting safe by itself; it counts as if it had
+to shrink by this multiple of its extent.
+"""
+SLIGHTLY_WIDER = 1.03
+"""Factor by which a box is wider than its boundary to see which side would make it safe again."""
+STAGE = "limits together"
+
+
+class JointLimits(NamedTuple):
+    """The largest box found by relative volume in which the characteristics of `fixed` reach their limits.
+
+    Of `samples` settings drawn at random in it, `unsafe` are unsafe, and `failed` could not be simulated; at most the
+    share `at_most` of all settings in it are unsafe or cannot be simulated, with 95 % confidence. `kept` is false if
+    settings within the limits are unsafe, all other characteristics as in the original; the box then leaves those no
+    room. It holds `known_unsafe_inside` unsafe solutions of results. `beyond` are unsafe settings, by the
+    characteristic that is just beyond the box, while all others are in it.
+    """
+
+    fixed: Mapping[str, Limit]
+    box: Mapping[str, Interval]
+    kept: bool
+    samples: int
+    unsafe: int
+    failed: int
+    at_most: float
+    known_unsafe_inside: int
+    beyond: Mapping[str, FloatArray]
+
+    def to_dict(self) -> JsonObject:
+        """The last record of `tolerance --limits --json`."""
+        fixed = {name: [limit.at_least, limit.at_most] for name, limit in self.fixed.items()}
+        box = {name: list(ends) for name, ends in self.box.items()}
+        rest = ("samples", "unsafe", "at_most", "known_unsafe_inside", "kept")
+        return {"joint": {"fixed": fixed, "box": box, **{key: getattr(self, key) for key in rest}}}
+
+
+@dataclass
+class _Search:
+    """The search for a box: its sides are extents below and above the original, shape (2, n), in the table's units.
+
+    `room` are the extents of the domain, `free` the sides that may move, `unsafe_found` unsafe settings that no box may
+    hold, and `corners` the corners that were unsafe in some box, as -1 or 1 for each characteristic.
+    """
+
+    evaluator: Evaluator
+    columns: Sequence[int]
+    unsafe: Unsafe
+    room: FloatArray
+    free: BoolArray
+    unsafe_found: FloatArray
+    corners: list[FloatArray] = field(default_factory=list)
+    searches: int = 0
+
+    @property
+    def original(self) -> FloatArray:
+        return self.evaluator.characteristics.original
+
+    def extents(self, settings: FloatArray) -> FloatArray:
+        """How far K settings lie below and above the original, shape (K, 2, n)."""
+        change = settings - self.original
+        return np.maximum(np.stack([-change, change], axis=1), 0.0)
+
+    def holds(self, sides: FloatArray, settings: FloatArray) -> BoolArray:
+        """Which settings a box holds; shape (K,)."""
+        return np.asarray((self.extents(settings) <= sides).all(axis=(1, 2)))
+
+    def find_unsafe(self, settings: FloatArray) -> FloatArray:
+        """Those of the settings that are unsafe; no later box holds one of them."""
+        found = settings[self.unsafe.of(self.evaluator.evaluate(settings, STAGE))]
+        self.unsafe_found = np.concatenate([self.unsafe_found, found])
+        return found
+
+    def corner_settings(self, sides: FloatArray, corners: Sequence[FloatArray]) -> FloatArray:
+        return np.array([self.original + np.where(corner > 0, sides[1], -sides[0]) for corner in corners])
+
+    def points(self, sides: FloatArray, number: int) -> FloatArray:
+        """Sobol points and as many corners of a box."""
+        self.searches += 1
+        seed = self.evaluator.study.search.seed + self.searches
+        sobol = sobol_points(number, len(self.columns), seed)
+        ends = self.original - sides[0], self.original + sides[1]
+        return settings_in_box(self.evaluator, self.columns, *ends, np.concatenate([np.round(sobol), sobol]))
+
+    def attack(self, sides: FloatArray) -> FloatArray:
+        """Unsafe settings of a box: at corners that were unsafe before, else wherever a search finds some."""
+        if self.corners and len(found := self.find_unsafe(self.corner_settings(sides, self.corners))):
+            return found
+        return self.find_unsafe(self.points(sides, FIRST_SEARCH_POINTS))
+
+    def boundary_factors(self, setting: FloatArray) -> FloatArray:
+        """By which factor each free side that an unsafe setting reaches must shrink to exclude it alone, shape (2, n);
+        1 where a side does not reach it. The settings there count as found.
+        """
+        sides, columns = np.nonzero((self.extents(setting[np.newaxis])[0] > 0) & self.free)
+        factors, rows = np.ones_like(self.room), np.arange(len(columns))
+        starts, low, high = np.tile(setting, (len(columns), 1)), np.zeros(len(columns)), np.ones(len(columns))
+        starts[rows, columns] = self.original[columns]
+        for _ in range(ROUNDS if len(columns) else 0):
+            shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(PARTS + 1) / PARTS
+            inner = starts[:, np.newaxis] + shares[:, 1:-1, np.newaxis] * (setting - starts)[:, np.newaxis]
+            evaluations = self.evaluator.evaluate(inner.reshape(-1, len(setting)), STAGE)
+            is_unsafe = self.unsafe.of(evaluations).reshape(len(columns), -1)
+            first = np.argmax(np.column_stack([is_unsafe, np.ones(len(columns), dtype=bool)]), axis=1)
+            low, high = shares[rows, first], shares[rows, first + 1]
+        factors[sides, columns] = high
+        edges = starts + high[:, np.newaxis] * (setting - starts)
+        self.unsafe_found = np.concatenate([self.unsafe_found, edges])
+        return factors
+
+    def without(self, sides: FloatArray, settings: FloatArray) -> FloatArray | None:
+        """The box without some settings, each excluded by the side that costs least volume; None if no side can."""
+        while len(inside := settings[self.holds(sides, settings)]):
+            extents = self.extents(inside)
+            widths = sides.sum(axis=0)
+            rest = widths - sides + STEP_BACK * extents
+            can = self.free & (extents > 0)
+            shares = np.where(can, np.divide(rest, widths, out=np.zeros_like(rest), where=widths > 0), -1.0)
+            best = shares.reshape(len(inside), -1).max(axis=1)
+            hardest = int(np.argmin(best))
+            if best[hardest] < 0:
+                return None
+            side = np.unravel_index(int(np.argmax(shares[hardest])), sides.shape)
+            sides = sides.copy()
+            sides[side] = STEP_BACK * extents[hardest][side]
+        return sides
+
+    def balanced(self, sides: FloatArray, corner: FloatArray) -> FloatArray:
+        """The box shrunk until one corner is safe, so that its sides share the loss as the largest box needs it.
+
+        Where safety is linear in each characteristic, the widths of the largest box are in proportion to the ways by
+        which single sides would have to shrink to make the corner safe alone.
+        """
+        used, opposite = self.free & np.stack([corner < 0, corner > 0]) & (sides > 0), sides[::-1]
+        widths, best, best_volume = sides + opposite, sides, -np.inf
+        for _ in range(BALANCING_ROUNDS):
+            inner, outer = self._corner_boundary(sides, np.where(used, widths, 0.0), used, corner)
+            volume = float(np.sum(np.log(np.maximum(inner.sum(axis=0), 1e-12)[used.any(axis=0)])))
+            if volume > best_volume:
+                best, best_volume = inner, volume
+            setting = self.corner_settings(outer, [corner])
+            if not len(self.find_unsafe(setting)):
+                break
+            factors = self.boundary_factors(setting[0])
+            ways = outer * np.where(factors > LEAST_SHARE, 1 - factors, BEYOND_REACH)
+            widths = np.where(ways > 0, ways, widths * (np.max(ways) / np.max(widths)))
+        return best
+
+    def _corner_boundary(
+        self, sides: FloatArray, widths: FloatArray, used: BoolArray, corner: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Two boxes within `sides` whose widths are in proportion to `widths` on the sides `used`: one whose corner is
+        safe, and one slightly wider than the narrowest that is not.
+        """
+        opposite = sides[::-1]
+
+        def box(share: float) -> FloatArray:
+            return np.where(used, np.clip(share * widths - opposite, 0.0, sides), sides)
+
+        ratio = np.divide(sides + opposite, widths, out=np.zeros_like(sides), where=used & (widths > 0))
+        low, high = 0.0, float(ratio.max())
+        for _ in range(ROUNDS):
+            shares = low + (high - low) * np.arange(1, PARTS + 1) / PARTS
+            settings = np.concatenate([self.corner_settings(box(share), [corner]) for share in shares])
+            is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
+            if not is_unsafe.any():
+                return box(high), box(high)
+            first = int(np.argmax(is_unsafe))
+            low, high = (float(shares[first - 1]) if first else low), float(shares[first])
+        return box(low * STEP_BACK), box(high * SLIGHTLY_WIDER)
+
+    def shrunk(self, sides: FloatArray) -> FloatArray | None:
+        """A box in which no search finds anything unsafe any more; None if the fixed sides alone are unsafe."""
+        rounds = 0
+        while len(found := self.attack(sides)):
+            rounds += 1
+            corner = np.where(found[0] < self.original, -1.0, 1.0)
+            if not any((corner == known).all() for known in self.corners):
+                self.corners.append(corner)
+                if self.unsafe.of(self.evaluator.evaluate(self.corner_settings(sides, [corner]), STAGE))[0]:
+                    sides = self.balanced(sides, corner)
+            inside = found[self.holds(sides, found)]
+            for setting in inside[:1]:
+                self.boundary_factors(setting)
+            smaller = self.without(sides, self.unsafe_found)
+            if smaller is None:
+                return None
+            sides = smaller if rounds < MAX_ROUNDS else np.where(self.free, smaller * (1 - WIDER), smaller)
+        return sides
+
+    def widened(self, sides: FloatArray) -> FloatArray:
+        """The box with each free side as wide as it can be: something unsafe or the domain's end is at most 5 % of the
+        domain away.
+        """
+        width = self.room.sum(axis=0)
+        for side in zip(*np.nonzero(self.free & (sides < self.room)), strict=True):
+            while sides[side] < self.room[side]:
+                wider = sides.copy()
+                wider[side] = min(sides[side] + WIDER * width[side[1]], self.room[side])
+                if self.holds(wider, self.unsafe_found).any():
+                    break
+                sign = 1.0 if side[0] else -1.0
+                slab = self.points(wider, SLAB_POINTS)
+                slab[:SLAB_POINTS, side[1]] = self.original[side[1]] + sign * wider[side]
+                corners = [corner for corner in self.corners if corner[side[1]] == sign]
+                settings = np.concatenate([self.corner_settings(wider, corners), slab]) if corners else slab
+                if len(self.find_unsafe(settings)):
+                    break
+                sides = wider
+        return sides
+
+    def beyond(self, sides: FloatArray) -> dict[str, FloatArray]:
+        """An unsafe setting for each characteristic that alone is beyond a box, by at most 5 % of its domain."""
+        found, width = dict[str, FloatArray](), self.room.sum(axis=0)
+        for side, column in zip(*np.nonzero(self.free & (sides < self.room)), strict=True):
+            wider = sides.copy()
+            wider[side, column] += 0.05 * width[column]
+            inside = self.unsafe_found[self.holds(wider, self.unsafe_found)]
+            if len(inside):
+                found.setdefault(self.evaluator.characteristics.names[column], inside[0])
+        return found
+
+
+def find_joint_limits(
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    unsafe: Unsafe,
+    limits: Mapping[str, Limit],
+    scans: Sequence[OneAtATimeScan],
+    unsafe_settings: FloatArray,
+    known: FloatArray,
+) -> JointLimits:
+    """The largest box by relative volume in which `columns` vary, and in which those of `limits` reach their limits.
+
+    The box holds none of `unsafe_settings`, shape (K, n), and none of the unsafe solutions of a search, `known`, shape
+    (L, n).
+
+    Notes
+    -----
+    The box begins with what is safe alone. Its unsafe corner tells by how much each side would have to shrink alone to
+    make it safe; sides in proportion to these losses give the largest box where safety is linear. A search then attacks
+    the box: at corners that were unsafe before, at Sobol points and at other corners. Each unsafe setting is excluded
+    by the side that costs least volume, until the search finds nothing. Sides that could go further are widened, and
+    the box is tested with independent settings as in `find_safe_box`, whose error probabilities hold here, too.
+    """
+    characteristics = evaluator.characteristics
+    domain = np.stack(
+        [characteristics.original - characteristics.lower, characteristics.upper - characteristics.original]
+    )
+    room, fixed = np.zeros_like(domain), np.zeros(domain.shape, dtype=bool)
+    room[:, list(columns)] = domain[:, list(columns)]
+    limited = room.copy()
+    for name, limit in limits.items():
+        column = characteristics.names.index(name)
+        for side, value in enumerate((limit.at_least, limit.at_most)):
+            if value is not None:
+                fixed[side, column], limited[side, column] = True, abs(value - characteristics.original[column])
+    search = _Search(evaluator, columns, unsafe, limited, ~fixed & (room > 0), np.concatenate([unsafe_settings, known]))
+    only_fixed = np.where(fixed, limited, 0.0)
+    sides: FloatArray | None = None
+    if not search.holds(only_fixed, search.unsafe_found).any() and not (
+        only_fixed.any() and len(search.attack(only_fixed))
+    ):
+        sides = search.without(limited, unsafe_settings)
+    if sides is not None:
+        margins = [scan.margins for scan in scans]
+        worst = np.ones(len(characteristics))
+        for column, (low, high) in zip(columns, margins, strict=True):
+            worst[column] = -1.0 if low is not None and (high is None or low < high) else 1.0
+        search.corners.append(worst)
+        if len(search.find_unsafe(search.corner_settings(sides, [worst]))):
+            sides = search.balanced(sides, worst)
+        sides = search.without(sides, search.unsafe_found)
+    seed, attempt = evaluator.study.search.seed, 0
+    while sides is not None and attempt < MAX_ROUNDS:
+        sides = search.shrunk(sides)
+        if sides is None:
+            break
+        wider = search.widened(sides)
+        if (wider != sides).any():
+            sides = search.shrunk(wider)
+            if sides is None:
+                break
+        attempt += 1
+        error_probability, samples = plan_test(attempt)
+        counts = _test(search, sides, samples, np.random.default_rng((seed, 1, attempt)))
+        if not counts[1]:
+            return _joint_limits(search, limits, sides, known, counts, error_probability, kept=True)
+    error_probability, samples = plan_test(attempt + 1)
+    counts = _test(search, only_fixed, samples, np.random.default_rng((seed, 1, attempt + 1)))
+    return _joint_limits(search, limits, only_fixed, known, counts, error_probability, kept=False)
+
+
+def _test(search: _Search, sides: FloatArray, samples: int, rng: np.random.Generator) -> tuple[int, int, int]:
+    """Numbers of random settings in a box, of unsafe ones, and of those that could not be simulated."""
+    ends = search.original - sides[0], search.original + sides[1]
+    settings = random_settings(search.evaluator, search.columns, *ends, samples, rng)
+    evaluations = search.evaluator.evaluate(settings, "test of the limits together")
+    is_unsafe = search.unsafe.of(evaluations)
+    search.unsafe_found = np.concatenate([search.unsafe_found, settings[is_unsafe]])
+    for setting in settings[is_unsafe][:2]:
+        search.boundary_factors(setting)
+    return len(settings), int(is_unsafe.sum()), int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
+
+
+def _joint_limits(
+    search: _Search,
+    limits: Mapping[str, Limit],
+    sides: FloatArray,
+    known: FloatArray,
+    counts: tuple[int, int, int],
+    error_probability: float,
+    *,
+    kept: bool,
+) -> JointLimits:
+    samples, unsafe, failed = counts
+    bad, good = unsafe + failed, samples - unsafe - failed
+    at_most = float(scipy.stats.beta.ppf(1 - error_probability, bad + 1, good)) if good else 1.0
+    characteristics = search.evaluator.characteristics
+    ends = zip((search.original - sides[0]).tolist(), (search.original + sides[1]).tolist(), strict=True)
+    inside = int(search.holds(sides, known).sum())
+    # Ends of the domain are stated exactly, not through their distance from the original.
+    box = {
+        one.name: (max(low, one.lower), min(high, one.upper))
+        for one, (low, high) in zip(characteristics, ends, strict=True)
+    }
+    return JointLimits(limits, box, kept, samples, unsafe, failed, at_most, inside, search.beyond(sides))
