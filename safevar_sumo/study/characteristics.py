@@ -18,7 +18,8 @@ Description = Annotated[str, Meta(max_length=200)]
 
 
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One row of the characteristics table; its values are in `unit`, and f_diff multiplies its change by `weight`.
+    """One row of the characteristics table: its `original` value, and the ends `lower` and `upper` of its domain, in
+    `unit`; f_diff multiplies its change by `weight`.
 
     `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket);
     `counterpart` is the part of a real vehicle that sets it.
@@ -88,8 +89,8 @@ Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
 class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The correlation of two characteristics after each is transformed to a standard normal variable (Gaussian
-    copula).
+    """The correlation, `value`, of the two characteristics `between` after each is transformed to a standard normal
+    variable (Gaussian copula).
     """
 
     between: tuple[str, str]

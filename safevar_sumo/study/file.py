@@ -242,6 +242,8 @@ def _refines(key: str, base_value: object, override: object) -> bool:
 
 def drop_nulls(raw: Any) -> Any:
     """Tables without null values, which TOML does not have."""
+    if isinstance(raw, list):
+        return [drop_nulls(value) for value in raw]
     return {key: drop_nulls(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
 
 

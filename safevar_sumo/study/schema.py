@@ -43,9 +43,9 @@ DESCRIPTION_KEYS = ("meaning", "counterpart")
 
 
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A model by its name, or by `package.module:Name`, and its parameters.
+    """A `model` by its name, or by `package.module:Name`, and its `parameters`.
 
-    An ADS of the kind `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
+    An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
     its path: `inputs` and `outputs` are the FMU's variables by the quantity they receive or return; `step` [s] is the
     FMU's time step, by default the declared step.
     """
@@ -59,9 +59,9 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle under test: its model, the model's parameters, and the characteristics that vary.
+    """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that vary.
 
-    A vehicle of the kind `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its
+    A vehicle of the `kind` `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its
     parameters are the characteristics, whose rows state only what the FMU does not declare. `sensors` and `sumo_type`
     map properties of the sensors and of SUMO's vehicle type to a characteristic or a number; `sumo_type` may also name
     variables of the FMU.
@@ -79,7 +79,7 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Weather as data: its effects on the road and on the sensors.
+    """Weather as data: its `name`, and its effects on the road and on the sensors.
 
     `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose
     further friction. `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for
@@ -110,7 +110,8 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The search: `runs` runs of every algorithm, each with `evaluations` simulations.
+    """The search: `runs` runs of each of the `algorithms`, each with `evaluations` simulations, in generations of
+    `population`; `seed` is the seed of all random numbers.
 
     A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises `objectives`, and drives
     metrics in their unsafe direction. `parameters` hold the parameters of algorithms by label; a file has them in
@@ -140,7 +141,8 @@ def label_of(algorithm: str) -> str:
 
 
 class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A test of a matrix: a scenario at every combination of the values in `over`, in each of the `weathers`.
+    """A test of a matrix: its `name`, and a scenario at every combination of the values in `over`, in each of the
+    `weathers`.
 
     `parameters` are added to those of the study's scenario; a test with a `model` of its own has only its own
     parameters. A weather is a name or a table.
@@ -174,7 +176,7 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A parameter to calibrate: its bounds in `unit`, and its meaning.
+    """A parameter to calibrate: its bounds `lower` and `upper` in `unit`, and its `meaning`.
 
     Studies that are fitted together share one fitted value if their files state the same value; with `own`, a study has
     its own. The search measures distances of values as differences, or with `log` as ratios, for positive quantities of
@@ -250,6 +252,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
+    `title` is its heading, `weather` a shipped weather by its name, or a table;
     `matrix` are the test points at which the study is simulated, if there are several;
     `rating` are the user's claims for a rating;
     `step_length` is the simulation's time step [s], by default the time step in the network's options;

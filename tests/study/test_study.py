@@ -20,45 +20,38 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
-        ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
-        ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics.ttc: there is no such key"),
-        ("ttc_threshold = 1.5", "ttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
-        ("ttc_threshold = 1.5", "ttc_threshold = nan", "metrics.ttc_threshold = nan"),
-        ("ttc_threshold = 1.5", "ttc_threshold = -1", "metrics.ttc_threshold = -1"),
-        ("population = 50", "population = 1", "search.population = 1"),
-        ("population = 50", "population = 50.5", "search.population = 50.5"),
-        ("runs = 30", "", "search: 'runs' is a required property"),
-        (
-            "lower = 4200, upper = 7000",
-            "lower = 7000, upper = 4200",
-            "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0",
-        ),
-        (
-            "lower = 4200, upper = 7000",
-            "lower = 5800, upper = 5800",
-            "vehicle.characteristics.max_rpm: lower = 5800.0 and upper = 5800.0",
-        ),
-        (
-            "lower = 4200, upper = 7000",
-            "lower = 5900, upper = 7000",
-            "vehicle.characteristics.max_rpm.original = 5800.0",
-        ),
-        ("original = 5800", "original = nan", "vehicle.characteristics.max_rpm.original = nan"),
-        ("original = 5800", "original = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),
-        (
-            "original = 0.15, lower = 0.1",
-            "original = 0, lower = -1",
-            "vehicle.characteristics.dampRateFullT.original = 0",
-        ),
-        ("[ads]", "[ads", "cannot be read as TOML"),
-        ('name = "sun"', 'name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
-        ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
-    ],
-)
+REPLACEMENTS = [
+    ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
+    ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
+    ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics.ttc: there is no such key"),
+    ("ttc_threshold = 1.5", "ttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
+    ("ttc_threshold = 1.5", "ttc_threshold = nan", "metrics.ttc_threshold = nan"),
+    ("ttc_threshold = 1.5", "ttc_threshold = -1", "metrics.ttc_threshold = -1"),
+    ("population = 50", "population = 1", "search.population = 1"),
+    ("population = 50", "population = 50.5", "search.population = 50.5"),
+    ("runs = 30", "", "search: 'runs' is a required property"),
+    (
+        "lower = 4200, upper = 7000",
+        "lower = 7000, upper = 4200",
+        "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0",
+    ),
+    (
+        "lower = 4200, upper = 7000",
+        "lower = 5800, upper = 5800",
+        "vehicle.characteristics.max_rpm: lower = 5800.0 and upper = 5800.0",
+    ),
+    ("lower = 4200, upper = 7000", "lower = 5900, upper = 7000", "vehicle.characteristics.max_rpm.original = 5800.0"),
+    ("original = 5800", "original = nan", "vehicle.characteristics.max_rpm.original = nan"),
+    ("original = 5800", "original = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),
+    ("original = 0.15, lower = 0.1", "original = 0, lower = -1", "vehicle.characteristics.dampRateFullT.original = 0"),
+    ("[ads]", "[ads", "cannot be read as TOML"),
+    ('name = "sun"', 'name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
+    ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
+]
+"""A text of `sun`, another text in its place, and what the error says."""
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), REPLACEMENTS)
 def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str, new: str, expected: str) -> None:
     path = variant(tmp_path, old, new)
     with pytest.raises(InputError) as caught:
@@ -69,73 +62,68 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     assert len(message.splitlines()) <= 2
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
-        ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
-        (
-            "[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300",
-            "variation.mass.deviation = 1e+300 is greater than the maximum",
-        ),
-        ("[variation.mass]\ndistribution = 'uniform'\nlower = 9999", "variation.mass.lower = 9999"),
-        ('[calibration."ads.parameters.brake_gap"]\nlower = "a"', "calibration.'ads.parameters.brake_gap'.lower = 'a'"),
-        (
-            '[calibration."ads.parameters.brake_gap"]\nlow = 1',
-            "calibration.'ads.parameters.brake_gap'.low: there is no such key",
-        ),
-        ('[published]\ntet = "much"', "published.tet = 'much'"),
-        ("seed = 3", "seed: there is no such key; did you mean search.seed or fit.seed?"),
-        (
-            "[search]\nttc_threshold = 3",
-            "search.ttc_threshold: there is no such key; did you mean metrics.ttc_threshold?",
-        ),
-        (
-            "[vehicle.characteristics.masss]\noriginal = 9",
-            "vehicle.characteristics.masss: 'unit' is a required property; did you mean 'mass'?",
-        ),
-        ("[vehicle.characteristics.mass]\nupper = 1e300", "1e+300]\nexpected: numbers up to 1e+12"),
-        ("[search]\nevaluatons = 5", "search.evaluatons: there is no such key; did you mean 'evaluations'?"),
-        ("evaluatons = 5", "evaluatons: there is no such key; did you mean search.evaluations?"),
-        ("\n".join(f"x{i} = 1" for i in range(20_000)), "more than 8 mistakes: x0: there is no such key"),
-        (
-            '[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1',
-            "weather.road_friction = 0 is less than or equal to the minimum of 0",
-        ),
-        ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
-        ("[origin]\nplaces = []", "origin"),
-        ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3 is not of type 'object'"),
-        ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci"),
-        (
-            '[variation.mass]\ndistribution = "norml"',
-            "variation.mass = {'distribution': 'norml'}\nexpected: one of fixed, lognormal",
-        ),
-        (
-            '[metrics]\nalso = ["max_jerk", "max_jerk"]',
-            "metrics.also = ['max_jerk', 'max_jerk']\nexpected: each metric once",
-        ),
-        ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a' is not of type 'number'"),
-        (
-            'extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]',
-            "rating.claims.CCRs[0] = 3 is not of type 'string'",
-        ),
-        ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
-        ("search = 3", "search = 3"),
-        ('[vehicle]\nmodel = "tesla"', "vehicle: 'characteristics' is a required property"),
-        ('extends = "mine.toml"\n', "extends = 'mine.toml' leads back to "),
-        ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key"),
-        ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
-        ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
-        ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
-        ('[ads.outputs]\nfoo = "bar"', "ads.outputs: 'world_on_rails' is no FMU"),
-        ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
-        (
-            '[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
-            "calibration.'ads.parameters.brake_gapp' is no parameter of the study",
-        ),
-        ("extends = 3\n", "extends"),
-    ],
-)
+ADDITIONS = [
+    ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
+    ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
+    (
+        "[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300",
+        "variation.mass.deviation = 1e+300 is greater than the maximum",
+    ),
+    ("[variation.mass]\ndistribution = 'uniform'\nlower = 9999", "variation.mass.lower = 9999"),
+    ('[calibration."ads.parameters.brake_gap"]\nlower = "a"', "calibration.'ads.parameters.brake_gap'.lower = 'a'"),
+    (
+        '[calibration."ads.parameters.brake_gap"]\nlow = 1',
+        "calibration.'ads.parameters.brake_gap'.low: there is no such key",
+    ),
+    ('[published]\ntet = "much"', "published.tet = 'much'"),
+    ("seed = 3", "seed: there is no such key; did you mean search.seed or fit.seed?"),
+    ("[search]\nttc_threshold = 3", "search.ttc_threshold: there is no such key; did you mean metrics.ttc_threshold?"),
+    (
+        "[vehicle.characteristics.masss]\noriginal = 9",
+        "vehicle.characteristics.masss: 'unit' is a required property; did you mean 'mass'?",
+    ),
+    ("[vehicle.characteristics.mass]\nupper = 1e300", "1e+300]\nexpected: numbers up to 1e+12"),
+    ("[search]\nevaluatons = 5", "search.evaluatons: there is no such key; did you mean 'evaluations'?"),
+    ("evaluatons = 5", "evaluatons: there is no such key; did you mean search.evaluations?"),
+    ("\n".join(f"x{i} = 1" for i in range(20_000)), "more than 8 mistakes: x0: there is no such key"),
+    (
+        '[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1',
+        "weather.road_friction = 0 is less than or equal to the minimum of 0",
+    ),
+    ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
+    ("[origin]\nplaces = []", "origin"),
+    ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3 is not of type 'object'"),
+    ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci"),
+    (
+        '[variation.mass]\ndistribution = "norml"',
+        "variation.mass = {'distribution': 'norml'}\nexpected: one of fixed, lognormal",
+    ),
+    (
+        '[metrics]\nalso = ["max_jerk", "max_jerk"]',
+        "metrics.also = ['max_jerk', 'max_jerk']\nexpected: each metric once",
+    ),
+    ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a' is not of type 'number'"),
+    ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]', "rating.claims.CCRs[0] = 3 is not of type 'string'"),
+    ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
+    ("search = 3", "search = 3"),
+    ('[vehicle]\nmodel = "tesla"', "vehicle: 'characteristics' is a required property"),
+    ('extends = "mine.toml"\n', "extends = 'mine.toml' leads back to "),
+    ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key"),
+    ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
+    ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
+    ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
+    ('[ads.outputs]\nfoo = "bar"', "ads.outputs: 'world_on_rails' is no FMU"),
+    ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
+    (
+        '[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
+        "calibration.'ads.parameters.brake_gapp' is no parameter of the study",
+    ),
+    ("extends = 3\n", "extends"),
+]
+"""A text in a study that extends `smoke`, and what the error says."""
+
+
+@pytest.mark.parametrize(("text", "expected"), ADDITIONS)
 def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text if text.startswith("extends") else f'extends = "smoke"\nname = "mine"\n{text}\n')
