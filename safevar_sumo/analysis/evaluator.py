@@ -70,6 +70,25 @@ class Evaluator:
                 groups = [self.evaluate(settings[feasible], stage), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
                 return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
+        return self._evaluate_shown(settings, stage, verified=self._verified)
+
+    def evaluate_parameters(
+        self, rows: FloatArray, parameters: tuple[str, ...], points: tuple[int, ...], stage: str
+    ) -> Evaluations:
+        """Evaluate M settings with the values of some parameters of the ADS beside them, shape (M, n + P), at some
+        points of the study's matrix; without `points`, at all.
+        """
+        return self._evaluate_shown(rows, stage, verified=0, parameters=parameters, points=points)
+
+    def _evaluate_shown(
+        self,
+        settings: FloatArray,
+        stage: str,
+        *,
+        verified: int,
+        parameters: tuple[str, ...] = (),
+        points: tuple[int, ...] = (),
+    ) -> Evaluations:
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, total = 0, len(np.unique(settings, axis=0))
@@ -80,7 +99,7 @@ class Evaluator:
             done += increment
             self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, self._verified)
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, parameters, points)
         self.simulated += total
         return evaluations
 

@@ -14,7 +14,10 @@ from types import MappingProxyType
 from typing import IO
 
 import msgspec
+import numpy as np
 
+from safevar_sumo.ads import ADS
+from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import changed_files, digests, files_named_in, note_inputs, unload_user_modules
@@ -23,7 +26,7 @@ from safevar_sumo.results import LAYERS_OF_FILES, RESULTS, evaluation_keys
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate, evaluate_cells
+from safevar_sumo.sumo.matrix import evaluate, evaluate_cells, settings_per_batch
 from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System, assemble
 
@@ -48,6 +51,8 @@ class Task(msgspec.Struct, frozen=True):
     check: bool
     cells: tuple[int, int] | None
     empty_road: bool
+    parameters: tuple[str, ...]
+    points: tuple[int, ...]
 
 
 def pack_study(
@@ -59,6 +64,8 @@ def pack_study(
     check: bool = False,
     cells: tuple[int, int] | None = None,
     empty_road: bool = False,
+    parameters: tuple[str, ...] = (),
+    points: tuple[int, ...] = (),
 ) -> bytes:
     """Pack a study for a worker as bytes.
 
@@ -78,11 +85,17 @@ def pack_study(
     empty_road
         Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's
         `reasons`.
+    parameters
+        Parameters of the ADS whose values follow the characteristics in every row of the settings.
+    points
+        Numbers of the only points to simulate; by default all.
     """
     if inputs is None:
         inputs = {"network": network_digests(assemble(study))}
     shared_inputs = {layer: dict(inputs[layer]) for layer in LAYERS_OF_FILES if layer in inputs}
-    return msgspec.msgpack.encode(Task(study, shared_inputs, engine, afresh, check, cells, empty_road))
+    return msgspec.msgpack.encode(
+        Task(study, shared_inputs, engine, afresh, check, cells, empty_road, parameters, points)
+    )
 
 
 @lru_cache(maxsize=8)
@@ -116,12 +129,44 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
             evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
         elif task.cells is not None:
             evaluations = evaluate_cells(system, settings, task.cells, task.engine)
+        elif task.parameters or task.points:
+            evaluations = _evaluate_parameters(system, task, settings)
         else:
             evaluations = evaluate(system, settings, task.engine)
     files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
     known = task.inputs.get("sources", {})
     refuse_changed_files([name for name, digest in files_read.items() if known.get(name, digest) != digest])
     return replace(evaluations, files={name: digest for name, digest in files_read.items() if name not in known})
+
+
+def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
+    """Evaluate rows of n characteristics and the values of some parameters of the ADS, at the points of a task.
+
+    A shipped ADS drives all rows at once, with arrays as its parameters; any other has an own instance for each set of
+    values.
+    """
+    n = len(system.characteristics)
+    settings, values = rows[:, :n], rows[:, n:]
+    if task.points:
+        system = replace(system, matrix=tuple(system.points[number] for number in task.points))
+    if (task.study.ads.model in ADS and len(rows) <= settings_per_batch(system, task.engine)) or not task.parameters:
+        ads = VariedAds(system.ads, task.parameters, values) if task.parameters else system.ads
+        return replace(evaluate(replace(system, ads=ads), settings, task.engine), settings=rows)
+    distinct_values, set_of_row = np.unique(values, axis=0, return_inverse=True)
+    batches, order = [], []
+    for number, own_values in enumerate(distinct_values):
+        members = np.flatnonzero(set_of_row.ravel() == number)
+        own_study = with_parameters(task.study, dict(zip(task.parameters, own_values.tolist(), strict=True)))
+        own_system = replace(system, ads=assemble(own_study).ads)
+        batches.append(replace(evaluate(own_system, settings[members], task.engine), settings=rows[members]))
+        order.append(members)
+    return Evaluations.concatenate(batches).take(np.argsort(np.concatenate(order)))
+
+
+def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
+    """A study with other values of parameters of its ADS."""
+    ads = msgspec.structs.replace(study.ads, parameters={**study.ads.parameters, **values})
+    return msgspec.structs.replace(study, ads=ads)
 
 
 def evaluate_in_time(work: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:

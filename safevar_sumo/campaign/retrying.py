@@ -93,14 +93,14 @@ class Retries:
             return self._failed_evaluation(setting, error)
 
     def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
-        undefined = np.full(1, np.nan)
+        undefined, own = np.full(1, np.nan), setting[:, : len(self.characteristics)]  # without an ADS's parameters
         return Evaluations(
             settings=setting,
             outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
             collision_speed=undefined,
             metrics=dict.fromkeys(METRICS, undefined),
-            f_diff=self.characteristics.largest_change(setting),
-            f_num_diff=self.characteristics.number_changed(setting),
+            f_diff=self.characteristics.largest_change(own),
+            f_num_diff=self.characteristics.number_changed(own),
             reasons={setting[0].tobytes(): " ".join(str(error).split())},
         )
 

@@ -30,6 +30,10 @@ COMMANDS_BY_GROUP = {
         "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
         "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
         "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
+        "repair": (
+            "questions",
+            "Find the smallest change of the driving system that survives promised wear, and its price.",
+        ),
         "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
         "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
     },

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import answer_question, study_in
@@ -42,6 +43,7 @@ from safevar_sumo.terminal import print_answer
 from safevar_sumo.vehicles import CharacteristicSet
 
 SPREADSHEET_ENDINGS = (".xlsx",)
+STUDY_ENDINGS = (".toml",)
 
 
 def add_question(
@@ -176,6 +178,26 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     if result.errors:
         print_warning(f"{result.errors} vehicles could not be simulated and are left out")
     return _show(result, as_json, plot)
+
+
+@add_question(
+    RepairOptions,
+    "STUDY|RESULTS",
+    file_option("--out", "Write a study file with the first repair there, which extends STUDY.", metavar="FILE.toml"),
+)
+def repair(source: str, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> Any:
+    """Find the smallest change of the driving system of STUDY that survives the promised wear, and what it costs."""
+    from safevar_sumo.analysis.repair.answer import write_repair
+    from safevar_sumo.analysis.repair.compute import find_repairs
+
+    options, subject = RepairOptions(**values), load_results_or_study(source, point)
+    check_output(out, "--out", STUDY_ENDINGS)
+    result = answer_question(find_repairs, subject, options, jobs=jobs)
+    answer = _show(result, as_json)
+    if out is not None and result.repairs:
+        write_repair(out, result)
+        click.echo(f"The study with it: {out}", err=as_json)
+    return answer
 
 
 @add_question(RulesOptions, "STUDY|DIR")

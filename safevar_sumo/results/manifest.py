@@ -36,6 +36,7 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "variation",
     "correlations",
     "limits",
+    "repair",
 )
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")

@@ -32,6 +32,7 @@ from safevar_sumo.scenarios.euro_ncap import (
 from safevar_sumo.scenarios.target import (
     FOOTPATH_NETWORK,
     PARKED_GAP,
+    STOP_DISTANCE,
     EncounterConstants,
     PersonMover,
     Target,
@@ -144,9 +145,9 @@ class _Start(NamedTuple):
             time = test.time_to_impact or float(
                 max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP)
             )
-            profile = SpeedProfile.with_arrival(distance, time, speed, run_up)
+            profile = SpeedProfile.with_arrival(distance, time - test.lead, speed, run_up)
         mover = (
-            PersonMover(target, sign, -lateral_start, profile)
+            PersonMover(target, sign, -lateral_start, profile, test.stop)
             if test.is_on_foot
             else VehicleMover(target, direction, profile.speed_at)
         )
@@ -231,6 +232,16 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     def __post_init__(self) -> None:
         if not self.network:
             force_setattr(self, "network", FOOTPATH_NETWORK if self.is_on_foot else JUNCTION)
+
+    @property
+    def stop(self) -> float:
+        """Position at which a pedestrian stops, past the middle of the lane [m]."""
+        return STOP_DISTANCE
+
+    @property
+    def lead(self) -> float:
+        """Time by which a pedestrian is at the place of the impact before the vehicle [s]."""
+        return 0.0
 
     @property
     def pre_crash(self) -> PreCrash:

@@ -198,13 +198,14 @@ STOP_DISTANCE = 5.0
 
 class PersonMover(NamedTuple):
     """A pedestrian who walks to the left (`sign` 1) or right (-1); `start` is the position in this direction from the
-    lane's middle [m].
+    lane's middle, `stop` the position at which the pedestrian stops [m].
     """
 
     target: str
     sign: float
     start: float
     profile: SpeedProfile
+    stop: float = STOP_DISTANCE
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
         """No changes: the pedestrian uses the network's footpath."""
@@ -262,7 +263,7 @@ class PersonMover(NamedTuple):
 
     def next_speed(self, sample: int, step: float) -> float:
         """Mean speed in the coming step [m/s]."""
-        walking_distance = STOP_DISTANCE - self.start
+        walking_distance = self.stop - self.start
         walked, next_walked = (min(self.profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
         return (next_walked - walked) / step
 

@@ -19,6 +19,7 @@ from safevar_sumo.study.schema import (
     NAME_PATTERN,
     Origin,
     Parameters,
+    RepairTable,
     SearchTable,
     Study,
     StudyLike,
@@ -82,7 +83,8 @@ def _checked_study(raw: _RawStudy) -> Study:
     raise_mistakes(infinite_numbers(raw.source, raw.tables))
     if "origin" in raw.tables:
         raise InputError(raw.source, "origin: there is no such key")
-    study = convert_table(raw.source, _with_algorithms(_with_fmu(raw)), Study)
+    tables = _with_parameters(_with_parameters(_with_fmu(raw), "search", SearchTable), "repair", RepairTable)
+    study = convert_table(raw.source, tables, Study)
     raise_mistakes(contradictions(raw.source, study))
     return msgspec.structs.replace(study, origin=raw.origin)
 
@@ -119,19 +121,17 @@ def _with_fmu(raw: _RawStudy) -> Parameters:
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
-def _with_algorithms(tables: Parameters) -> Parameters:
-    """Move the tables of algorithms, such as [search.nsga2], to `search.parameters`."""
-    search = tables.get("search")
-    if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
+def _with_parameters(tables: Parameters, name: str, record: type[SearchTable | RepairTable]) -> Parameters:
+    """Move the tables within a table, such as [search.nsga2] and those of [repair], to its `parameters`."""
+    table = tables.get(name)
+    if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
         return tables
-    algorithm_tables = {
-        key: value
-        for key, value in search.items()
-        if isinstance(value, dict) and key not in SearchTable.__struct_fields__
+    inner_tables = {
+        key: value for key, value in table.items() if isinstance(value, dict) and key not in record.__struct_fields__
     }
-    other_keys = {key: value for key, value in search.items() if key not in algorithm_tables}
-    parameters = {**other_keys.get("parameters", {}), **algorithm_tables}
-    return {**tables, "search": {**other_keys, "parameters": parameters}} if algorithm_tables else tables
+    other_keys = {key: value for key, value in table.items() if key not in inner_tables}
+    parameters = {**other_keys.get("parameters", {}), **inner_tables}
+    return {**tables, name: {**other_keys, "parameters": parameters}} if inner_tables else tables
 
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:

@@ -191,6 +191,19 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     log: bool = False
 
 
+class RepairTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What a repair of the ADS may change and has to keep.
+
+    `parameters` may change, by name; a file has them directly under [repair]. Without any, those that come with a
+    shipped ADS may change. `promise` holds limits by characteristic that the user promises to keep, or is "all" for the
+    whole domain; by default the study's limits. `benign` are tests in which nobody needs to brake.
+    """
+
+    parameters: dict[str, FreeParameter] = {}
+    promise: dict[str, Limit] | Literal["all"] = {}
+    benign: list[MatrixTest] = []
+
+
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a study comes from; results do not depend on it.
 
@@ -263,7 +276,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     parameter, the study's own value first; `model_error` is the model's further error, by metric, for a vehicle that
     differs from the original by the full width of a domain; `variation` and `correlations` state how characteristics
     vary in the world, by name: uniformly by default; `constraints` are conditions that the characteristics of one
-    vehicle satisfy together; `limits` are the values, by name, up to which characteristics may wear in service.
+    vehicle satisfy together; `limits` are the values, by name, up to which characteristics may wear in service;
+    `repair` states what a repair of the ADS may change.
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
@@ -290,6 +304,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     correlations: list[Correlation] = []
     constraints: list[Constraint] = []
     limits: dict[str, Limit] = {}
+    repair: RepairTable = RepairTable()
     origin: Origin = Origin()
 
     @property
@@ -302,7 +317,7 @@ def tables_of(study: Study) -> Parameters:
     """A study as plain tables, without its origin and without keys that it does not use."""
     tables: Parameters = msgspec.to_builtins(study)
     del tables["origin"]
-    for name in ("constraints", "limits"):
+    for name in ("constraints", "limits", "repair"):
         if not tables[name]:
             del tables[name]  # so that results from before these tables existed stay the same bytes
     for name in ("vehicle", "ads", "scenario"):

@@ -19,7 +19,9 @@ def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
 
     read, batches = many.inputs_of, many.choose_batch_size
     monkeypatch.setattr(
-        many, "choose_batch_size", lambda study: (100, False) if study.name == "made-up" else batches(study)
+        many,
+        "choose_batch_size",
+        lambda study, *points: (100, False) if study.name == "made-up" else batches(study, *points),
     )
     monkeypatch.setattr(many, "pack_study", pack_study)
     monkeypatch.setattr(many, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool))

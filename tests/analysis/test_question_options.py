@@ -21,6 +21,7 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -55,7 +56,8 @@ def test_a_default_that_changes_changes_everywhere() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [ExplainOptions, OpinionOptions, RatingOptions, RiskOptions, RulesOptions, ToleranceOptions]
+    "options",
+    [ExplainOptions, OpinionOptions, RatingOptions, RepairOptions, RiskOptions, RulesOptions, ToleranceOptions],
 )
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)

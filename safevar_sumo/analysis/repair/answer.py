@@ -1,0 +1,266 @@
+"""The answer of a repair: its records as JSON, table and sentences."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+import tomli_w
+from rich.table import Table
+
+from safevar_sumo.analysis.repair.attack import Proof
+from safevar_sumo.analysis.repair.price import Price
+from safevar_sumo.analysis.repair.problem import Parameter, Promise
+from safevar_sumo.analysis.words import join_phrases, number_of
+from safevar_sumo.campaign.evaluation import with_parameters
+from safevar_sumo.output import whole_file
+from safevar_sumo.records import JsonObject
+from safevar_sumo.study import Study
+from safevar_sumo.study.schema import NAME_PATTERN
+from safevar_sumo.sumo.empty_road import summary_entry
+
+
+class NotRepairable(NamedTuple):
+    """A part of the promise that no driving system survives: `limits` are the values of a minimal cause at which full
+    braking at the first possible moment first fails, at a test `point`; `share` of the first counterexamples fail so.
+    """
+
+    limits: dict[str, float]
+    point: str
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repair:
+    """A change of parameters that survives the promise.
+
+    Attributes
+    ----------
+    values
+        The parameters that change, with their new values in their units.
+    largest_change
+        The largest of the changes, as a share of its range.
+    price, proof
+        What it costs on a new vehicle, and its proof on fresh wear.
+    held_out
+        Counts of `safe` among `all`: `points` of the matrix left out at first; `weathers`; `second_vehicle`;
+        `fitted_sets`; None where there is nothing to check. `lost_on_new_car` counts the points that the new vehicle
+        passed before and fails with the repair.
+    """
+
+    values: dict[str, float]
+    largest_change: float
+    price: Price
+    proof: Proof
+    held_out: JsonObject
+
+    def to_dict(self) -> JsonObject:
+        """A record of the JSON."""
+        return {
+            "record": "repair",
+            "parameters": self.values,
+            "changed": len(self.values),
+            "largest_change": self.largest_change,
+            "price": self.price.to_dict(),
+            "certified": self.proof._asdict(),
+            "held_out": self.held_out,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repairs:
+    """The smallest changes of a driving system that survive the promised wear, the fewest changes first.
+
+    Attributes
+    ----------
+    worst_today
+        Safety degree of today's driving system with the worst vehicle of the promise that was tried [m, or -m/s].
+    proof_of_today
+        If today's system keeps the promise already: its proof on fresh wear.
+    largest_promise
+        If no change survives the promise: the largest part of it that some change keeps; None if there is none.
+    unread
+        Parameters that no simulation reads, so that they were not searched.
+    """
+
+    study: Study
+    promise: Promise
+    margin: float
+    parameters: tuple[Parameter, ...]
+    repairs: tuple[Repair, ...]
+    worst_today: float
+    proof_of_today: Proof | None
+    not_repairable: tuple[NotRepairable, ...]
+    largest_promise: Promise | None
+    unread: tuple[str, ...]
+    attacks: int
+    simulations: int
+    counterexamples: int
+    no_verdict: str = ""
+
+    def to_dict(self) -> list[JsonObject]:
+        """The JSON of `repair`."""
+        largest = (
+            {}
+            if self.repairs or self.proof_of_today
+            else {"largest_promise": None if self.largest_promise is None else self.largest_promise.to_dict()}
+        )
+        summary = {
+            "record": "summary",
+            "promise": self.promise.to_dict(),
+            "margin": self.margin,
+            "repairs": len(self.repairs),
+            "not_repairable": [one._asdict() for one in self.not_repairable],
+            "attacks": self.attacks,
+            "simulations": self.simulations,
+            "counterexamples": self.counterexamples,
+            **largest,
+        }
+        return [*(one.to_dict() for one in self.repairs), summary, *summary_entry(self.no_verdict)]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each repair: `parameters`, `changed`, `largest_change`, and the price [m, s, m/s^2, m/s^3]."""
+        rows = [
+            {
+                "parameters": self._changes_in_words(one),
+                "changed": len(one.values),
+                "largest_change": one.largest_change,
+                "metres_earlier_mean": one.price.mean,
+                "metres_earlier_worst": one.price.worst,
+                "seconds_earlier": one.price.seconds,
+                "largest_deceleration": one.price.deceleration,
+                "largest_jerk": one.price.jerk,
+            }
+            for one in self.repairs
+        ]
+        columns = ["parameters", "changed", "largest_change", "metres_earlier_mean", "metres_earlier_worst"]
+        return pd.DataFrame(rows, columns=[*columns, "seconds_earlier", "largest_deceleration", "largest_jerk"])
+
+    def repaired_study(self) -> Study:
+        """The study with the first repair."""
+        return with_parameters(self.study, self.repairs[0].values)
+
+    def __repr__(self) -> str:
+        return f"<Repairs of {self.study.name}: {self.verdict}>"
+
+    @property
+    def verdict(self) -> str:
+        """One sentence on the promise: kept already, survived by a change, or by none."""
+        if self.no_verdict:
+            return self.no_verdict
+        if self.proof_of_today is not None:
+            return (
+                f"The driving system of today keeps this promise ({self.promise.in_words}): the worst vehicle tried "
+                f"has a safety degree of {self.worst_today:.2f} m, and {_proof_in_words(self.proof_of_today)}."
+            )
+        if self.repairs:
+            first = self.repairs[0]
+            number = "One change survives" if len(first.values) == 1 else f"{len(first.values)} changes survive"
+            return f"{number} this wear ({self.promise.in_words}): {self._changes_in_words(first)}."
+        if self.largest_promise is None:
+            return (
+                f"No change of {join_phrases(one.name for one in self.parameters)} survives any part of this promise."
+            )
+        return (
+            f"No change survives this promise ({self.promise.in_words}). The largest that can be kept: "
+            f"{self.largest_promise.in_words}."
+        )
+
+    def sentences(self) -> Iterator[str | Table]:
+        """The verdict; the price, the other repairs and the checks; what cannot be repaired."""
+        if not self.no_verdict:
+            yield self.verdict
+        if self.repairs:
+            first = self.repairs[0]
+            yield f"  today              the worst vehicle of the promise: {_degree(self.worst_today)}"
+            yield f"  price on a new car {_price_in_words(first.price)}"
+            for one in self.repairs[1:]:
+                yield f"  or                 {self._changes_in_words(one)}: {_price_in_words(one.price)}"
+            yield f"  checked            {_proof_in_words(first.proof)}{_held_out_in_words(first.held_out)}"
+        for name in self.unread:
+            yield f"  not searched       no simulation reads {name}"
+        for part in self.not_repairable:
+            limits = [
+                f"{name} {'below' if value < one.original else 'above'} {one.text(value)}{one.suffix}"
+                for one in self.promise.characteristics
+                for name, value in part.limits.items()
+                if name == one.name
+            ]
+            place = f" ({part.point})" if part.point else ""
+            yield f"  not repairable     {' with '.join(limits)}{place}: needs another part, not a parameter"
+
+    def _changes_in_words(self, repair: Repair) -> str:
+        return ", ".join(
+            f"{one.name} {one.today:.4g} -> {repair.values[one.name]:.4g}{one.suffix} ({one.meaning})"
+            for one in self.parameters
+            if one.name in repair.values
+        )
+
+
+def write_repair(path: Path, result: Repairs) -> None:
+    """Write a study file with the first repair, which extends the study.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    study, values = result.study, result.repairs[0].values
+    base = os.path.abspath(study.origin.called) if study.origin.called else study.name
+    name = {"name": path.stem} if re.fullmatch(NAME_PATTERN, path.stem) else {"name": f"{study.name}-repaired"}
+    tables = {"extends": base, **name, "ads": {"parameters": values}}
+    text = f"# {result.verdict}\n\n{tomli_w.dumps(tables)}"
+    with whole_file(path, "out") as file:
+        file.write_text(text, encoding="utf-8")
+
+
+def _degree(value: float) -> str:
+    return f"safety degree {value:.2f} m" if value >= 0 else f"a collision at {-value:.2f} m/s"
+
+
+def _price_in_words(price: Price) -> str:
+    if price.worst is None:
+        metres = "brakes nowhere on a new car"
+    else:
+        place = f" at {price.worst_point}" if price.worst_point else ""
+        metres = (
+            f"brakes up to {price.worst:.2f} m ({price.seconds:.2f} s) earlier{place}, {price.mean:.2f} m on average"
+        )
+    if price.needless is None:
+        needless = "needless braking is unknown: the study has no benign scenes"
+    else:
+        scenes, repaired, original = price.needless
+        needless = f"brakes needlessly in {repaired} of {scenes} benign scenes ({original} before)"
+    return f"{metres}; up to {price.deceleration:.1f} m/s^2; {needless}"
+
+
+def _proof_in_words(proof: Proof) -> str:
+    return (
+        f"{proof.n:,} fresh worn cars, {proof.unsafe} unsafe (at most {100 * proof.at_most:.2g} %, "
+        f"{100 * proof.confidence:.0f} %)"
+    )
+
+
+def _held_out_in_words(held_out: JsonObject) -> str:
+    texts = []
+    if held_out["points"]:
+        texts.append(
+            f"{held_out['points']['safe']} of {number_of(held_out['points']['all'], 'unseen test')} safe at once"
+        )
+    weathers = [f"{name} {count['safe']} of {count['all']}" for name, count in held_out["weathers"].items()]
+    if weathers:
+        texts.append(f"worst cars safe in other weathers: {', '.join(weathers)}")
+    for key, words in (("second_vehicle", "second vehicle model"), ("fitted_sets", "fitted vehicle models")):
+        if held_out[key]:
+            texts.append(f"{words} {held_out[key]['safe']} of {held_out[key]['all']}")
+    texts.append(
+        f"a new car fails at {held_out['lost_on_new_car']} points that it passed"
+        if held_out["lost_on_new_car"]
+        else "a new car loses nothing"
+    )
+    return "".join(f"; {text}" for text in texts)

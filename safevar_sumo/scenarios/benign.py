@@ -1,0 +1,105 @@
+"""Benign scenes: scenes like those of the shipped scenarios in which nobody needs to brake.
+
+The pedestrian stops short of the vehicle's path, leaves it in time, or walks beside it; a car stands in the next lane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import product
+
+from msgspec.structs import asdict, replace
+
+from safevar_sumo.records import KMH_PER_MS
+from safevar_sumo.scenarios.ahead import Along, TargetAhead
+from safevar_sumo.scenarios.base import Point, Scenario
+from safevar_sumo.scenarios.car_to_car import CarToCar
+from safevar_sumo.scenarios.crossing import Crossing
+from safevar_sumo.scenarios.euro_ncap import BODIES, SAME_DIRECTION, Direction
+from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
+
+SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
+"""Distances from the vehicle's path at which a pedestrian stops [m]: the ends, and steps between them."""
+LEADS = (1.5, 2.0)
+"""Times by which a pedestrian is at the place of the impact before the vehicle [s]: the path is clear half a second
+later.
+"""
+BESIDE = (-50.0, -40.0)
+"""Places beside the vehicle's path [% of the width from its left corner]: the pedestrian walks there, or drives by."""
+LANE_WIDTH = 3.5
+"""Distance of the next lane [m]."""
+HEADWAYS = (2.0, 2.5, 3.0, 4.0, 5.0)
+"""Distances of a car in the next lane at the start, as time headways [s]."""
+CITY_SPEEDS = (20.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
+"""Speeds with a car in the next lane of a study whose vehicle starts at rest [km/h]."""
+SLOW_SPEEDS, WALKING_SPEED = (10.0, 15.0, 20.0), 1.8 * KMH_PER_MS
+"""Speeds near which vehicles reach the published scenario's pedestrian, and his own [km/h]."""
+
+
+class StopsShort(Crossing, frozen=True, kw_only=True):
+    """The pedestrian stops `short` metres before the vehicle's path."""
+
+    short: float = 1.0
+
+    @property
+    def stop(self) -> float:
+        """Position at which the pedestrian stops, past the middle of the lane [m]."""
+        body = BODIES[self.parameter("target")]
+        return -(self.vut_width + body.length) / 2 - self.short
+
+
+class LeavesInTime(Crossing, frozen=True, kw_only=True):
+    """The pedestrian is at the place of the impact `seconds` before the vehicle."""
+
+    seconds: float = 2.0
+
+    @property
+    def lead(self) -> float:
+        """Time by which the pedestrian is there before the vehicle [s]."""
+        return self.seconds
+
+
+class NextLane(CarToCar, frozen=True, kw_only=True):
+    """The car stands, or drives more slowly, in the next lane."""
+
+    def _target_at_impact_location(
+        self, target: str, gap: float, speed_at: Callable[[float], float], direction: Direction = SAME_DIRECTION
+    ) -> TargetAhead:
+        ahead = CarToCar._target_at_impact_location(self, target, gap, speed_at, direction)
+        return ahead._replace(offset=LANE_WIDTH)
+
+
+def benign_points(points: Iterable[Point]) -> list[Point]:
+    """Benign scenes for the shipped scenarios at these points, in the points' weathers; none for other scenarios."""
+    scenes = dict[str, Point]()
+    for point in points:
+        for name, scenario in _scenes_like(point.scenario):
+            scenes.setdefault(f"{name}, {point.weather.name}", point._replace(scenario=scenario, name=name))
+    return [point._replace(name=name, parameters=()) for name, point in scenes.items()]
+
+
+def _scenes_like(scenario: Scenario) -> Iterable[tuple[str, Scenario]]:
+    """Benign scenes like a scenario, by name."""
+    if isinstance(scenario, Crossing) and scenario.is_on_foot:
+        base = asdict(replace(scenario, impact_location=50.0))
+        row = f"{scenario.test}, {scenario.speed:g} km/h"
+        for short in SHORT_OF_PATH:
+            yield f"{row}, stops {short:g} m short", StopsShort(**base, short=short)
+        for seconds in LEADS:
+            yield f"{row}, leaves {seconds:g} s before", LeavesInTime(**{**base, "hidden": False}, seconds=seconds)
+    if isinstance(scenario, Along):
+        for place in BESIDE:
+            name = f"{scenario.test}, {scenario.speed:g} km/h, beside at {place:g} %"
+            yield name, replace(scenario, impact_location=place)
+    if isinstance(scenario, Crossing | Along | CarToCar):
+        length, width = scenario.vut_length, scenario.vut_width
+        for headway in HEADWAYS[::2] if isinstance(scenario, Crossing | Along) else HEADWAYS:
+            name = f"{scenario.speed:g} km/h, a car in the next lane {headway:g} s ahead"
+            yield name, NextLane(speed=scenario.speed, headway=headway, vut_length=length, vut_width=width)
+    if isinstance(scenario, LeadVehicleStopped):
+        for speed, headway in product(CITY_SPEEDS, HEADWAYS):
+            yield f"{speed:g} km/h, a car in the next lane {headway:g} s ahead", NextLane(speed=speed, headway=headway)
+    if isinstance(scenario, PedestrianCrossing):
+        walk = replace(Crossing(test="CPNA"), target_speed=WALKING_SPEED, time_to_impact=7.0)
+        for side, speed in product((walk, replace(walk, test="CPFA")), SLOW_SPEEDS):
+            yield from _scenes_like(replace(side, speed=speed))
