@@ -24,21 +24,23 @@ from safevar_sumo.study import Limit
 
 PARTS, ROUNDS = 8, 3
 """Parts into which each round divides an interval between a safe and an unsafe setting."""
-BALANCING_ROUNDS = 4
-"""Rounds that balance the sides of a box before its first search."""
 WIDER = 0.04
 """Share of its domain by which a side of the box is widened in search of something unsafe."""
 SLAB_POINTS = 64
 """Number of Sobol points, and of corners, at which the room beside a box is searched."""
 MAX_ROUNDS = 40
 """Maximum number of times that a box is searched, and of tests of boxes."""
-LEAST_SHARE, BEYOND_REACH = 4 / PARTS**ROUNDS, 2.0
-"""A side that must shrink below this share of its extent cannot make a setting safe by itself; it counts as if it had
-to shrink by this multiple of its extent.
-"""
-SLIGHTLY_WIDER = 1.03
-"""Factor by which a box is wider than its boundary to see which side would make it safe again."""
+DEVIATIONS = tuple(0.35 * 0.8**k for k in range(14))
+"""Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
+PROPOSALS, SIMULATED_BOXES, LEAST_GAIN = 4096, 64, 0.01
+"""Boxes proposed in a round, the number of corners simulated, and the gain in volume (logarithm) that is worth it."""
 STAGE = "limits together"
+
+
+def _log_volume(boxes: FloatArray, width: FloatArray) -> FloatArray:
+    """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
+    shares = np.divide(boxes.sum(axis=-2), width, out=np.ones_like(boxes[..., 0, :]), where=width > 0)
+    return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))
 
 
 class JointLimits(NamedTuple):
@@ -159,49 +161,42 @@ class _Search:
             sides[side] = STEP_BACK * extents[hardest][side]
         return sides
 
-    def balanced(self, sides: FloatArray, corner: FloatArray) -> FloatArray:
-        """The box shrunk until one corner is safe, so that its sides share the loss as the largest box needs it.
+    def largest(self, sides: FloatArray) -> FloatArray:
+        """A box within `sides` that is safe at the known corners, as large as a random search makes it.
 
-        Where safety is linear in each characteristic, the widths of the largest box are in proportion to the ways by
-        which single sides would have to shrink to make the corner safe alone.
+        The box first shrinks as a whole. Boxes nearby that are larger and hold no unsafe setting known so far are then
+        simulated at their corners.
         """
-        used, opposite = self.free & np.stack([corner < 0, corner > 0]) & (sides > 0), sides[::-1]
-        widths, best, best_volume = sides + opposite, sides, -np.inf
-        for _ in range(BALANCING_ROUNDS):
-            inner, outer = self._corner_boundary(sides, np.where(used, widths, 0.0), used, corner)
-            volume = float(np.sum(np.log(np.maximum(inner.sum(axis=0), 1e-12)[used.any(axis=0)])))
-            if volume > best_volume:
-                best, best_volume = inner, volume
-            setting = self.corner_settings(outer, [corner])
-            if not len(self.find_unsafe(setting)):
-                break
-            factors = self.boundary_factors(setting[0])
-            ways = outer * np.where(factors > LEAST_SHARE, 1 - factors, BEYOND_REACH)
-            widths = np.where(ways > 0, ways, widths * (np.max(ways) / np.max(widths)))
-        return best
-
-    def _corner_boundary(
-        self, sides: FloatArray, widths: FloatArray, used: BoolArray, corner: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Two boxes within `sides` whose widths are in proportion to `widths` on the sides `used`: one whose corner is
-        safe, and one slightly wider than the narrowest that is not.
-        """
-        opposite = sides[::-1]
-
-        def box(share: float) -> FloatArray:
-            return np.where(used, np.clip(share * widths - opposite, 0.0, sides), sides)
-
-        ratio = np.divide(sides + opposite, widths, out=np.zeros_like(sides), where=used & (widths > 0))
-        low, high = 0.0, float(ratio.max())
+        rng, width = np.random.default_rng((self.evaluator.study.search.seed, 2)), self.room.sum(axis=0)
+        low, high = 0.0, 1.0
         for _ in range(ROUNDS):
             shares = low + (high - low) * np.arange(1, PARTS + 1) / PARTS
-            settings = np.concatenate([self.corner_settings(box(share), [corner]) for share in shares])
-            is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
-            if not is_unsafe.any():
-                return box(high), box(high)
-            first = int(np.argmax(is_unsafe))
-            low, high = (float(shares[first - 1]) if first else low), float(shares[first])
-        return box(low * STEP_BACK), box(high * SLIGHTLY_WIDER)
+            is_safe = self._safe_boxes([np.where(self.free, share * sides, sides) for share in shares])
+            first = PARTS if is_safe.all() else int(np.argmin(is_safe))
+            low, high = (float(shares[first - 1]) if first else low), float(shares[min(first, PARTS - 1)])
+        best = np.where(self.free, low * sides, sides)
+        for deviation in DEVIATIONS:
+            steps = rng.normal(0.0, deviation, (PROPOSALS, *sides.shape)) * (
+                rng.random((PROPOSALS, *sides.shape)) < 0.5
+            )
+            boxes = np.where(self.free, np.clip(best + steps * width, 0.0, sides), sides)
+            boxes = boxes[_log_volume(boxes, width) > _log_volume(best, width) + LEAST_GAIN]
+            extents = self.extents(self.unsafe_found)
+            is_open = [not (extents <= box).all(axis=(1, 2)).any() for box in boxes]
+            boxes = boxes[is_open][: max(SIMULATED_BOXES // len(self.corners), 1)]
+            if not len(boxes):
+                continue
+            safe = boxes[self._safe_boxes(boxes)]
+            if len(safe):
+                best = safe[int(np.argmax(_log_volume(safe, width)))]
+        return best
+
+    def _safe_boxes(self, boxes: Sequence[FloatArray] | FloatArray) -> BoolArray:
+        """Which boxes are safe at the known corners."""
+        settings = np.concatenate([self.corner_settings(box, self.corners) for box in boxes])
+        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
+        self.unsafe_found = np.concatenate([self.unsafe_found, settings[is_unsafe]])
+        return ~is_unsafe.reshape(len(boxes), -1).any(axis=1)
 
     def shrunk(self, sides: FloatArray) -> FloatArray | None:
         """A box in which no search finds anything unsafe any more; None if the fixed sides alone are unsafe."""
@@ -211,10 +206,7 @@ class _Search:
             corner = np.where(found[0] < self.original, -1.0, 1.0)
             if not any((corner == known).all() for known in self.corners):
                 self.corners.append(corner)
-                if self.unsafe.of(self.evaluator.evaluate(self.corner_settings(sides, [corner]), STAGE))[0]:
-                    sides = self.balanced(sides, corner)
-            inside = found[self.holds(sides, found)]
-            for setting in inside[:1]:
+            for setting in found[:1]:
                 self.boundary_factors(setting)
             smaller = self.without(sides, self.unsafe_found)
             if smaller is None:
@@ -302,9 +294,7 @@ def find_joint_limits(
         for column, (low, high) in zip(columns, margins, strict=True):
             worst[column] = -1.0 if low is not None and (high is None or low < high) else 1.0
         search.corners.append(worst)
-        if len(search.find_unsafe(search.corner_settings(sides, [worst]))):
-            sides = search.balanced(sides, worst)
-        sides = search.without(sides, search.unsafe_found)
+        sides = search.largest(sides)
     seed, attempt = evaluator.study.search.seed, 0
     while sides is not None and attempt < MAX_ROUNDS:
         sides = search.shrunk(sides)
