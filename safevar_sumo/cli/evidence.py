@@ -62,10 +62,26 @@ def export(directory: str, solution: str, point: str | None, to: str, out: Path)
 @click.option("--tolerance", "questions", flag_value="tolerance", multiple=True, help="With the tolerances.")
 @click.option("--risk", "questions", flag_value="risk", multiple=True, help="With the share of unsafe vehicles.")
 @click.option("--rating", "questions", flag_value="rating", multiple=True, help="With the rating, of a rated study.")
+@click.option(
+    "--repair", "questions", flag_value="repair", multiple=True, help="With repairs, by [repair] of the study."
+)
+@click.option(
+    "--reference",
+    "references",
+    multiple=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.csv",
+    help="Validate each study with these published rows; may be repeated.",
+)
 @click.option("--digests-only", is_flag=True, help="Leave your code and files out; the pack then has their digests.")
 @jobs_option
 def evidence(
-    directories: tuple[str, ...], out: Path, questions: tuple[str, ...], digests_only: bool, jobs: int | None
+    directories: tuple[str, ...],
+    out: Path,
+    questions: tuple[str, ...],
+    references: tuple[Path, ...],
+    digests_only: bool,
+    jobs: int | None,
 ) -> None:
     """Pack results DIR... with their study, answers and dossier, so that anybody can make every number again."""
     from safevar_sumo.report.evidence import Maker
@@ -73,7 +89,7 @@ def evidence(
 
     check_output(out, "--out", (".zip",))
     with open_progress(True) as progress:
-        maker = Maker(questions, digests_only, jobs, progress)
+        maker = Maker(questions, references, digests_only, jobs, progress)
         description = maker.make(directories)
     write_pack(out, description, maker.files)
     click.echo(f"Evidence: {out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {file_digest_of(out)})")

@@ -133,10 +133,11 @@ RATING_POINTS = Metric(
 
 
 JERK_TIME = 1.0
-"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s.
+"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s;
+cited from memory, not read.
 """
 BRAKING_TIME = 0.5
-"""Time over which a deceleration is averaged [s], as for accelerations in UN R79."""
+"""Time over which a deceleration is averaged [s], as for accelerations in UN R79; cited from memory, not read."""
 HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
 """W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
 

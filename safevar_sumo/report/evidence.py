@@ -19,6 +19,8 @@ from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import rate_variant
+from safevar_sumo.analysis.repair import RepairOptions
+from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.research_questions.case import Case, are_collisions, build_case
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.compute import estimate_risk
@@ -31,6 +33,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import file_by_name
 from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.reference.rows import read_reference
+from safevar_sumo.report.dossier import dossier_page, make_dossier
+from safevar_sumo.report.measurements import check_study, validate_with
 from safevar_sumo.report.pack import Description, PackedAnswer, PackedStudy, describe
 from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, read_manifest
 from safevar_sumo.results.journal import files_read_later
@@ -45,9 +50,12 @@ QUESTIONS: Mapping[str, tuple[type[Options], Callable[..., Any]]] = {
     "tolerance": (ToleranceOptions, find_tolerances),
     "risk": (RiskOptions, estimate_risk),
     "rating": (RatingOptions, rate_variant),
+    "repair": (RepairOptions, find_repairs),
 }
 """The questions whose answers a pack may hold: their options, and the functions that compute them."""
-STUDY, SETTINGS, ANSWERS, CODE = "study.toml", "settings.csv", "answers", "code"
+STUDY, SETTINGS, CHECKS, DOSSIER = "study.toml", "settings.csv", "checks.json", "dossier"
+ANSWERS, CODE, REFERENCES, VALIDATIONS = "answers", "code", "references", "validations"
+"""Files and folders of a study in a pack."""
 PLACE = "place"
 """Column of `settings.csv`: the answer that names a setting, and where in its JSON."""
 TEXT_COLUMNS = ("algorithm", "outcome", PLACE)
@@ -69,6 +77,15 @@ class Subject(NamedTuple):
         _, compute = QUESTIONS[options.question]
         answer = answer_question(compute, self.case, options, pool=pool, progress=progress)
         return json.dumps(answer.to_dict(), indent=2, allow_nan=False) + "\n"
+
+    def checks(self, pool: Pool, progress: Progress) -> bytes:
+        """The JSON of `check_study` on the solutions."""
+        settings = self.case.solutions[list(self.case.characteristics.names)].to_numpy(float)
+        return json_bytes(check_study(self.study, settings, pool, progress))
+
+    def validation(self, reference: Path, pool: Pool, progress: Progress) -> bytes:
+        """The JSON of `validate_with`."""
+        return json_bytes(validate_with(self.study, reference, pool, progress))
 
     def evaluated(self, settings: FloatArray, pool: Pool, progress: Progress, stage: str) -> pd.DataFrame:
         """Settings, shape (M, n), as rows of `solutions.csv` without algorithm and run."""
@@ -103,8 +120,8 @@ def read_table(content: bytes) -> pd.DataFrame:
     return frame.astype({name: int for name in WHOLE_COLUMNS if name in frame})
 
 
-def manifest_bytes(manifest: JsonObject) -> bytes:
-    return (json.dumps(manifest, indent=2, allow_nan=False) + "\n").encode()
+def json_bytes(value: JsonObject) -> bytes:
+    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
 
 
 def csv_of(frame: pd.DataFrame) -> bytes:
@@ -134,12 +151,21 @@ class Maker:
     ----------
     questions
         Names of `QUESTIONS` to be answered about each.
+    references
+        Files of published rows to validate each study with.
     digests_only
         Whether user code and files stay out of the pack.
     """
 
-    def __init__(self, questions: Collection[str], digests_only: bool, jobs: int | None, progress: Progress) -> None:
-        self._questions = [name for name in QUESTIONS if name in questions]
+    def __init__(
+        self,
+        questions: Collection[str],
+        references: Sequence[Path],
+        digests_only: bool,
+        jobs: int | None,
+        progress: Progress,
+    ) -> None:
+        self._questions, self._references = [name for name in QUESTIONS if name in questions], references
         self._digests_only, self._jobs, self._progress = digests_only, jobs, progress
         self.files: dict[str, bytes] = {}
 
@@ -151,12 +177,16 @@ class Maker:
         InputError
             If a directory holds no results of a study, or its inputs have changed since.
         """
+        if len({path.stem for path in self._references}) < len(self._references):
+            raise InputError("references", "two files have the same name", "files of different names")
         cases = []
         for directory in map(Path, directories):
             case = study_or_case(directory, results_only=True)
             assert isinstance(case, Case)
             if not case.has_runs:
                 raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
+            for reference in self._references:
+                read_reference(reference, case.characteristics)  # refuses a wrong file before the work begins
             cases.append((directory, case))
         studies = [self._pack(number, directory, case) for number, (directory, case) in enumerate(cases, 1)]
         return describe(studies, self._digests_only)
@@ -186,8 +216,15 @@ class Maker:
                 self.files[f"{folder}/{SETTINGS}"] = csv_of(
                     pd.concat([pd.Series([*settings], name=PLACE), frame], axis=1)
                 )
+            checks = subject.checks(pool, self._progress)
+            made = [subject.validation(path, pool, self._progress) for path in self._references]
+        for path, validation in zip(self._references, made, strict=True):
+            self.files[f"{folder}/{VALIDATIONS}/{path.stem}.json"] = validation
+            if not self._digests_only:
+                self.files[f"{folder}/{REFERENCES}/{path.name}"] = path.read_bytes()
         self.files |= {
-            f"{folder}/{MANIFEST}": manifest_bytes(manifest),
+            f"{folder}/{CHECKS}": checks,
+            f"{folder}/{MANIFEST}": json_bytes(manifest),
             f"{folder}/{SOLUTIONS}": solutions,
             f"{folder}/{STUDY}": study_text(subject.study).encode(),
             **{f"{folder}/{CODE}/{name}": content for name, content in code.items()},
@@ -198,7 +235,23 @@ class Maker:
             "evaluations": len(case.evaluations),
             "collisions": int(are_collisions(case.evaluations).sum()),
         }
-        return PackedStudy(folder, case.study.name, counts, answers, list(case.finished_runs), sorted(code))
+        packed = PackedStudy(folder, case.study.name, counts, answers, list(case.finished_runs), sorted(code))
+        mine = {name.removeprefix(f"{folder}/"): text for name, text in self.files.items() if name.startswith(folder)}
+        self.files |= {f"{folder}/{name}": text for name, text in dossier_of(subject, packed, mine).items()}
+        return packed
+
+
+def dossier_of(subject: Subject, packed: PackedStudy, files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """The dossier as JSON and as a page, from the other files of a study's folder."""
+    dossier = make_dossier(
+        subject.manifest,
+        subject.study,
+        packed.counts,
+        {one.question: (one.command, json.loads(files[f"{ANSWERS}/{one.question}.json"])) for one in packed.answers},
+        json.loads(files[CHECKS]),
+        [json.loads(text) for name, text in sorted(files.items()) if name.startswith(f"{VALIDATIONS}/")],
+    )
+    return {f"{DOSSIER}.json": json_bytes(dossier), f"{DOSSIER}.html": dossier_page(dossier).encode()}
 
 
 def study_text(study: Study) -> str:

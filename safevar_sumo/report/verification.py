@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import zip_longest
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,13 +29,18 @@ from safevar_sumo.plugins import digest_of
 from safevar_sumo.records import JsonObject
 from safevar_sumo.report.evidence import (
     ANSWERS,
+    CHECKS,
     CODE,
+    DOSSIER,
     PLACE,
     QUESTIONS,
+    REFERENCES,
     SETTINGS,
     STUDY,
+    VALIDATIONS,
     csv_of,
-    manifest_bytes,
+    dossier_of,
+    json_bytes,
     named_settings,
     read_table,
     study_text,
@@ -51,7 +56,7 @@ from safevar_sumo.terminal import Progress, show_no_progress
 SAME, DIFFERS, CANNOT = "same", "differs", "cannot be made here"
 MAX_COLUMNS_NAMED = 3
 """Number of columns that a differing row names."""
-SOLUTION, SETTING, ANSWER = "solution ", "setting ", "answer "
+SOLUTION, SETTING, ANSWER, VALIDATION = "solution ", "setting ", "answer ", "validation "
 """Beginnings of the names of claims."""
 
 
@@ -149,11 +154,15 @@ class _Part:
             if name.startswith(f"{packed.folder}/")
         }
         self._manifest = json.loads(self._files[MANIFEST])
-        if manifest_bytes(self._manifest) != self._files[MANIFEST]:  # digits that no double has
+        if json_bytes(self._manifest) != self._files[MANIFEST]:  # digits that no double has
             raise ValueError(f"{MANIFEST} was edited")
         self.subject = subject_of(self._manifest, self._files[SOLUTIONS], packed.runs, ())
         self._solutions = [str(handle) for handle in handles_of(self.subject.case.solutions)]
         self._settings = read_table(self._files[SETTINGS])[PLACE].tolist() if SETTINGS in self._files else []
+        self._validations = {
+            PurePosixPath(name).stem: name for name in sorted(self._files) if name.startswith(f"{VALIDATIONS}/")
+        }
+        dossier_of(self.subject, packed, self._files)  # has all that it needs
         for answer in packed.answers:
             QUESTIONS[answer.question][0](**answer.options)
             self._files[f"{ANSWERS}/{answer.question}.json"]
@@ -193,6 +202,9 @@ class _Part:
             *(f"{SOLUTION}{handle}" for handle in self._solutions),
             *(f"{SETTING}{place}" for place in self._settings),
             *(f"{ANSWER}{answer.question}" for answer in self._packed.answers),
+            "checks",
+            *(f"{VALIDATION}{name}" for name in self._validations),
+            DOSSIER,
             *(["search"] if search else []),
         ]
 
@@ -242,6 +254,14 @@ class _Part:
         study, packed = self.subject.study, self._packed
         if name.startswith(ANSWER):
             return self._answer_difference(name.removeprefix(ANSWER), pool, progress)
+        if name == "checks":
+            return _other_bytes(self._files[CHECKS], self.subject.checks(pool, progress), name)
+        if name.startswith(VALIDATION):
+            return self._validation_difference(name.removeprefix(VALIDATION), pool, progress)
+        if name == DOSSIER:
+            made = dossier_of(self.subject, packed, self._files).items()
+            changed = ((file, text) for file, text in made if self._files[file] != text)
+            return next((_other_bytes(self._files[file], text, file) for file, text in changed), None)
         if name == "inputs":
             system = assemble(study, packed.name)
             sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
@@ -283,11 +303,17 @@ class _Part:
         stored = [place for place in self._settings if place.startswith(f"{question}.")]
         if text == packed and named == stored:
             return None
-        try:
-            difference = _first_difference(json.loads(packed), json.loads(text), question)
-        except ValueError:
-            difference = None
-        return difference or ("other bytes", "other settings" if text == packed else "other bytes")
+        return _other_bytes(packed.encode(), text.encode(), question) or ("", "other named settings")
+
+    def _validation_difference(self, name: str, pool: Pool, progress: Progress) -> tuple[str, str] | None:
+        packed = self._files[self._validations[name]]
+        file = str(json.loads(packed)["file"])
+        if f"{REFERENCES}/{file}" not in self._files:
+            raise InputError(file, "the pack has only the digest of this file")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, PurePosixPath(file).name)
+            path.write_bytes(self._files[f"{REFERENCES}/{file}"])
+            return _other_bytes(packed, self.subject.validation(path, pool, progress), name)
 
     def _search_difference(self, pool: Pool, progress: Progress) -> tuple[str, str] | None:
         """Search again: the same runs find the same solutions, after as many evaluations and collisions."""
@@ -315,6 +341,17 @@ _LABELS = ("algorithm", "run", PLACE)
 def _texts(content: bytes) -> pd.DataFrame:
     """A CSV table as texts, to compare the bytes."""
     return pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
+
+
+def _other_bytes(packed: bytes, here: bytes, path: str) -> tuple[str, str] | None:
+    """The first value at which two JSON files differ, if their bytes do."""
+    if packed == here:
+        return None
+    try:
+        difference = _first_difference(json.loads(packed), json.loads(here), path)
+    except ValueError:
+        difference = None
+    return difference or ("other bytes", "other bytes")
 
 
 def _first_difference(packed: Any, here: Any, path: str) -> tuple[str, str] | None:

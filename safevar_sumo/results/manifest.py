@@ -37,6 +37,7 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "correlations",
     "limits",
     "repair",
+    "evidence",
 )
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")

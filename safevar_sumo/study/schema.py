@@ -262,6 +262,27 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     )
 
 
+class EvidenceTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Thresholds that the user declares for measures of validation, before they are computed; no verdict of ours."""
+
+    threshold: dict[
+        Literal[
+            "relative_error",
+            "rmse",
+            "largest_error",
+            "sprague_geers",
+            "pearson",
+            "t_test",
+            "anova",
+            "kolmogorov_smirnov",
+            "spearman",
+            "mean_absolute_error",
+            "coverage",
+        ],
+        float,
+    ] = {}
+
+
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
@@ -277,7 +298,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     differs from the original by the full width of a domain; `variation` and `correlations` state how characteristics
     vary in the world, by name: uniformly by default; `constraints` are conditions that the characteristics of one
     vehicle satisfy together; `limits` are the values, by name, up to which characteristics may wear in service;
-    `repair` states what a repair of the ADS may change.
+    `repair` states what a repair of the ADS may change; `evidence` holds thresholds
+    that the user declares for a dossier.
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
@@ -305,6 +327,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     constraints: list[Constraint] = []
     limits: dict[str, Limit] = {}
     repair: RepairTable = RepairTable()
+    evidence: EvidenceTable = EvidenceTable()
     origin: Origin = Origin()
 
     @property
@@ -317,7 +340,7 @@ def tables_of(study: Study) -> Parameters:
     """A study as plain tables, without its origin and without keys that it does not use."""
     tables: Parameters = msgspec.to_builtins(study)
     del tables["origin"]
-    for name in ("constraints", "limits", "repair"):
+    for name in ("constraints", "limits", "repair", "evidence"):
         if not tables[name]:
             del tables[name]  # so that results from before these tables existed stay the same bytes
     for name in ("vehicle", "ads", "scenario"):
