@@ -40,7 +40,7 @@ from safevar_sumo.report.pack import Description, PackedAnswer, PackedStudy, des
 from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, read_manifest
 from safevar_sumo.results.journal import files_read_later
 from safevar_sumo.study import Origin, Study, convert_table, write_study
-from safevar_sumo.sumo.network import is_shipped, open_network
+from safevar_sumo.sumo.network import OPTIONS_FILE, is_shipped, open_network, options_of
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import CharacteristicSet
@@ -271,17 +271,11 @@ def _files_of_user(study: Study, sources: Iterable[str]) -> dict[str, bytes]:
     tables = [study.scenario.parameters, *(table for test in tests for table in (test.parameters, test.over))]
     texts = [text for table in tables for text in np.atleast_1d(table.get("network", [])).tolist()]
     located = {point.scenario.network for point in assemble(study, study.source).points}
-    for text in {str(text) for text in texts}:
-        place = next(
-            (
-                path
-                for path in located
-                if path == text or Path(path).parts[-len(Path(text).parts) :] == Path(text).parts
-            ),
-            "",
-        )
-        if place and not is_shipped(text) and not Path(text).is_absolute() and ".." not in Path(text).parts:
-            network, folder = open_network(place), PurePosixPath(text)
-            folder = folder if Path(place).is_dir() else folder.parent
-            paths |= {str(folder / name): network.folder / name for name, _ in network.digests}
+    for text in map(PurePosixPath, {str(text) for text in texts}):
+        place = next((path for path in located if Path(path).parts[-len(text.parts) :] == text.parts), "")
+        if place and not is_shipped(str(text)) and not text.is_absolute() and ".." not in text.parts:
+            network, folder = open_network(place), text if Path(place).is_dir() else text.parent
+            view = options_of(network.path(OPTIONS_FILE)).get("gui-settings-file", "")  # SUMO does not start without it
+            names = [*(name for name, _ in network.digests), *([view] if view else [])]
+            paths |= {str(folder / name): network.folder / name for name in names}
     return {name: path.read_bytes() for name, path in sorted(paths.items())}

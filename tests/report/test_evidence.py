@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import stat
 import zipfile
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import pytest
 from safevar_sumo.report import pack as packs
 from safevar_sumo.report.pack import DESCRIPTION, Description, describe, read_pack, write_pack
 from safevar_sumo.results import load_runs
+from safevar_sumo.shipped import NETWORKS
 from tests.in_process import refused, run
 
 MINE = """
@@ -274,6 +276,21 @@ def test_user_code_runs_only_when_told(mine: Path, in_tmp: Path) -> None:
     path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
     refused("verify", path, "--run-code", message=("code/limits.txt is not the file of the study's identity",))
     assert sorted(os.listdir()) == ["it.zip", "other.zip", "there"]
+
+
+@pytest.mark.slow
+def test_an_own_network_travels_along_and_is_no_code(in_tmp: Path) -> None:
+    shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "there" / "roads")
+    (in_tmp / "there" / "mine.toml").write_text(
+        STUDY.replace(
+            '[ads]\nmodel = "mine:Mine"\nparameters = { limits = "limits.txt" }',
+            '[scenario.parameters]\nnetwork = "roads"',
+        )
+    )
+    run("evidence", str(searched_here(in_tmp / "there")), "--out", "it.zip")
+    shutil.rmtree(in_tmp / "there")
+    result = json.loads(run("verify", "it.zip", "--json").stdout)
+    assert result["same"] == result["claims"] > 4
 
 
 @pytest.mark.slow
