@@ -118,12 +118,15 @@ def verify(
         If the pack is damaged, of another version, or holds user code and `run_code` is false.
     """
     description, files = read_pack(path)
+    folders = tuple(f"{packed.folder}/" for packed in description.studies)
+    if not folders or (stray := [name for name in files if not name.startswith(folders)]):
+        raise InputError(path, f"{stray[0]} belongs to no study" if folders else "holds no study", PACK)
     with ExitStack() as stack:
         parts = []
         for packed in description.studies:
             try:
                 parts.append(_Part(path, packed, files))
-            except (LookupError, ValueError, TypeError, InputError) as error:
+            except (LookupError, ValueError, TypeError, RecursionError, InputError) as error:
                 raise InputError(path, f"{packed.folder} is damaged: {describe_error(error)}", PACK) from None
         if not run_code and (code := [name for part in parts for name in part.code_in_words]):
             raise InputError(
@@ -168,6 +171,14 @@ class _Part:
             self._files[f"{ANSWERS}/{answer.question}.json"]
         for name in packed.code:
             self._files[f"{CODE}/{name}"]
+        for file in (SOLUTIONS, SETTINGS) if self._settings else (SOLUTIONS,):
+            _texts(self._files[file])[list(self.subject.case.characteristics.names)].to_numpy(dtype=float)
+        known = {MANIFEST, SOLUTIONS, SETTINGS, STUDY, CHECKS, f"{DOSSIER}.json", f"{DOSSIER}.html"}
+        known |= {f"{ANSWERS}/{answer.question}.json" for answer in packed.answers}
+        known |= {f"{CODE}/{name}" for name in packed.code}
+        for name in self._files:
+            if name not in known and not name.startswith((f"{VALIDATIONS}/", f"{REFERENCES}/")):
+                raise ValueError(f"{name} belongs to no claim")
 
     @property
     def code_in_words(self) -> list[str]:
@@ -277,9 +288,8 @@ class _Part:
             return self._original_difference(pool, progress)
         if name == "search":
             return self._search_difference(pool, progress)
-        claimed = (packed.counts["solutions"], packed.counts["runs"])
-        counted = (len(self._solutions), len(packed.runs))
-        return None if claimed == counted else (str(claimed), str(counted))
+        counted = {"solutions": len(self._solutions), "runs": len(packed.runs)}
+        return _first_difference({key: packed.counts.get(key) for key in counted}, counted, "counts")
 
     def _study_difference(self, study: Study) -> tuple[str, str] | None:
         text = self._files[STUDY].decode(errors="replace")

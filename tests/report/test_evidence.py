@@ -185,6 +185,20 @@ def test_digits_beyond_the_last_bit_are_damage(bare: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_what_no_claim_covers_is_damage(bare: Path, tmp_path: Path) -> None:
+    description, files = read_pack(bare)
+    for name in ("1-slippery/answers/risk.json", "2-other/manifest.json"):
+        write_pack(tmp_path / "it.zip", description, {**files, name: b"{}"})
+        refused("verify", str(tmp_path / "it.zip"), message=(name.removeprefix("1-slippery/"), "belongs to no"))
+    write_pack(tmp_path / "it.zip", msgspec.structs.replace(description, studies=[]), {})
+    refused("verify", str(tmp_path / "it.zip"), message=("holds no study",))
+    for name in ("solutions.csv", "manifest.json", "checks.json"):
+        for text in (b"[" * 100_000, b"", b"a,b\n1,2\n", b"\xff\xfe"):
+            write_pack(tmp_path / "it.zip", description, {**files, f"1-slippery/{name}": text})
+            refused("verify", str(tmp_path / "it.zip"), message=("1-slippery is damaged",))
+
+
+@pytest.mark.slow
 def test_a_changed_study_is_another_study_throughout(bare: Path, tmp_path: Path) -> None:
     change = digit_of(r'"tyre_friction": 0\.(\d)')
     claims = not_same(changed(bare, tmp_path / "it.zip", "manifest.json", change))
