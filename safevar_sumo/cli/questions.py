@@ -173,8 +173,6 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     options, subject = RiskOptions(**values), load_results_or_study(source, point)
     check_output(plot, "--plot")
     result = answer_question(estimate_risk, subject, options, jobs=jobs)
-    if result.study.correlations:
-        print_note("no sensitivity indices: they are not defined for correlated characteristics")
     if result.errors:
         print_warning(f"{result.errors} vehicles could not be simulated and are left out")
     return _show(result, as_json, plot)

@@ -30,6 +30,14 @@ FLEET_VEHICLES = 1000
 """Number of vehicles of the fleet in examples."""
 INDICES = ("first_order", "total")
 """Sobol indices."""
+SHARE = ("share",)
+"""Shapley effects as shares of the variance."""
+BARS = {
+    "total": ("total: with all others", GREY, 0.2),
+    "first_order": ("alone", BLUE, -0.2),
+    "share": ("Shapley effect", BLUE, 0.0),
+}
+"""Label, colour and place of each index in the figure."""
 ERROR_STYLE = {"elinewidth": 0.8, "ecolor": "black"}
 
 
@@ -75,14 +83,18 @@ class Risk(Estimate):
     sensitivity, sensitivity_of_unsafe
         The two frames of `compute_sensitivities`; None if characteristics are correlated or bound by constraints,
         because Sobol indices are then undefined.
+    shapley, shapley_of_unsafe
+        In that case the two frames of `compute_shapley_effects`, unless a method for rare failures is required.
     """
 
     study: Study
     unsafe: Unsafe
     samples: int
     confidence: float
-    sensitivity: pd.DataFrame | None
-    sensitivity_of_unsafe: pd.DataFrame | None
+    sensitivity: pd.DataFrame | None = None
+    sensitivity_of_unsafe: pd.DataFrame | None = None
+    shapley: pd.DataFrame | None = None
+    shapley_of_unsafe: pd.DataFrame | None = None
     no_verdict: str = ""
 
     @property
@@ -93,6 +105,13 @@ class Risk(Estimate):
     def of_fleet(self, vehicles: int) -> float:
         """Probability that at least one of N = `vehicles` vehicles that vary independently is unsafe, 1 - (1 - p)^N."""
         return float(-np.expm1(vehicles * np.log1p(-self.probability))) if self.probability < 1 else 1.0
+
+    @property
+    def _what_decides(self) -> tuple[tuple[str, ...], list[pd.DataFrame]]:
+        """The names of the indices, and the two frames that hold them; no frame without indices."""
+        of_sobol, of_shapley = (self.sensitivity, self.sensitivity_of_unsafe), (self.shapley, self.shapley_of_unsafe)
+        indices, both = (INDICES, of_sobol) if self.shapley is None else (SHARE, of_shapley)
+        return indices, [frame for frame in both if frame is not None]
 
     def to_dict(self) -> JsonObject:
         """The JSON of `risk`."""
@@ -117,6 +136,7 @@ class Risk(Estimate):
                 }
                 for row in rows
             ],
+            **self._shapley_entry(),
             "method": self.method,
             "simulations": self.simulations,
             "coefficient_of_variation": finite_or_none(self.coefficient_of_variation),
@@ -124,19 +144,35 @@ class Risk(Estimate):
             "remark": self.remark,
         }
 
+    def _shapley_entry(self) -> JsonObject:
+        """The entry `shapley` of the JSON, only where Sobol indices are undefined."""
+        if self.shapley is None:
+            return {}
+        rows = [
+            {
+                "characteristic": row["characteristic"],
+                "effect": finite_or_none(row["effect"]),
+                "share": finite_or_none(row["share"]),
+                "share_interval": [finite_or_none(row[f"share_{end}"]) for end in ("lower", "upper")],
+            }
+            for row in self.shapley.to_dict("records")
+        ]
+        return {"shapley": rows}
+
     def to_frame(self) -> pd.DataFrame:
         """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if
-        correlated.
+        there is none.
 
-        Columns: `output` (safety_degree or unsafe), and the columns of `compute_sensitivities`.
+        Columns: `output` (safety_degree or unsafe), and the columns of `compute_sensitivities` or, if Sobol indices
+        are undefined, of `compute_shapley_effects`.
         """
-        frames = {SAFETY_DEGREE: self.sensitivity, "unsafe": self.sensitivity_of_unsafe}
+        indices, frames = self._what_decides
         columns = [
-            "output",
-            "characteristic",
-            *(f"{name}{end}" for name in INDICES for end in ("", "_lower", "_upper")),
+            *("output", "characteristic", *(["effect"] if indices == SHARE else [])),
+            *(f"{name}{end}" for name in indices for end in ("", "_lower", "_upper")),
         ]
-        tables = [frame.assign(output=name) for name, frame in frames.items() if frame is not None]
+        outputs = (SAFETY_DEGREE, "unsafe")
+        tables = [frame.assign(output=name) for name, frame in zip(outputs, frames, strict=False)]
         return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
 
     def __repr__(self) -> str:
@@ -174,52 +210,48 @@ class Risk(Estimate):
             )
         yield _how_vehicles_vary(self.study)
         yield from constraints_in_words(self.study)
-        if self.sensitivity is None or self.sensitivity_of_unsafe is None:
+        indices, frames = self._what_decides
+        if not frames:
             return
-        table = WholeTable(
-            "characteristic",
-            right=("SD alone", "SD in all", "unsafe alone", "unsafe in all"),
-            title="What decides: share of the variance",
-        )
-        outputs = [frame.set_index("characteristic") for frame in (self.sensitivity, self.sensitivity_of_unsafe)]
-        for name in outputs[0].sort_values("total", ascending=False, kind="stable").index:
+        heads = ("SD alone", "SD in all", "unsafe alone", "unsafe in all") if indices == INDICES else ("SD", "unsafe")
+        table = WholeTable("characteristic", right=heads, title="What decides: share of the variance")
+        outputs = [frame.set_index("characteristic") for frame in frames]
+        for name in outputs[0].sort_values(indices[-1], ascending=False, kind="stable").index:
             rows = [output.loc[name] for output in outputs]
-            table.add_row(name, *(_index_in_words(row, index) for row in rows for index in INDICES))
+            table.add_row(name, *(_index_in_words(row, index) for row in rows for index in indices))
         yield table
-        if self.sensitivity_of_unsafe["total"].isna().all():
+        if outputs[1][indices[-1]].isna().all():
             yield "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe."
         yield meanings(characteristics)
+        kind = "Sobol indices, first order and total" if indices == INDICES else "Shapley effects, which sum to 1"
         yield (
-            f"Sobol indices, first order and total, with half of their {100 * self.confidence:g} % intervals: "
-            "estimates, "
+            f"{kind}, with half of their {100 * self.confidence:g} % intervals: estimates, "
             "which may exceed 1 or fall below 0 by their error."
         )
 
     def figure(self) -> Figure:
-        """Sobol indices of every characteristic with intervals, for the safety degree and for unsafe outcomes.
+        """Sobol indices or Shapley effects of every characteristic with intervals, for the safety degree and for unsafe
+        outcomes.
 
         Raises
         ------
         InputError
-            If characteristics are correlated or bound by constraints, so that indices are undefined.
+            If there are none, because a method for rare failures was required.
         """
-        if self.sensitivity is None or self.sensitivity_of_unsafe is None:
+        indices, both = self._what_decides
+        if not both:
             raise InputError(
-                "correlations",
-                "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
-                "a study without correlations and constraints",
+                "method", "there are no sensitivity indices with a method for rare failures", "auto or monte_carlo"
             )
-        order = self.sensitivity.sort_values("total", kind="stable")["characteristic"]
+        order = both[0].sort_values(indices[-1], kind="stable")["characteristic"]
         title = f"{self.study.name}: what decides ({100 * self.confidence:g} % intervals)"
         figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(order), 4)), sharey=True)
-        frames = {"safety degree": self.sensitivity, f"unsafe ({self.unsafe})": self.sensitivity_of_unsafe}
+        frames = dict(zip(("safety degree", f"unsafe ({self.unsafe})"), both, strict=True))
         names = [escape_dollars(name) for name in order]
         for axis, (output, frame) in zip(axes, frames.items(), strict=True):
             rows = frame.set_index("characteristic").loc[order]
-            for index, label, colour, shift in (
-                ("total", "total: with all others", GREY, 0.2),
-                ("first_order", "alone", BLUE, -0.2),
-            ):
+            for index in reversed(indices):
+                label, colour, shift = BARS[index]
                 error = (rows[f"{index}_upper"] - rows[index]).clip(lower=0)
                 places = np.arange(len(names)) + shift
                 axis.barh(places, rows[index], height=0.36, color=colour, label=label, xerr=error, error_kw=ERROR_STYLE)

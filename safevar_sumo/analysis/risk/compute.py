@@ -19,6 +19,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.answer import Estimate, Risk
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns
+from safevar_sumo.analysis.risk.shapley import compute_shapley_effects
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -58,20 +59,23 @@ def estimate_risk(source: Study | Case, options: RiskOptions, evaluator: Evaluat
     unsafe = evaluator.choose_criterion(options.unsafe, source)
     simulated_before = evaluator.simulated
     estimate = vars(_draw_vehicles(evaluator, model, unsafe, options))
-    has_indices = not (model.is_correlated or evaluator.region or options.requires_rare_method)
-    sensitivity, sensitivity_of_unsafe = (
-        compute_sensitivities(evaluator, model, unsafe, options.confidence) if has_indices else (None, None)
+    are_independent = not (model.is_correlated or evaluator.region)
+    compute = compute_sensitivities if are_independent else compute_shapley_effects
+    of_degree, of_unsafe = (
+        (None, None) if options.requires_rare_method else compute(evaluator, model, unsafe, options.confidence)
     )
     samples, simulations = estimate["simulations"] - estimate["errors"], simulated_before + estimate.pop("simulations")
     return Risk(
         study=evaluator.study,
         unsafe=unsafe,
         confidence=options.confidence,
-        sensitivity=sensitivity,
         no_verdict=evaluator.no_verdict,
-        sensitivity_of_unsafe=sensitivity_of_unsafe,
         samples=samples,
         simulations=simulations,
+        sensitivity=of_degree if are_independent else None,
+        sensitivity_of_unsafe=of_unsafe if are_independent else None,
+        shapley=None if are_independent else of_degree,
+        shapley_of_unsafe=None if are_independent else of_unsafe,
         **estimate,
     )
 
@@ -195,6 +199,8 @@ class VariationModel:
         for correlation in study.correlations:
             first, second = map(self._characteristics.names.index, correlation.between)
             matrix[first, second] = matrix[second, first] = correlation.value
+        self.correlation = matrix
+        self.varying = np.array([not isinstance(study.variation.get(one.name), Fixed) for one in self._characteristics])
         try:
             self._factor = np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError:
@@ -212,7 +218,11 @@ class VariationModel:
 
     def settings_of_normal(self, points: FloatArray) -> FloatArray:
         """Settings at N points of standard normal space, shape (N, n), correlated as the study specifies."""
-        return self._settings_at(scipy.stats.norm.cdf(points @ self._factor.T if self.is_correlated else points))
+        return self.settings_of_correlated(points @ self._factor.T if self.is_correlated else points)
+
+    def settings_of_correlated(self, points: FloatArray) -> FloatArray:
+        """Settings at N points of normal space, shape (N, n), that have the study's correlations already."""
+        return self._settings_at(scipy.stats.norm.cdf(points))
 
     def _settings_at(self, probabilities: FloatArray) -> FloatArray:
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]

@@ -1,0 +1,134 @@
+"""Shapley effects against closed forms: linear functions of correlated normal values, and a simplex."""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from safevar_sumo import risk
+from safevar_sumo.analysis.risk.answer import Risk
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import load_study
+from tests.analysis.known_regions import Plant, made_up_study, nowhere
+from tests.in_process import run
+
+NAMES = "abcdefgh"
+
+
+def closed_form(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """The mean, over all orders, of the growth of Var(Y | the others), which is a constant for a linear function."""
+    d = len(slopes)
+
+    def conditional(joined: tuple[int, ...]) -> float:
+        others = [index for index in range(d) if index not in joined]
+        rest = covariance[np.ix_(joined, joined)]
+        if others:
+            mixed = covariance[np.ix_(joined, others)]
+            rest = rest - mixed @ np.linalg.inv(covariance[np.ix_(others, others)]) @ mixed.T
+        return float(slopes[list(joined)] @ rest @ slopes[list(joined)]) if joined else 0.0
+
+    effects, orders = np.zeros(d), list(permutations(range(d)))
+    for order in orders:
+        for place, index in enumerate(order):
+            effects[index] += conditional(order[: place + 1]) - conditional(order[:place])
+    return effects / len(orders)
+
+
+def linear(slopes: list[float], deviations: list[float], correlations: dict[tuple[int, int], float]) -> Risk:
+    names = NAMES[: len(slopes)]
+    study = load_study(
+        made_up_study(len(slopes)),
+        variation={
+            name: {"distribution": "normal", "deviation": deviation}
+            for name, deviation in zip(names, deviations, strict=True)
+        },
+        correlations=[{"between": [names[i], names[j]], "value": value} for (i, j), value in correlations.items()],
+    )
+    plant = Plant(study, nowhere, lambda settings: (settings - 5) @ np.array(slopes) + 10)
+    return risk(study, unsafe="below=10", samples=200, pool=plant)
+
+
+@pytest.mark.parametrize(
+    ("slopes", "deviations", "correlations"),
+    [
+        ([1.0, 1.0], [0.5, 1.0], {(0, 1): -0.7}),
+        ([1.0, 1.0, 1.0], [0.5, 0.5, 1.0], {(1, 2): 0.9}),
+        pytest.param(
+            [1.0, -1.0, 2.0, 1.0, 0.5, 0.7], [0.5] * 6, {(0, 1): 0.5, (2, 3): -0.6, (4, 5): 0.8}, marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_effects_of_correlated_normal_values_are_those_of_the_closed_form(
+    slopes: list[float], deviations: list[float], correlations: dict[tuple[int, int], float]
+) -> None:
+    matrix = np.eye(len(slopes))
+    for (i, j), value in correlations.items():
+        matrix[i, j] = matrix[j, i] = value
+    expected = closed_form(np.array(slopes), np.outer(deviations, deviations) * matrix)
+    result = linear(slopes, deviations, correlations)
+    assert result.shapley is not None
+    assert result.sensitivity is None
+    np.testing.assert_allclose(result.shapley["effect"], expected, rtol=0.02)
+    assert result.shapley["effect"].sum() == pytest.approx(expected.sum(), rel=0.02)
+    assert result.shapley["share"].sum() == pytest.approx(1, abs=1e-12)
+    assert result.shapley_of_unsafe is not None
+    assert result.shapley_of_unsafe["share"].sum() == pytest.approx(1, abs=1e-12)
+    entry = result.to_dict()
+    assert entry["sensitivity"] == []
+    assert [row["effect"] for row in entry["shapley"]] == result.shapley["effect"].to_list()
+    assert set(result.to_frame()["output"]) == {"safety_degree", "unsafe"}
+    assert result.figure().axes
+
+
+def test_a_constraint_a_characteristic_that_does_not_vary_and_an_output_that_does_not() -> None:
+    """On the triangle a + b <= 10 of a square the conditional variance of a given b is (10 - b)^2 / 12."""
+    study = load_study(
+        made_up_study(3),
+        variation={"c": {"distribution": "fixed"}},
+        constraints=[{"sum": {"a": 1.0, "b": 1.0}, "at_most": 10.0}],
+    )
+    result = risk(study, samples=200, unsafe="below=-5", pool=Plant(study, nowhere, lambda settings: settings[:, 0]))
+    assert result.shapley is not None
+    effects = result.shapley.set_index("characteristic")["effect"]
+    variance, alone = 100 / 18, 50 / 12  # E[(10 - b)^2] / 12 with the density (10 - b) / 50
+    expected = {"a": (alone + variance) / 2, "b": (variance - alone) / 2, "c": 0.0}
+    assert effects.to_dict() == pytest.approx(expected, abs=0.02 * variance)
+    assert result.shapley_of_unsafe is not None
+    assert result.shapley_of_unsafe["share"].isna().all()
+    words = "\n".join(part for part in result.sentences() if isinstance(part, str))
+    assert "Shapley effects, which sum to 1" in words
+    assert "There are no indices of the unsafe outcome" in words
+
+
+@pytest.mark.parametrize("varying", [0, 1])
+def test_one_characteristic_or_none_that_varies(varying: int) -> None:
+    study = load_study(
+        made_up_study(2),
+        variation={name: {"distribution": "fixed"} for name in "ab"[varying:]},
+        correlations=[{"between": ["a", "b"], "value": 0.5}],
+    )
+    result = risk(study, samples=50, unsafe="below=5", pool=Plant(study, nowhere, lambda settings: settings[:, 0]))
+    assert result.shapley is not None
+    shares = result.shapley["share"]
+    assert shares.to_list() == pytest.approx([1.0, 0.0]) if varying else shares.isna().all()
+
+
+def test_independent_characteristics_have_sobol_indices_and_no_key_of_their_own() -> None:
+    result = linear([1.0, 1.0], [0.5, 1.0], {})
+    assert "shapley" not in result.to_dict()
+    assert result.shapley is None
+
+
+@pytest.mark.slow
+def test_the_command_draws_them_and_repeats_them_to_the_bit(in_tmp: Path) -> None:
+    typed = ("risk", "rain_realistic", "--samples", "200", "--json")
+    one, two = (run(*typed, "--jobs", jobs, "--plot", "it.png").stdout for jobs in ("1", "2"))
+    assert one == two
+    assert Path("it.png").stat().st_size > 10_000
+    assert pd.DataFrame(pd.read_json(one, typ="series")["shapley"])["share"].sum() == pytest.approx(1)
+    assert math.isfinite(sum(pd.DataFrame(pd.read_json(one, typ="series")["shapley"])["effect"]))
