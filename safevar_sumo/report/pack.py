@@ -120,7 +120,9 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     names = [entry.filename for entry in entries]
     for entry in entries:
         name = entry.filename
-        if name.startswith("/") or ".." in PurePosixPath(name).parts or "\\" in name or ":" in name:
+        path_of_entry = PurePosixPath(name)
+        is_inside = name == str(path_of_entry) and not path_of_entry.is_absolute() and ".." not in path_of_entry.parts
+        if not is_inside or "\\" in name or ":" in name:  # "a//b" is no path inside either: joined, it is "/b"
             _refuse(path, f"the path {name!r} leaves the pack")
         if stat.S_ISLNK(entry.external_attr >> 16):
             _refuse(path, f"{name!r} is a symbolic link")

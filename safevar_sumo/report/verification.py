@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import tempfile
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -49,7 +48,7 @@ from safevar_sumo.report.evidence import (
 from safevar_sumo.report.pack import PACK, PackedStudy, read_pack
 from safevar_sumo.results import MANIFEST, SOLUTIONS, handles_of, load_runs, manifest_of, record
 from safevar_sumo.results.manifest import differences
-from safevar_sumo.study import Study, load_study, tables_of, user_code_names
+from safevar_sumo.study import user_code_names
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 
@@ -283,23 +282,13 @@ class _Part:
             changes = [text for _, text, changes_simulations in differences(self._manifest, now) if changes_simulations]
             return ("", "; ".join(changes)) if changes else None
         if name == "study":
-            return self._study_difference(study)
+            return _other_lines(self._files[STUDY], study_text(study).encode())
         if name == "original vehicle":
             return self._original_difference(pool, progress)
         if name == "search":
             return self._search_difference(pool, progress)
         counted = {"solutions": len(self._solutions), "runs": len(packed.runs)}
         return _first_difference({key: packed.counts.get(key) for key in counted}, counted, "counts")
-
-    def _study_difference(self, study: Study) -> tuple[str, str] | None:
-        text = self._files[STUDY].decode(errors="replace")
-        if text == study_text(study):
-            return None
-        try:
-            other = tables_of(load_study(tomllib.loads(text)))
-        except (SafevarError, ValueError) as error:
-            return describe_error(error), MANIFEST
-        return _first_difference(other, tables_of(study), STUDY) or ("other text", MANIFEST)
 
     def _original_difference(self, pool: Pool, progress: Progress) -> tuple[str, str] | None:
         original = Evaluator(self.subject.study, pool, progress).evaluate_original()
@@ -343,8 +332,7 @@ class _Part:
         }
         if difference := _first_difference(self._packed.counts, counts, "counts"):
             return difference
-        lines = zip_longest(self._files[SOLUTIONS].decode().splitlines(), csv_of(solutions).decode().splitlines())
-        return next(((str(first), str(second)) for first, second in lines if first != second), None)
+        return _other_lines(self._files[SOLUTIONS], csv_of(solutions))
 
 
 _LABELS = ("algorithm", "run", PLACE)
@@ -354,6 +342,12 @@ _LABELS = ("algorithm", "run", PLACE)
 def _texts(content: bytes) -> pd.DataFrame:
     """A CSV table as texts, to compare the bytes."""
     return pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
+
+
+def _other_lines(packed: bytes, here: bytes) -> tuple[str, str] | None:
+    """The first line at which two texts differ."""
+    lines = zip_longest(*(text.decode(errors="replace").splitlines(keepends=True) for text in (packed, here)))
+    return next(((str(first).strip(), str(second).strip()) for first, second in lines if first != second), None)
 
 
 def _other_bytes(packed: bytes, here: bytes, path: str) -> tuple[str, str] | None:
