@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from html import escape
 from threading import Event, Thread
-from typing import Any
+from typing import Any, Protocol
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
@@ -104,6 +105,41 @@ def print_answer(console: Console, study: Study, no_verdict: str, parts: Iterabl
             print_text(console, part)
         elif part.row_count:
             console.print(part)
+
+
+class ShownAnswer(Protocol):
+    """An answer that a terminal or a notebook can show."""
+
+    @property
+    def study(self) -> Study: ...
+    @property
+    def no_verdict(self) -> str: ...
+    def sentences(self) -> Iterable[str | Table]: ...
+
+
+def answer_as_html(answer: ShownAnswer) -> str:
+    """The sentences and tables that a terminal shows, as HTML for a notebook."""
+    lines = [
+        f"<p>{escape(answer.no_verdict)}</p>" if answer.no_verdict else "",
+        f"<h4>{escape(answer.study.title)}</h4>",
+    ]
+    for part in answer.sentences():
+        lines += [f"<p>{escape(part)}</p>"] if isinstance(part, str) else _table_as_html(part)
+    return "\n".join(filter(None, lines))
+
+
+def _table_as_html(table: Table) -> list[str]:
+    if not table.row_count:
+        return []
+    title = getattr(table, "_title_line", "")
+    columns = [list(column.cells) for column in table.columns]
+    heads = "".join(f"<th>{escape(str(column.header))}</th>" for column in table.columns) if table.show_header else ""
+    rows = ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in zip(*columns, strict=True)]
+    return [
+        f"<table><caption>{escape(str(title))}</caption>" if title else "<table>",
+        *(f"<tr>{row}</tr>" for row in (heads, *rows) if row),
+        "</table>",
+    ]
 
 
 def print_heading(console: Console, title: str, no_verdict: str) -> None:

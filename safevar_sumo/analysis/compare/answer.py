@@ -22,7 +22,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
-from safevar_sumo.terminal import WholeTable, meanings
+from safevar_sumo.terminal import WholeTable, answer_as_html, meanings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -158,6 +158,8 @@ class SystemComparison:
             ends = (f"{facts['outcome']}, SD {two_decimals(facts[SAFETY_DEGREE])}" for facts in (a_facts, b_facts))
             texts.append(" in A, ".join(ends) + " in B")
         return texts
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         counts = self.counts()

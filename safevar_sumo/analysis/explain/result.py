@@ -21,6 +21,7 @@ from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import SolutionId
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.terminal import answer_as_html
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -168,6 +169,8 @@ class Explained:
             **driven_entry(self.no_verdict),
         }
         return [*(failure.to_dict() for failure in self.explanations), {"summary": summary}]
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         counts = f"{self.failures} of {self.looked_at}, {len(self.explanations)} in full"

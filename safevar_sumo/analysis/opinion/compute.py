@@ -30,7 +30,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import Progress, show_no_progress
+from safevar_sumo.terminal import Progress, answer_as_html, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 MODEL_IN_WORDS = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
@@ -144,6 +144,8 @@ class Opinions:
                 f"  with our model {one.here}; {one.because}",
             ]
         return lines
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {self.notes[-1]}>"

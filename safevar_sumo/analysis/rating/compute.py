@@ -4,12 +4,14 @@ rules.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.rating import RatingOptions
@@ -24,6 +26,10 @@ from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import answer_as_html
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 POINT_KINDS = ("standard", "extended", "robustness")
 DECIMALS = 9
@@ -185,6 +191,20 @@ class Rating:
                 {"test": test, "points": points} for test, points in self.protocol.points_not_simulated.items()
             ],
         }
+
+    def sentences(self) -> Sequence[str | Table]:
+        """The verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
+        from safevar_sumo.analysis.rating.render import rating_parts
+
+        return rating_parts(self)
+
+    def figure(self) -> Figure:
+        """The matrices of all tests with the colours of their cells."""
+        from safevar_sumo.analysis.rating.render import matrices_figure
+
+        return matrices_figure(self)
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.vehicles)

@@ -45,8 +45,12 @@ SUMMARY_CHOICES = {
 
 def print_rating(console: Console, rating: Rating) -> None:
     """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
-    tables = _build_points_table(rating), _build_layers_table(rating)
-    print_answer(console, rating.study, rating.no_verdict, [rating_in_words(rating), *tables, not_simulated(rating)])
+    print_answer(console, rating.study, rating.no_verdict, rating.sentences())
+
+
+def rating_parts(rating: Rating) -> list[str | WholeTable]:
+    """The sentences and tables that `print_rating` prints."""
+    return [rating_in_words(rating), _build_points_table(rating), _build_layers_table(rating), not_simulated(rating)]
 
 
 def rating_in_words(rating: Rating) -> str:

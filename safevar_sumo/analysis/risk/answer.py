@@ -20,7 +20,7 @@ from safevar_sumo.records import JsonObject, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.characteristics import Uniform
 from safevar_sumo.sumo.empty_road import driven_entry
-from safevar_sumo.terminal import WholeTable, constraints_in_words, meanings
+from safevar_sumo.terminal import WholeTable, answer_as_html, constraints_in_words, meanings
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -174,6 +174,8 @@ class Risk(Estimate):
         outputs = (SAFETY_DEGREE, "unsafe")
         tables = [frame.assign(output=name) for name, frame in zip(outputs, frames, strict=False)]
         return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         low, high = self.interval

@@ -24,7 +24,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.terminal import constraints_in_words, meanings
+from safevar_sumo.terminal import answer_as_html, constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 MIN_SETTINGS = 10
@@ -130,6 +130,8 @@ class Rules:
             ],
             columns=["rule", "characteristic", "at_least", "at_most", "density", "coverage"],
         )
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         share = f"{self.unsafe_share:.2%} of {self.samples}"

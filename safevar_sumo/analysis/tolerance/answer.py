@@ -21,7 +21,7 @@ from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, constraints_in_words, meanings
+from safevar_sumo.terminal import WholeTable, answer_as_html, constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic
 
 if TYPE_CHECKING:
@@ -163,6 +163,8 @@ class Tolerance:
             "pairs": [pair._asdict() for pair in self.pairs or []],
             "joint": self.joint._asdict(),
         }
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
