@@ -181,12 +181,11 @@ class _Part:
 
     @property
     def code_in_words(self) -> list[str]:
-        """The user code that simulations would run: what the study names, and the pack's files, of which none runs
-        unless the study names code.
+        """The user code that simulations would run: files of the pack, and what the study names. Networks count: the
+        options of SUMO beside them may name files to write.
         """
         study = self.subject.study
-        named = [*user_code_names(study), *(name for name in study.search.algorithms if ":" in name)]
-        return [*self._packed.code, *named] if named else []
+        return [*self._packed.code, *user_code_names(study), *(name for name in study.search.algorithms if ":" in name)]
 
     def unpack_code(self, folder: Path) -> None:
         """Write the user's files to a folder, and let the study find them there.
