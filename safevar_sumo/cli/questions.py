@@ -69,12 +69,14 @@ def add_question(
     return add
 
 
-def _show(result: Any, as_json: bool, plot: Path | None = None) -> Any:
-    """Print an answer, and draw its figure to a file, if one is named; returns the answer's JSON."""
+def _show(result: Any, as_json: bool | None, plot: Path | None = None) -> Any:
+    """Print an answer, unless `as_json` is None, and draw its figure to a file, if one is named; returns the answer's
+    JSON.
+    """
     answer = result.to_dict()
     if as_json:
         print_json(answer)
-    else:
+    elif as_json is not None:
         print_answer(Console(), result.study, result.no_verdict, result.sentences())
     if plot is not None:
         from safevar_sumo.analysis.figures import save
@@ -148,17 +150,36 @@ def opinion(
     return _show(result, as_json)
 
 
-@add_question(ToleranceOptions, "STUDY|DIR", file_option("--plot", "Draw the profiles to this file: png, pdf or svg."))
-def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> Any:
+@add_question(
+    ToleranceOptions,
+    "STUDY|DIR",
+    file_option("--plot", "Draw the profiles to this file: png, pdf or svg."),
+    click.option(
+        "--format",
+        "format_name",
+        type=click.Choice(["text", "csv", "latex", "markdown"]),
+        default="text",
+        show_default=True,
+        help="Print only the limits sheet, in this format; text prints the whole answer.",
+    ),
+)
+def tolerance(
+    source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, format_name: str, **values: Any
+) -> Any:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
+    if as_json and format_name != "text":
+        raise InputError("--format", f"{format_name}, and --json", "one of them")
     subject = load_results_or_study(source, point)
     check_output(plot, "--plot")
     result = answer_question(find_tolerances, subject, ToleranceOptions(**values), jobs=jobs)
     for sentence in result.broken_limits:
         fail(sentence)
-    return _show(result, as_json, plot)
+    if format_name == "text":
+        return _show(result, as_json, plot)
+    click.echo(result.sheet.render(format_name), nl=False)
+    return _show(result, None, plot)
 
 
 @add_question(

@@ -294,9 +294,12 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         "title": data.case.study.title,
         "anchor": data.anchor(),
         "replays": replays,
-        "limits": None,
+        "limits": table_data(answers["tolerance"].sheet.to_frame().set_index("characteristic"), "Limits")
+        if "tolerance" in answers
+        else None,
         "failures": [describe_failure(data, failure) for failure in choices],
         "picture": _picture("failure", data.draw_failure(choices[0])) if choices and "verdict" in sections else None,
+        "sheet": _picture("limits", answers["tolerance"].sheet.figure()) if "tolerance" in answers else None,
         "different": different,
         "agreement": describe_agreement(data.case.study),
         "no_verdict": why_no_verdict(data.system),

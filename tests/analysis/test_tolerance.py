@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,14 +17,18 @@ from safevar_sumo import risk, rules, tolerance
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.rules.compute import Rule, Rules
-from safevar_sumo.analysis.tolerance import ToleranceOptions, boxes
+from safevar_sumo.analysis.tolerance import ToleranceOptions, boxes, compute
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
+from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
+from safevar_sumo.analysis.tolerance.sheet import safe_text
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
-from safevar_sumo.study import load_study
+from safevar_sumo.study import Limit, load_study
+from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
+from tests.in_process import run
 
 
 def of(
@@ -265,3 +270,91 @@ def test_rules_say_over_what_they_hold() -> None:
         "as in the original"
     ) in printed
     assert "% of 16384 vehicles drawn evenly over the whole domain (" in printed
+
+
+LINEAR = np.array([1.0, 2.0, 3.0])
+"""Weights of a region whose largest box has sides at 10, 7.5 and 5."""
+
+
+def box_of(n: int, region: Region, limits: dict[str, Limit], known: Sequence[Sequence[float]] = ()) -> JointLimits:
+    study = made_up_study(n)
+    evaluator = Evaluator(study, Plant(study, region))
+    columns, criterion = list(range(n)), Unsafe()
+    scans = compute.scan(evaluator, columns, criterion)
+    unsafe_settings = compute._unsafe_settings(evaluator, scans, [])
+    rows = np.array(known, dtype=float).reshape(-1, n)
+    return find_joint_limits(evaluator, columns, criterion, limits, scans, unsafe_settings, rows)
+
+
+def relative_volume(box: JointLimits) -> float:
+    return float(np.prod([(high - low) / 10 for low, high in box.box.values()]))
+
+
+@pytest.mark.parametrize(("limits", "largest"), [({}, 0.375), ({"c": Limit(at_most=7)}, 0.315)])
+def test_the_box_with_limits_is_nearly_the_largest(limits: dict[str, Limit], largest: float) -> None:
+    box = box_of(3, lambda rows: (rows - 5) @ LINEAR > 10, limits)
+    assert box.kept
+    assert 0.97 * largest < relative_volume(box) <= largest
+    assert (np.array([high for _, high in box.box.values()]) - 5) @ LINEAR <= 10
+    assert box.at_most == pytest.approx(1 - (0.05 / 2) ** (1 / box.samples))
+    assert all(box.box[name][1] == limit.at_most for name, limit in limits.items())
+
+
+@pytest.mark.slow
+def test_a_side_of_the_box_cannot_be_widened_by_a_20th_of_its_domain() -> None:
+    def region(rows: FloatArray) -> BoolArray:
+        return np.asarray((((rows - 5) / 5) ** 2).sum(axis=1) > 1)
+
+    box = box_of(3, region, {"b": Limit(at_least=3)})
+    low, high = np.array(list(box.box.values())).T
+    assert low[1] == 3
+    for column in range(3):
+        for ends, step in ((low, -0.5), (high, 0.5)):
+            if (column, step) == (1, -0.5):
+                continue
+            wider = ends.copy()
+            wider[column] += step
+            corners = np.array([np.where(list(np.ndindex(2, 2, 2))[k], high, low) for k in range(8)])
+            corners[:, column] = wider[column]
+            assert region(corners).any()
+
+
+def test_limits_that_a_region_breaks_are_not_kept_and_are_counted() -> None:
+    box = box_of(2, lambda rows: rows[:, 0] > 7, {"a": Limit(at_most=9)})
+    assert not box.kept
+    assert box.box == {"a": (5.0, 9.0), "b": (5.0, 5.0)}
+    assert box.unsafe / box.samples == pytest.approx(0.5, abs=0.05)
+    assert box.at_most > box.unsafe / box.samples
+
+
+def test_the_box_with_limits_holds_no_known_solution() -> None:
+    box = box_of(3, nowhere, {"a": Limit(at_most=8)}, known=[[7.0, 8.0, 9.0]])
+    assert box.known_unsafe_inside == 0
+    assert any(high < value for (_, high), value in zip(box.box.values(), (7.0, 8.0, 9.0), strict=True))
+
+
+def test_limits_are_rounded_to_the_safe_side() -> None:
+    one = CharacteristicSet.of(load_study("wear")).members[0]
+    assert safe_text(one, 2.3178, upwards=True) == "2.32"
+    assert safe_text(one, 2.3278, upwards=False) == "2.32"
+    assert safe_text(one, 7.999, upwards=True) == "8.00"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "code"), [("5", 0), ("4.6", 3)])
+def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:
+    study = tmp_path / "mine.toml"
+    study.write_text(f'extends = "native"\n[limits]\ndecel = {{ at_least = {limit}, source = "workshop" }}\n')
+    done = run("tolerance", str(study), "--characteristics", "decel,brakeGain", "--jobs", "1", "--json", expect=code)
+    today, decel, gain, joint = json.loads(done.stdout)
+    assert list(today) == ["study", "unsafe", "alone", "pairs", "joint"]
+    keys = "characteristic unit original alone together specified kept margin first_failure"
+    assert list(decel["limit"]) == keys.split()
+    assert decel["limit"]["specified"] == {"low": float(limit), "high": None, "source": "workshop"}
+    assert decel["limit"]["margin"] == pytest.approx(float(limit) - decel["limit"]["alone"][0])
+    assert (decel["limit"]["kept"], joint["joint"]["kept"]) == ((code == 0),) * 2
+    assert gain["limit"]["kept"]
+    keys = "fixed box samples unsafe at_most known_unsafe_inside kept"
+    assert list(joint["joint"]) == keys.split()
+    assert joint["joint"]["box"]["decel"][0] == float(limit)
+    assert ("failed: limit of decel: outside by" in done.stderr) == (code == 3)

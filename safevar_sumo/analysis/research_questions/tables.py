@@ -319,11 +319,11 @@ def _markdown(source: str) -> str:
 def as_latex(answers: Sequence[Answer]) -> str:
     r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for an answer's second table."""
     numbered = ((answer.name, i, table) for answer in answers for i, table in enumerate(lay_out(answer), 1))
-    tables = [_render_latex(table, f"{name}-{i}" if i > 1 else name) for name, i, table in numbered]
+    tables = [render_latex(table, f"{name}-{i}" if i > 1 else name) for name, i, table in numbered]
     return "\n".join([LATEX_NEEDS, *tables])
 
 
-def _render_latex(table: Table, label: str) -> str:
+def render_latex(table: Table, label: str) -> str:
     lines = [
         r"\begin{table}[htbp]",
         r"\centering",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,12 @@ DEVIATIONS = tuple(0.35 * 0.8**k for k in range(14))
 """Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
 PROPOSALS, SIMULATED_BOXES, LEAST_GAIN = 4096, 64, 0.01
 """Boxes proposed in a round, the number of corners simulated, and the gain in volume (logarithm) that is worth it."""
+CAUSES_PER_ROUND = 4
+"""Approximate number of unsafe settings of a search that a box shrinks for at once."""
+ROUNDING = 1e-9
+"""Rounding errors of a setting, as a share of the domain."""
+RESTARTS = 6
+"""Maximum number of times that the largest box at all corners known is sought anew."""
 STAGE = "limits together"
 
 
@@ -75,8 +82,9 @@ class JointLimits(NamedTuple):
 class _Search:
     """The search for a box: its sides are extents below and above the original, shape (2, n), in the table's units.
 
-    `room` are the extents of the domain, `free` the sides that may move, `unsafe_found` unsafe settings that no box may
-    hold, and `corners` the corners that were unsafe in some box, as -1 or 1 for each characteristic.
+    `room` are the extents of the domain, `free` the sides that may move. `unsafe_found` are unsafe settings, which no
+    box may hold; `causes` those that differ from the original in nothing that is not needed. `corners` were unsafe in
+    some box, as -1, 0 or 1 for each characteristic.
     """
 
     evaluator: Evaluator
@@ -85,6 +93,7 @@ class _Search:
     room: FloatArray
     free: BoolArray
     unsafe_found: FloatArray
+    causes: FloatArray
     corners: list[FloatArray] = field(default_factory=list)
     searches: int = 0
 
@@ -99,7 +108,7 @@ class _Search:
 
     def holds(self, sides: FloatArray, settings: FloatArray) -> BoolArray:
         """Which settings a box holds; shape (K,)."""
-        return np.asarray((self.extents(settings) <= sides).all(axis=(1, 2)))
+        return np.asarray((self.extents(settings) <= sides + ROUNDING * self.room.sum(axis=0)).all(axis=(1, 2)))
 
     def find_unsafe(self, settings: FloatArray) -> FloatArray:
         """Those of the settings that are unsafe; no later box holds one of them."""
@@ -108,41 +117,53 @@ class _Search:
         return found
 
     def corner_settings(self, sides: FloatArray, corners: Sequence[FloatArray]) -> FloatArray:
-        return np.array([self.original + np.where(corner > 0, sides[1], -sides[0]) for corner in corners])
+        """Settings at corners of a box; a characteristic whose sign is 0 is as in the original."""
+        return np.array([self.original + np.where(corner > 0, sides[1], corner * sides[0]) for corner in corners])
 
     def points(self, sides: FloatArray, number: int) -> FloatArray:
-        """Sobol points and as many corners of a box."""
+        """Sobol points of a box, and first as many corners, or all if these are at most twice as many."""
         self.searches += 1
-        seed = self.evaluator.study.search.seed + self.searches
-        sobol = sobol_points(number, len(self.columns), seed)
-        ends = self.original - sides[0], self.original + sides[1]
-        return settings_in_box(self.evaluator, self.columns, *ends, np.concatenate([np.round(sobol), sobol]))
+        sobol = sobol_points(number, len(self.columns), self.evaluator.study.search.seed + self.searches)
+        ends, corners = (self.original - sides[0], self.original + sides[1]), np.round(sobol)
+        if 2 ** len(self.columns) <= 2 * number:
+            corners = np.array(list(product((0.0, 1.0), repeat=len(self.columns))))
+        return settings_in_box(self.evaluator, self.columns, *ends, np.concatenate([corners, sobol]))
 
     def attack(self, sides: FloatArray) -> FloatArray:
-        """Unsafe settings of a box: at corners that were unsafe before, else wherever a search finds some."""
+        """Unsafe settings of a box: known ones, else at corners that were unsafe before, else those of a search."""
+        if len(held := self.unsafe_found[self.holds(sides, self.unsafe_found)]):
+            return held
         if self.corners and len(found := self.find_unsafe(self.corner_settings(sides, self.corners))):
             return found
         return self.find_unsafe(self.points(sides, FIRST_SEARCH_POINTS))
 
-    def boundary_factors(self, setting: FloatArray) -> FloatArray:
-        """By which factor each free side that an unsafe setting reaches must shrink to exclude it alone, shape (2, n);
-        1 where a side does not reach it. The settings there count as found.
+    def reduced(self, setting: FloatArray) -> FloatArray:
+        """An unsafe setting with as many characteristics as possible as in the original."""
+        cause = setting
+        for column in np.flatnonzero((setting != self.original) & self.free.any(axis=0)):
+            less = cause.copy()
+            less[column] = self.original[column]
+            cause = less if len(self.find_unsafe(less[np.newaxis])) else cause
+        return cause
+
+    def add_causes(self, cause: FloatArray) -> None:
+        """Add an unsafe setting to the causes, and the settings in which one characteristic goes back from it as far as
+        it remains unsafe.
         """
-        sides, columns = np.nonzero((self.extents(setting[np.newaxis])[0] > 0) & self.free)
-        factors, rows = np.ones_like(self.room), np.arange(len(columns))
-        starts, low, high = np.tile(setting, (len(columns), 1)), np.zeros(len(columns)), np.ones(len(columns))
-        starts[rows, columns] = self.original[columns]
-        for _ in range(ROUNDS if len(columns) else 0):
-            shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(PARTS + 1) / PARTS
-            inner = starts[:, np.newaxis] + shares[:, 1:-1, np.newaxis] * (setting - starts)[:, np.newaxis]
-            evaluations = self.evaluator.evaluate(inner.reshape(-1, len(setting)), STAGE)
-            is_unsafe = self.unsafe.of(evaluations).reshape(len(columns), -1)
-            first = np.argmax(np.column_stack([is_unsafe, np.ones(len(columns), dtype=bool)]), axis=1)
-            low, high = shares[rows, first], shares[rows, first + 1]
-        factors[sides, columns] = high
-        edges = starts + high[:, np.newaxis] * (setting - starts)
-        self.unsafe_found = np.concatenate([self.unsafe_found, edges])
-        return factors
+        columns = np.flatnonzero(((self.extents(cause[np.newaxis])[0] > 0) & self.free).any(axis=0))
+        rows, edges = np.arange(len(columns)), np.tile(cause, (len(columns), 1))
+        if len(columns):
+            starts, low, high = edges.copy(), np.zeros(len(columns)), np.ones(len(columns))
+            starts[rows, columns] = self.original[columns]
+            for _ in range(ROUNDS):
+                shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(PARTS + 1) / PARTS
+                inner = starts[:, np.newaxis] + shares[:, 1:-1, np.newaxis] * (cause - starts)[:, np.newaxis]
+                evaluations = self.evaluator.evaluate(inner.reshape(-1, len(cause)), STAGE)
+                is_unsafe = self.unsafe.of(evaluations).reshape(len(columns), -1)
+                first = np.argmax(np.column_stack([is_unsafe, np.ones(len(columns), dtype=bool)]), axis=1)
+                low, high = shares[rows, first], shares[rows, first + 1]
+            edges = starts + high[:, np.newaxis] * (cause - starts)
+        self.causes = np.concatenate([self.causes, cause[np.newaxis], edges])
 
     def without(self, sides: FloatArray, settings: FloatArray) -> FloatArray | None:
         """The box without some settings, each excluded by the side that costs least volume; None if no side can."""
@@ -196,23 +217,43 @@ class _Search:
         settings = np.concatenate([self.corner_settings(box, self.corners) for box in boxes])
         is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
         self.unsafe_found = np.concatenate([self.unsafe_found, settings[is_unsafe]])
-        return ~is_unsafe.reshape(len(boxes), -1).any(axis=1)
+        return np.asarray(~is_unsafe.reshape(len(boxes), -1).any(axis=1))
+
+    def learn(self, sides: FloatArray, found: FloatArray) -> FloatArray | None:
+        """The box without causes of some unsafe settings found in it; None if the fixed sides alone are unsafe."""
+        smaller: FloatArray | None = sides
+        for setting in found[:: max(len(found) // CAUSES_PER_ROUND, 1)]:
+            if smaller is None or not self.holds(smaller, setting[np.newaxis])[0]:
+                continue
+            cause = self.reduced(setting)
+            if not any((np.sign(cause - self.original) == corner).all() for corner in self.corners):
+                self.corners.append(np.sign(cause - self.original))
+            self.add_causes(cause)
+            smaller = self.without(smaller, self.causes)
+        return smaller
 
     def shrunk(self, sides: FloatArray) -> FloatArray | None:
         """A box in which no search finds anything unsafe any more; None if the fixed sides alone are unsafe."""
         rounds = 0
         while len(found := self.attack(sides)):
-            rounds += 1
-            corner = np.where(found[0] < self.original, -1.0, 1.0)
-            if not any((corner == known).all() for known in self.corners):
-                self.corners.append(corner)
-            for setting in found[:1]:
-                self.boundary_factors(setting)
-            smaller = self.without(sides, self.unsafe_found)
+            smaller = self.learn(sides, found)
             if smaller is None:
                 return None
+            rounds += 1
             sides = smaller if rounds < MAX_ROUNDS else np.where(self.free, smaller * (1 - WIDER), smaller)
         return sides
+
+    def best(self, start: FloatArray | None) -> FloatArray | None:
+        """The largest box within `start` in which no search finds anything unsafe, and that cannot be widened."""
+        if start is None:
+            return None
+        for _ in range(RESTARTS):  # the first boxes show at which corners something is unsafe
+            sides = self.largest(start)
+            if not len(found := self.attack(sides)):
+                break
+            self.learn(sides, found)
+        smaller = self.shrunk(sides)
+        return None if smaller is None else self.shrunk(self.widened(smaller))
 
     def widened(self, sides: FloatArray) -> FloatArray:
         """The box with each free side as wide as it can be: something unsafe or the domain's end is at most 5 % of the
@@ -227,7 +268,7 @@ class _Search:
                     break
                 sign = 1.0 if side[0] else -1.0
                 slab = self.points(wider, SLAB_POINTS)
-                slab[:SLAB_POINTS, side[1]] = self.original[side[1]] + sign * wider[side]
+                slab[:, side[1]] = self.original[side[1]] + sign * wider[side]
                 corners = [corner for corner in self.corners if corner[side[1]] == sign]
                 settings = np.concatenate([self.corner_settings(wider, corners), slab]) if corners else slab
                 if len(self.find_unsafe(settings)):
@@ -269,61 +310,49 @@ def find_joint_limits(
     by the side that costs least volume, until the search finds nothing. Sides that could go further are widened, and
     the box is tested with independent settings as in `find_safe_box`, whose error probabilities hold here, too.
     """
-    characteristics = evaluator.characteristics
-    domain = np.stack(
-        [characteristics.original - characteristics.lower, characteristics.upper - characteristics.original]
-    )
-    room, fixed = np.zeros_like(domain), np.zeros(domain.shape, dtype=bool)
-    room[:, list(columns)] = domain[:, list(columns)]
-    limited = room.copy()
+    characteristics, varied = evaluator.characteristics, np.zeros(len(evaluator.characteristics), dtype=bool)
+    varied[list(columns)] = True
+    below, above = characteristics.original - characteristics.lower, characteristics.upper - characteristics.original
+    room = np.where(varied, np.stack([below, above]), 0.0)
+    fixed = np.zeros(room.shape, dtype=bool)
     for name, limit in limits.items():
         column = characteristics.names.index(name)
         for side, value in enumerate((limit.at_least, limit.at_most)):
             if value is not None:
-                fixed[side, column], limited[side, column] = True, abs(value - characteristics.original[column])
-    search = _Search(evaluator, columns, unsafe, limited, ~fixed & (room > 0), np.concatenate([unsafe_settings, known]))
-    only_fixed = np.where(fixed, limited, 0.0)
-    sides: FloatArray | None = None
-    if not search.holds(only_fixed, search.unsafe_found).any() and not (
-        only_fixed.any() and len(search.attack(only_fixed))
-    ):
-        sides = search.without(limited, unsafe_settings)
-    if sides is not None:
-        margins = [scan.margins for scan in scans]
-        worst = np.ones(len(characteristics))
-        for column, (low, high) in zip(columns, margins, strict=True):
-            worst[column] = -1.0 if low is not None and (high is None or low < high) else 1.0
-        search.corners.append(worst)
-        sides = search.largest(sides)
-    seed, attempt = evaluator.study.search.seed, 0
-    while sides is not None and attempt < MAX_ROUNDS:
-        sides = search.shrunk(sides)
-        if sides is None:
-            break
-        wider = search.widened(sides)
-        if (wider != sides).any():
-            sides = search.shrunk(wider)
-            if sides is None:
-                break
-        attempt += 1
+                fixed[side, column], room[side, column] = True, abs(value - characteristics.original[column])
+    both = np.concatenate([unsafe_settings, known])
+    unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
+    search = _Search(unverified, columns, unsafe, room, ~fixed & (room > 0), both, both)
+    only_fixed, seed, attempt = np.where(fixed, room, 0.0), evaluator.study.search.seed, 1
+    sides = None
+    if not only_fixed.any() or not (search.holds(only_fixed, both).any() or len(search.attack(only_fixed))):
+        corner = np.zeros(len(characteristics))
+        for column, (low, high) in zip(columns, (scan.margins for scan in scans), strict=True):
+            corner[column] = -1.0 if low is not None and (high is None or low < high) else 1.0
+        search.corners.append(corner)
+        sides = search.best(search.without(room, unsafe_settings))
+    while sides is not None and attempt <= MAX_ROUNDS:
         error_probability, samples = plan_test(attempt)
-        counts = _test(search, sides, samples, np.random.default_rng((seed, 1, attempt)))
+        counts = _test(evaluator, search, sides, samples, np.random.default_rng((seed, 1, attempt)))
         if not counts[1]:
             return _joint_limits(search, limits, sides, known, counts, error_probability, kept=True)
-    error_probability, samples = plan_test(attempt + 1)
-    counts = _test(search, only_fixed, samples, np.random.default_rng((seed, 1, attempt + 1)))
+        sides, attempt = search.shrunk(sides), attempt + 1
+    error_probability, samples = plan_test(attempt)
+    counts = _test(evaluator, search, only_fixed, samples, np.random.default_rng((seed, 1, attempt)))
     return _joint_limits(search, limits, only_fixed, known, counts, error_probability, kept=False)
 
 
-def _test(search: _Search, sides: FloatArray, samples: int, rng: np.random.Generator) -> tuple[int, int, int]:
+def _test(
+    evaluator: Evaluator, search: _Search, sides: FloatArray, samples: int, rng: np.random.Generator
+) -> tuple[int, int, int]:
     """Numbers of random settings in a box, of unsafe ones, and of those that could not be simulated."""
     ends = search.original - sides[0], search.original + sides[1]
-    settings = random_settings(search.evaluator, search.columns, *ends, samples, rng)
-    evaluations = search.evaluator.evaluate(settings, "test of the limits together")
+    settings = random_settings(evaluator, search.columns, *ends, samples, rng)
+    evaluations = evaluator.evaluate(settings, "test of the limits together")
     is_unsafe = search.unsafe.of(evaluations)
     search.unsafe_found = np.concatenate([search.unsafe_found, settings[is_unsafe]])
-    for setting in settings[is_unsafe][:2]:
-        search.boundary_factors(setting)
+    for setting in settings[is_unsafe][:1]:
+        search.add_causes(search.reduced(setting))
     return len(settings), int(is_unsafe.sum()), int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 

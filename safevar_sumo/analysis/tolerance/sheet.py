@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, escape_dollars, new_figure
+from safevar_sumo.analysis.research_questions.tables import LATEX_NEEDS, Table, markdown_table, render_latex
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, JsonObject
 from safevar_sumo.scenarios import Point, distance_in_words
@@ -192,6 +193,16 @@ class LimitsSheet:
             + row.characteristic.suffix
             + source
         )
+
+    def render(self, format_name: str) -> str:
+        """The sheet as csv, markdown or latex."""
+        frame = self.to_frame()
+        if format_name == "csv":
+            return str(frame.to_csv(index=False, lineterminator="\n"))
+        if format_name == "markdown":
+            return markdown_table([list(frame.columns), *frame.to_numpy().tolist()], 2) + "\n"
+        table = Table(f"Limits: {self.subject}", frame.set_index("characteristic"))
+        return f"{LATEX_NEEDS}\n{render_latex(table, 'limits')}"
 
     def to_dict(self) -> list[JsonObject]:
         """The records of `tolerance --limits --json`, one for each characteristic."""
