@@ -21,14 +21,14 @@ FIRST_COMMAND_ROUNDING = 1e-9  # s
 
 
 class _ApolloMemory(NamedTuple):
-    """The original vehicle; time between calls; whether it stops; planned deceleration, commanded acceleration,
-    creeping time [SI].
+    """SI; `nominal` is the original vehicle, `step` the time between calls, `has_begun_to_stop` true from the onset of
+    braking on, and `needed_after_lag` the deceleration that decides on the onset.
     """
 
     nominal: Nominal
     step: float
-    stops: BoolArray
-    planned_deceleration: FloatArray
+    has_begun_to_stop: BoolArray
+    needed_after_lag: FloatArray
     commanded_acceleration: FloatArray
     creeping_time: FloatArray
 
@@ -43,7 +43,7 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     first_command
         Time from the start of the run to the first command to a standing vehicle [s].
     perception_range
-        Largest gap at which it detects obstacles, in clear weather [m].
+        Largest gap at which Apollo detects obstacles, in clear weather [m].
     cruise_speed, cruise_gain, cruise_acceleration
         Speed to accelerate to [m/s], acceleration per speed error [1/s], and largest acceleration [m/s^2].
     jerk
@@ -51,9 +51,9 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     stop_gap
         Gap at which the planned deceleration ends [m].
     comfortable_deceleration
-        It begins to brake when stopping at `stop_gap` requires this deceleration [m/s^2].
+        Apollo begins to brake when stopping at `stop_gap` requires this deceleration [m/s^2].
     largest_deceleration
-        Largest deceleration that it commands [m/s^2].
+        Largest deceleration that Apollo commands [m/s^2].
     creep_speed, creep_time
         Speed and duration of the final creep, a soft stop with the brake released [m/s, s].
     pedal_lag
@@ -78,8 +78,8 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return _ApolloMemory(
             nominal,
             step,
-            stops=zeros > 0,
-            planned_deceleration=zeros,
+            has_begun_to_stop=zeros > 0,
+            needed_after_lag=zeros,
             commanded_acceleration=zeros,
             creeping_time=zeros,
         )
@@ -90,6 +90,7 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, plan
         is_waiting = seen.speed == 0
+        # all fields after `nominal` and `step`
         array_fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
         return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _ApolloMemory(
             memory.nominal, memory.step, *array_fields
@@ -106,16 +107,17 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk
         # limit.
         lost_distance = speed * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
-        planned_deceleration = speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
-        begins_braking = (planned_deceleration > self.comfortable_deceleration) & ~memory.stops
-        stops = memory.stops | begins_braking
-        last_acceleration, largest_change = memory.commanded_acceleration, np.array(self.jerk * memory.step)
+        needed_after_lag = speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
+        begins_braking = (needed_after_lag > self.comfortable_deceleration) & ~memory.has_begun_to_stop
+        has_begun_to_stop = memory.has_begun_to_stop | begins_braking
+        last_acceleration = memory.commanded_acceleration
+        largest_change = np.array(self.jerk * memory.step)
         if np.count_nonzero(begins_braking):
-            # Planning is continuous in time: braking began within the last step, when the needed deceleration passed
-            # the limit.
-            rise = np.maximum(planned_deceleration - memory.planned_deceleration, 1e-9)
+            # Planning is continuous in time: braking began within the last step, when `needed_after_lag` passed
+            # `comfortable_deceleration`.
+            rise = np.maximum(needed_after_lag - memory.needed_after_lag, 1e-9)
             share = np.where(
-                begins_braking, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0
+                begins_braking, np.minimum((needed_after_lag - self.comfortable_deceleration) / rise, 1.0), 1.0
             )
             last_acceleration = np.where(begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration)
             largest_change = largest_change * share
@@ -123,16 +125,16 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         braking = np.minimum(needed_deceleration, self.largest_deceleration)
         braking = np.minimum(braking, np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME)
         cruising = np.minimum(self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration)
-        change = np.where(stops, -braking, cruising) - last_acceleration
+        change = np.where(has_begun_to_stop, -braking, cruising) - last_acceleration
         acceleration = last_acceleration + np.minimum(np.maximum(change, -largest_change), largest_change)
 
-        is_creeping = stops & (speed < self.creep_speed + CREEP_MARGIN)
+        is_creeping = has_begun_to_stop & (speed < self.creep_speed + CREEP_MARGIN)
         creeping_time = memory.creeping_time + memory.step * is_creeping
         acceleration[is_creeping] = 0.0
         acceleration[creeping_time > self.creep_time] = -HOLDING_DECELERATION
         return memory._replace(
-            stops=stops,
-            planned_deceleration=planned_deceleration,
+            has_begun_to_stop=has_begun_to_stop,
+            needed_after_lag=needed_after_lag,
             commanded_acceleration=acceleration,
             creeping_time=creeping_time,
         )
@@ -146,7 +148,8 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         excess = memory.commanded_acceleration + coasting
         throttle = np.minimum(np.maximum(excess / (full_throttle + coasting), 0.0), 1.0)
         brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
-        throttle[memory.stops], brake[~memory.stops] = 0.0, 0.0
+        throttle[memory.has_begun_to_stop] = 0.0
+        brake[~memory.has_begun_to_stop] = 0.0
         return Command(throttle, brake)
 
 
@@ -198,7 +201,7 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     brake_gap_before, brake_gap_past
         Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of
         `brake_place`, and by `brake_gap_past` for each metre past it, so that the policy brakes later for obstacles
-        that enter or leave its path. The visibility multiplies the remaining gap.
+        that enter or leave its path. The visibility multiplies the result.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     recognition_delay
@@ -207,8 +210,8 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake
         at once.
     release_gap
-        The policy does not brake for obstacles with smaller gaps, which its camera's picture does not show [m]: it
-        releases the brake and opens the throttle, whether or not the vehicle has stopped.
+        Obstacles nearer than this are below the camera's picture [m]: the policy releases the brake and opens the
+        throttle, whether or not the vehicle has stopped.
     """
 
     first_command: UpTo60
@@ -246,9 +249,7 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def _decide_to_brake(
         self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
     ) -> BoolArray:
-        """Whether the recognised obstacle is near and in the corridor; then the policy's probability of braking exceeds
-        one half.
-        """
+        """Whether the recognised obstacle is near and in the corridor."""
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -62,7 +63,7 @@ def new_panels(
     are in inches.
     """
     columns = min(max_columns, number)
-    rows = -(-number // columns)
+    rows = math.ceil(number / columns)
     figure, axes = new_figure(
         title, rows, columns, (max(panel_size[0] * columns, min_width), title_height + panel_size[1] * rows)
     )

@@ -153,7 +153,12 @@ class Simulation:
         return {
             "collision_speed": "m/s",
             **{metric.name: metric.unit for metric in self.scoring.metrics},
-            **{one.name: one.unit for one in self.scoring.objectives if one.name in self.metrics},
+            # for objectives that are metrics
+            **{
+                objective.name: objective.unit
+                for objective in self.scoring.objectives
+                if objective.name in self.metrics
+            },
             "f_safe": "m, or -m/s",
             "f_diff": "fraction",
             "f_num_diff": "characteristics",
@@ -180,7 +185,7 @@ class Simulation:
         return {
             "study": self.study.name,
             **driven_entry(self.no_verdict),
-            "vcs": dict(self.setting),
+            "vcs": dict(self.setting),  # vehicle characteristics
             **record(self.evaluation, row=0),
         }
 
@@ -221,8 +226,8 @@ def simulate(
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, once filtered,
-    infeasible.
+    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or (after the
+    filter, with `filtered`) infeasible.
     """
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
@@ -236,12 +241,12 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     setting = characteristics.filter(requested) if filtered else requested
     no_verdict = why_no_verdict(system)
     original = _simulate_one(study, system, characteristics.original, no_verdict)
-    compared = not np.array_equal(setting, characteristics.original)
-    simulation = _simulate_one(study, system, setting, no_verdict) if compared else original
+    is_changed = not np.array_equal(setting, characteristics.original)
+    simulation = _simulate_one(study, system, setting, no_verdict) if is_changed else original
     values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
     return replace(
         simulation,
-        _original=original if compared else None,
+        _original=original if is_changed else None,
         reset_values={name: value for name, value, kept in values if value != kept},
     )
 
@@ -253,10 +258,11 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 
 
 def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:
-    settings, observations = setting[np.newaxis], list[Observation]()
-    at_point = system_at_worst_point(system, settings)
+    settings = setting[np.newaxis]
+    observations = list[Observation]()
+    system_at_point = system_at_worst_point(system, settings)
     runs = drive_all(
-        at_point,
+        system_at_point,
         settings,
         Engine.LIBSUMO,
         listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
@@ -268,7 +274,7 @@ def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict:
         runs=runs,
         scoring=system.measuring.scoring,
         no_verdict=no_verdict,
-        _scenario=at_point.points[0].scenario,
+        _scenario=system_at_point.points[0].scenario,
         _observations=observations,
     )
 
@@ -337,7 +343,8 @@ def evaluate(
     simulated = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
         evaluations = evaluate_settings(loaded_study, simulated, pool, jobs, report_progress)
-    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
+    groups = [(("", 0), evaluations)]  # one group, of no algorithm and run
+    frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
 
@@ -368,7 +375,8 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
             for name in settings.columns.difference(names, sort=False):
                 raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
             values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
-            array, index = np.where(np.isnan(values), characteristics.original, values), settings.index
+            array = np.where(np.isnan(values), characteristics.original, values)
+            index = settings.index
         else:
             array = np.array(settings, dtype=float)
             if array.ndim != 2 or array.shape[1] != len(names):
@@ -379,6 +387,6 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
     is_legal = [item.is_legal(values, beyond=beyond) for item, values in zip(characteristics, array.T, strict=True)]
-    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:
+    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:  # the first illegal value
         characteristics.members[column].check(float(array[row, column]), f"settings, row {row}", beyond=beyond)
     return array, index

@@ -145,7 +145,7 @@ def opinion(
     subject = load_results_or_study(source, point, results_only=True)
     result = answer_question(ask_for_opinions, subject, options, jobs=jobs)
     if as_json:
-        for note in result.notes:
+        for note in (*result.notes, result.counts):
             print_note(note)
     return _show(result, as_json)
 

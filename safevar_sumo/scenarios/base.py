@@ -38,8 +38,8 @@ class Lane(NamedTuple):
 
 
 class BentLane(Lane):
-    """A lane that is not straight; `bend` is the largest distance between its centre line and the line between its ends
-    [m].
+    """A lane that is not straight, made only by `lane_through`; `bend` is the largest distance between its centre line
+    and the line between its ends [m].
     """
 
     name: str
@@ -57,12 +57,13 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     if max(deviations) <= MAX_BEND:
         return Lane(points[0], points[-1])
     bent = BentLane(points[0], points[-1])
-    bent.name, bent.bend = name, max(deviations)
+    bent.name = name
+    bent.bend = max(deviations)
     return bent
 
 
 MAX_SKEW = 0.05
-"""Largest offset along the road between the two ends of a crossing at right angles [m]."""
+"""Largest offset along the road between the two ends of a crossing at which it still counts as at right angles [m]."""
 
 
 class Frame(NamedTuple):
@@ -92,8 +93,8 @@ class Frame(NamedTuple):
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
-        """The network's coordinates rotated into the direction of a lane; exactly unchanged for a lane that leads
-        east.
+        """A frame with the network's origin and the lane's direction; if the lane leads east, coordinates keep their
+        exact values.
         """
         return cls((0.0, 0.0), cls.of(lane).direction)
 
@@ -197,8 +198,8 @@ class Scenario:
     pre_crash
         The scenario's type in NHTSA's typology; "" if it has none.
     test_speed
-        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the tolerance
-        before that is an invalid test. Only contacts at the vehicle's front are collisions.
+        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the speed
+        tolerance before the ADS brakes is an invalid test. Only contacts at the vehicle's front are collisions.
     """
 
     __slots__ = ()
@@ -206,7 +207,8 @@ class Scenario:
     reactive_actors: bool = True
     grade: float = 0.0
     centre_to_centre: bool = False
-    if TYPE_CHECKING:  # a scenario may set or compute these
+    # Type checkers see properties, so that a scenario may have a field or a property; only two of them have defaults.
+    if TYPE_CHECKING:
 
         @property
         def duration(self) -> float: ...
@@ -215,7 +217,8 @@ class Scenario:
         @property
         def test_speed(self) -> float | None: ...
     else:
-        pre_crash, test_speed = "", None
+        pre_crash = ""
+        test_speed = None
 
     @abstractmethod
     def begin(self, world: World) -> ScenarioMemory:
@@ -247,7 +250,7 @@ class Scenario:
 
 
 SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
-"""Dimensions of a test matrix that are the rows or columns of its tables."""
+"""Keys of a point that are rows and columns where `simulate` tabulates a matrix."""
 
 
 class Point(NamedTuple):
@@ -288,7 +291,7 @@ OBSTACLES: Mapping[str, str] = {
 
 
 def distance_in_words(scenario: Scenario, safety_degree: float) -> str:
-    """A safety degree above 0 in metres, and between which points it is, if not from the bumper on."""
+    """A safety degree above 0 as text; adds `from centre to centre` where the scenario measures so."""
     return f"{safety_degree:.2f} m{' from centre to centre' if scenario.centre_to_centre else ''}"
 
 
@@ -309,11 +312,13 @@ MAX_TEST_SPEED = 100.0
 class GuardedScenario(Scenario):
     """Guards a user's scenario: passes read-only copies to it, and checks its results."""
 
-    duration, pre_crash = 0.0, ""
+    duration = 0.0
+    pre_crash = ""
     test_speed: float | None = None
 
     def __init__(self, scenario: Scenario, guard: Guard) -> None:
-        self._scenario, self._guard = scenario, guard
+        self._scenario = scenario
+        self._guard = guard
         network = guard.field("__init__", scenario, "network")
         if not isinstance(network, str):
             raise guard.wrong_value("__init__", "network", network, "the name or path of a folder with a network")
@@ -369,7 +374,7 @@ class GuardedScenario(Scenario):
             if name in ("over", "visible"):
                 values[name] = self._guard.booleans("observe", name, value, (n,))
             else:
-                values[name] = self._guard.numbers("observe", name, value, (n,), infinite=name == "gap")
+                values[name] = self._guard.numbers("observe", name, value, (n,), infinite=(name == "gap"))
         return Scene(**values), memory
 
     def encounter(self, trace: Trace) -> Encounter:

@@ -56,4 +56,5 @@ def opinion(
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    return answer_call(ask_for_opinions, OpinionOptions, locals(), results_only=True)
+    arguments = locals()  # by name, the subject first
+    return answer_call(ask_for_opinions, OpinionOptions, arguments, results_only=True)

@@ -119,24 +119,28 @@ class Opinions:
         return pd.DataFrame(rows, columns=["solution", "changes", *ends, "opinion", "because"])
 
     @property
-    def notes(self) -> list[str]:
-        """The solutions that are not unsafe, and the number of causes with each verdict."""
-        words, numbers = {"outside": "outside (no answer)"}, Counter(one.opinion for one in self.opinions)
-        counts = [f"{numbers[one]} {words.get(one, one)}" for one in get_args(Verdict) if one in numbers]
-        total = number_of(len(self.opinions), "minimal cause")
-        return [
-            *(f"{handle} is not unsafe: it has no cause" for handle in self.without_cause),
-            f"of {total} {join_phrases(counts)}" if counts else "there is no cause to judge",
+    def counts(self) -> str:
+        """The number of causes with each verdict."""
+        labels = {"outside": "outside (no answer)"}
+        numbers = Counter(one.opinion for one in self.opinions)
+        counts = [
+            f"{numbers[verdict]} {labels.get(verdict, verdict)}" for verdict in get_args(Verdict) if verdict in numbers
         ]
+        total = number_of(len(self.opinions), "minimal cause")
+        return f"of {total} {join_phrases(counts)}" if counts else "there is no cause to judge"
+
+    @property
+    def notes(self) -> list[str]:
+        """The solutions that are not unsafe."""
+        return [f"{handle} is not unsafe: it has no cause" for handle in self.without_cause]
 
     def sentences(self) -> list[str]:
         """The answer as lines: how many causes are confirmed, then every cause with the reason."""
         characteristics = CharacteristicSet.of(self.study)
-        *notes, counts = self.notes
         lines = [
-            f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {counts}.",
+            f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {self.counts}.",
             f"The original vehicle with our model: {self.original_here}; with the second: {self.original_there}.",
-            *(f"note: {note}" for note in notes),
+            *(f"note: {note}" for note in self.notes),
         ]
         for one in self.opinions:
             lines += [
@@ -148,7 +152,7 @@ class Opinions:
     _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
-        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {self.notes[-1]}>"
+        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {self.counts}>"
 
 
 SIMULATION_LIMIT = 12_000
@@ -158,7 +162,7 @@ CHANGE_SHARES = np.arange(1, 10) / 10
 
 
 def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
-    """Assemble a study's system; with the second value as its vehicle, it simulates with the second model.
+    """A study's system and the second vehicle; with that vehicle the system simulates with the second model.
 
     The driving system stays the same, including its knowledge of our original vehicle.
 
@@ -205,12 +209,16 @@ def judge_causes(
     Raises the errors of `assemble_both_systems`.
     """
     system, vehicle = assemble_both_systems(study)
-    second, original, stage = replace(system, vehicle=vehicle), system.characteristics.original, "second vehicle model"
+    second_system = replace(system, vehicle=vehicle)
+    original = system.characteristics.original
+    stage = "second vehicle model"
     changed = [system.characteristics.setting(cause.changes, "cause", beyond=True) for _, cause in causes]
     settings = np.stack([original, *changed])
     progress(stage, 0, len(settings))
+    # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
-    ours, theirs = evaluate(system, settings), evaluate(second, np.concatenate([settings, scaled]))
+    ours = evaluate(system, settings)
+    theirs = evaluate(second_system, np.concatenate([settings, scaled]))
     fails_here, fails_there = unsafe.of(ours), unsafe.of(theirs)
     fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
     ends_here, ends_there = _run_ends(ours), _run_ends(theirs)
@@ -219,27 +227,33 @@ def judge_causes(
         there = ends_there[row]
         verdict: Verdict = "outside"
         if reasons := vehicle.reasons_to_omit(cause.changes):
-            because, there = "; ".join(reasons), RunEnd()
+            because = "; ".join(reasons)
+            there = RunEnd()
         elif fails_here[0]:
             because = "the original vehicle itself is unsafe, so that no change is a cause"
         elif fails_there[0] or not theirs.valid[0]:
             because = f"the original vehicle itself is not safe with the second model: {ends_there[0]}"
         elif not theirs.valid[row]:
             because = f"it could not be simulated with the second model: {there}"
-        elif settings[row].tobytes() in vehicle.spinning:
+        elif settings[row].tobytes() in vehicle.spinning:  # filled by `evaluate(second_system, ...)` above
             because = f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
         else:
             verdict = "contradicted"
             because = f"safe with the second model: {there}; the original vehicle: {ends_there[0]}"
             if fails_there[row]:
-                verdict, lower_share = "confirmed", np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])
+                verdict = "confirmed"
+                largest_safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])
                 because = (
                     f"also unsafe with the second model: {there}; the original vehicle is safe: {ends_there[0]}. "
-                    f"{lower_share:.0%} to {lower_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the "
-                    f"second model, {cause.fraction:.1%} with ours"
+                    f"{largest_safe_share:.0%} to {largest_safe_share + CHANGE_SHARES[0]:.0%} of the changes are "
+                    f"enough with the second model, {cause.fraction:.1%} with ours"
                 )
-            if doubt := _doubt(second, settings[row], cause.robustness, fails_there[row], unsafe, study.search.seed):
-                verdict, because = "borderline", f"{doubt}; {because}"
+            seed = study.search.seed
+            if reason := _why_borderline(
+                second_system, settings[row], cause.robustness, fails_there[row], unsafe, seed
+            ):
+                verdict = "borderline"
+                because = f"{reason}; {because}"
         opinions.append(
             Opinion(
                 solution=solution,
@@ -256,16 +270,16 @@ def judge_causes(
     )
 
 
-def _doubt(
-    second: System, setting: FloatArray, our_robustness: float | None, is_unsafe: bool, unsafe: Unsafe, seed: int
+def _why_borderline(
+    second_system: System, setting: FloatArray, our_robustness: float | None, is_unsafe: bool, unsafe: Unsafe, seed: int
 ) -> str:
-    """In which model a cause is borderline; empty if in none, or in a rated study, whose neighbours take too long."""
-    if our_robustness is None:
+    """In which model a cause is borderline; empty if in none."""
+    if our_robustness is None:  # in a rated study, whose neighbours take too long
         return ""
     if is_borderline(our_robustness):
         return f"with our model {robustness_in_words(our_robustness)}"
-    neighbours = draw_neighbours(second.characteristics, setting[np.newaxis], seed)
-    runs = evaluate(second, neighbours[second.region.feasible(neighbours)])
+    neighbours = draw_neighbours(second_system.characteristics, setting[np.newaxis], seed)
+    runs = evaluate(second_system, neighbours[second_system.region.feasible(neighbours)])
     same = (unsafe.of(runs) == is_unsafe)[runs.valid]
     share = int(np.sum(same)) / max(len(same), 1)
     result = "unsafe" if is_unsafe else "safe"

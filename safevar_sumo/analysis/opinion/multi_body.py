@@ -19,7 +19,9 @@ from safevar_sumo.vehicles import Slope
 
 WHEEL_COUNT = 4
 LONGEST_STEP = 1e-3
-"""Longest step of the integration [s]; the fastest motion, an axle on its springs (75 rad/s), turns by 0.08 rad."""
+"""Longest step of the integration [s]; the phase of the fastest motion, an axle on its springs (75 rad/s), advances by
+0.08 rad in a step.
+"""
 LEAST_SPEED = 0.1
 """Smallest denominator of a slip [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
 SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
@@ -28,13 +30,16 @@ SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
 Real controllers work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
 """
 RELEASE_RATE, BUILD_UP_RATE = 25.0, 8.0
-"""Rates at which it releases and restores pressure [1/s], as shares of full pressure; valves release faster.
+"""Rates at which the anti-lock controller releases and restores pressure [1/s], as shares of full pressure; valves
+release faster.
 
 Chosen values: braking uses at least 0.78 of the friction, for coefficients from 0.2 to 1 (tests). UN Regulation 13-H,
 annex 6, requires 0.75.
 """
 TRACTION_SHARE = 0.9
-"""Share of the greatest tyre force that the traction control lets the engine use [-]: half of the slip at the peak."""
+"""Share of the greatest tyre force that the traction control lets the engine use [-]; tyres reach this share at about
+half of the slip of their peak.
+"""
 
 
 @cache
@@ -61,13 +66,8 @@ ZERO, ONE, UNLIMITED = map(np.array, (0.0, 1.0, np.inf))
 
 
 class Plant(NamedTuple):
-    """Constants of N vehicles, SI, after the package's m, m_s, m_uf, a, b, h_s, I_y_s, K_sf, K_sdf, K_zt, R_w, I_y_w.
-
-    Shape (N,) or (), or (2, N) or (2, 1) for values per axle, front before rear: `arms`, a and -b; `static_shares` of
-    the sprung mass; `springs` and `dampers` of each wheel; `brake_shares`, T_sb and 1 - T_sb; `drive_shares`, T_se and
-    1 - T_se.
-    `unsprung_mass` is one axle's, `friction` Pacejka's p_dx1, `brake_torque` the torque of all wheels at full pedal;
-    `back` and `down` are the road slope's accelerations.
+    """Constants of N vehicles, SI, each with its name in the package; shape (N,) or (). Values per axle have the shape
+    (2, N) or (2, 1), front before rear.
 
     The brake pedal follows its command after the dead time `brake_delay`, as a first-order lag with the time constant
     `brake_lag`, at most at the rates `brake_rise` and `brake_fall` [1/s]. `drag` [N s/m], `air_drag` [N s^2/m^2] and
@@ -75,24 +75,24 @@ class Plant(NamedTuple):
     multiplies the original engine's driving torque.
     """
 
-    mass: FloatArray
-    sprung_mass: FloatArray
-    unsprung_mass: float | FloatArray
-    arms: FloatArray
-    static_shares: FloatArray
-    height: float | FloatArray
-    pitch_inertia: float | FloatArray
-    springs: FloatArray
-    dampers: FloatArray
-    tyre_spring: float | FloatArray
-    brake_shares: FloatArray
-    drive_shares: FloatArray
-    back: float | FloatArray
-    down: float | FloatArray
-    radius: FloatArray
-    wheel_inertia: FloatArray
-    friction: FloatArray
-    brake_torque: FloatArray
+    mass: FloatArray  # m
+    sprung_mass: FloatArray  # m_s
+    unsprung_mass: float | FloatArray  # m_uf, of one axle
+    arms: FloatArray  # per axle: a and -b
+    static_shares: FloatArray  # per axle, of the sprung mass
+    height: float | FloatArray  # h_s, plus the body's heave in balance
+    pitch_inertia: float | FloatArray  # I_y_s
+    springs: FloatArray  # per axle, of one wheel: K_sf and K_sr
+    dampers: FloatArray  # per axle, of one wheel: K_sdf and K_sdr
+    tyre_spring: float | FloatArray  # K_zt
+    brake_shares: FloatArray  # per axle: T_sb and 1 - T_sb
+    drive_shares: FloatArray  # per axle: T_se and 1 - T_se
+    back: float | FloatArray  # as in `Slope`
+    down: float | FloatArray  # as in `Slope`
+    radius: FloatArray  # R_w
+    wheel_inertia: FloatArray  # I_y_w
+    friction: FloatArray  # Pacejka's p_dx1
+    brake_torque: FloatArray  # of all wheels at full pedal
     brake_delay: FloatArray = ZERO
     brake_rise: FloatArray = UNLIMITED
     brake_fall: FloatArray = UNLIMITED
@@ -123,13 +123,16 @@ def build_plant(
     other fields of `Plant`.
     """
     bmw = load_bmw_parameters()
-    scale, package_length = unladen_mass / bmw.m, bmw.a + bmw.b
-    unsprung_mass, length = scale * bmw.m_uf, wheelbase or package_length
-    sprung_mass, front_arm = mass - 2 * unsprung_mass, (bmw.a / package_length) * length * np.ones_like(mass)
+    scale = unladen_mass / bmw.m
+    package_length = bmw.a + bmw.b
+    length = wheelbase or package_length
+    unsprung_mass = scale * bmw.m_uf
+    sprung_mass = mass - 2 * unsprung_mass
+    front_arm = (bmw.a / package_length) * length * np.ones_like(mass)
     if centre is not None:
         front_arm = (mass * centre - unsprung_mass * length) / sprung_mass
 
-    def axles(front: float, rear: float) -> FloatArray:
+    def per_axle(front: float, rear: float) -> FloatArray:
         return np.array([[front], [rear]])
 
     plant = Plant(
@@ -141,16 +144,16 @@ def build_plant(
         height=height or bmw.h_s,
         pitch_inertia=scale * bmw.I_y_s * (length / package_length) ** 2,
         tyre_spring=scale * bmw.K_zt,
-        springs=scale * axles(bmw.K_sf, bmw.K_sr),
-        dampers=scale * axles(bmw.K_sdf, bmw.K_sdr),
-        brake_shares=axles(front_brake_share, 1 - front_brake_share),
+        springs=scale * per_axle(bmw.K_sf, bmw.K_sr),
+        dampers=scale * per_axle(bmw.K_sdf, bmw.K_sdr),
+        brake_shares=per_axle(front_brake_share, 1 - front_brake_share),
         back=slope.back,
         down=slope.down,
-        drive_shares=axles(front_drive_share, 1 - front_drive_share),
+        drive_shares=per_axle(front_drive_share, 1 - front_drive_share),
         **constants,
     )
-    # Heights of the state count from unloaded tyres.
-    return plant._replace(height=plant.height + balanced_state(plant, mass).heights[0])
+    # Heights in the state count from unloaded tyres, so add the static deflection, which is the same at any speed.
+    return plant._replace(height=plant.height + balanced_state(plant, np.zeros_like(mass)).heights[0])
 
 
 class MultiBodyState(NamedTuple):
@@ -170,10 +173,13 @@ class MultiBodyState(NamedTuple):
 
 def balanced_state(plant: Plant, speed: FloatArray) -> MultiBodyState:
     """The body in static balance on its springs, with rolling wheels."""
-    axles = (plant.sprung_mass * plant.static_shares + plant.unsprung_mass) * plant.down / (2 * plant.tyre_spring)
-    # The springs carry the static load without deflection if, above each axle, the body is as high as the axle.
-    heave, pitch = (axles * plant.static_shares).sum(axis=0), (axles[1] - axles[0]) / (plant.arms[0] - plant.arms[1])
-    heights, ones = np.stack([heave, pitch, *axles]), np.ones_like(axles)
+    axle_loads = (plant.sprung_mass * plant.static_shares + plant.unsprung_mass) * plant.down
+    axle_heights = axle_loads / (2 * plant.tyre_spring)
+    # Springs count from their static load: in balance the body above each axle is as high as the axle.
+    heave = (axle_heights * plant.static_shares).sum(axis=0)
+    pitch = (axle_heights[1] - axle_heights[0]) / (plant.arms[0] - plant.arms[1])
+    heights = np.stack([heave, pitch, *axle_heights])
+    ones = np.ones_like(axle_heights)
     return MultiBodyState(speed, heights, np.zeros_like(heights), ones * speed / plant.radius, ones)
 
 
@@ -183,16 +189,19 @@ def tyre_forces(plant: Plant, body: MultiBodyState) -> tuple[FloatArray, FloatAr
     Of one tyre of each axle, shape (2, N): the force along the road and its greatest value [N], the slip [-], positive
     when braking, and the derivative of the force by the wheel's speed [N s/rad].
     """
-    tyre, slip_speed = load_bmw_parameters().tire, np.maximum(body.speed, LEAST_SPEED)
+    tyre = load_bmw_parameters().tire
+    slip_denominator = np.maximum(body.speed, LEAST_SPEED)
     load = np.maximum(body.heights[2:] * plant.tyre_spring, 1.0)
-    slip = (body.speed - plant.radius * body.wheel_speeds) / slip_speed
-    peak, stiffness = plant.friction * load, tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
+    slip = (body.speed - plant.radius * body.wheel_speeds) / slip_denominator
+    peak = plant.friction * load
+    stiffness = tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
     scaled_slip = stiffness * (tyre.p_hx1 - slip)
     curve = (1 - tyre.p_ex1) * scaled_slip + tyre.p_ex1 * np.arctan(scaled_slip)
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
     bend = 1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip)
-    slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * bend
-    return peak * np.sin(angle), peak, slip, slope * (stiffness * plant.radius / slip_speed)
+    force_by_scaled_slip = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * bend
+    force_by_wheel_speed = force_by_scaled_slip * (stiffness * plant.radius / slip_denominator)
+    return peak * np.sin(angle), peak, slip, force_by_wheel_speed
 
 
 def derivatives(
@@ -203,16 +212,19 @@ def derivatives(
     `torques`, shape (2, N), turn both wheels of an axle forward [N m]; `force` is that of one tyre of each axle [N].
     """
     traction = 2 * (force[0] + force[1])
-    deflection, deflection_rate = (one[2:] - one[0] + plant.arms * one[1] for one in (body.heights, body.rates))
+    deflection, deflection_rate = (
+        coordinates[2:] - coordinates[0] + plant.arms * coordinates[1] for coordinates in (body.heights, body.rates)
+    )
     static_loads = plant.sprung_mass * plant.down * plant.static_shares / 2
     springs = static_loads - deflection * plant.springs - deflection_rate * plant.dampers
     moments = plant.arms * springs
-    heave = plant.down - 2 * (springs[0] + springs[1]) / plant.sprung_mass
-    pitch = (2 * (moments[0] + moments[1]) + traction * (plant.height - body.heights[0])) / plant.pitch_inertia
-    axles = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - springs) / plant.unsprung_mass
+    heave_acceleration = plant.down - 2 * (springs[0] + springs[1]) / plant.sprung_mass
+    pitch_moment = 2 * (moments[0] + moments[1]) + traction * (plant.height - body.heights[0])
+    pitch_acceleration = pitch_moment / plant.pitch_inertia
+    axle_accelerations = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - springs) / plant.unsprung_mass
     return (
         traction / plant.mass - plant.back,
-        np.stack([heave, pitch, *axles]),
+        np.stack([heave_acceleration, pitch_acceleration, *axle_accelerations]),
         (torques / 2 - plant.radius * force) / plant.wheel_inertia,
     )
 
@@ -230,13 +242,14 @@ def advance(
     pressure_shares = np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
     drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * peak)
     brakes = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
-    acceleration, height_gains, wheel_gains = derivatives(plant, body, drive - brakes, force)
+    acceleration, rate_gains, wheel_gains = derivatives(plant, body, drive - brakes, force)
     gradients = np.maximum(gradient, 0.0)
     damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
     wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_gains / damping, 0.0)
     added_force = gradients * (wheel_speeds - body.wheel_speeds)
     speed = np.maximum(body.speed + step * (acceleration + 2 * (added_force[0] + added_force[1]) / plant.mass), 0.0)
-    # Pacejka's tyres push slightly even without slip.
+    # Pacejka's tyres push slightly even without slip, so a vehicle without drive is held.
     is_standing = (body.speed <= 0) & (drive_torque <= 0) & (plant.back >= 0)
-    speed, rates = np.where(is_standing, 0.0, speed), body.rates + step * height_gains
+    speed = np.where(is_standing, 0.0, speed)
+    rates = body.rates + step * rate_gains
     return MultiBodyState(speed, body.heights + step * rates, rates, wheel_speeds, pressure_shares)

@@ -64,4 +64,4 @@ def rating(
     """
     from safevar_sumo.analysis.rating.compute import rate_variant
 
-    return answer_call(rate_variant, RatingOptions, locals())
+    return answer_call(rate_variant, RatingOptions, locals())  # the arguments by name, the subject first

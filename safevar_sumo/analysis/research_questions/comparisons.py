@@ -58,7 +58,9 @@ RANK_COLUMNS += ["critical_difference"]
 SampleFunction = Callable[[Case, str, MetricFacts], "pd.Series[float]"]
 """Returns an algorithm's values of a metric."""
 Samples = Mapping[str, tuple[bool, Mapping[str, "pd.Series[float]"]]]
-"""For each indicator and metric: whether more is better (of a metric: more unsafe), and each algorithm's values."""
+"""For each indicator and metric: whether larger values speak for an algorithm (a better front, or more unsafe
+solutions), and each algorithm's values.
+"""
 
 
 def pooled_values(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
@@ -85,12 +87,12 @@ def rq1(case: Case) -> pd.DataFrame:
     UnanswerableError
         If no run is finished.
     """
-    rows = _rows_against_original(
-        case,
-        pooled_values,
-        lambda sample, original: compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original)),
-    )
+    rows = _rows_against_original(case, pooled_values, _against_repeated_original)
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
+
+
+def _against_repeated_original(sample: pd.Series[float], original: float) -> TwoSampleTest:
+    return compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original))
 
 
 def _rows_against_original(
@@ -100,7 +102,9 @@ def _rows_against_original(
     rows = []
     for algorithm in case.algorithms:
         for metric in case.scoring.metrics:
-            sample, original = sample_of(case, algorithm, metric), case.original[metric.name]
+            sample = sample_of(case, algorithm, metric)
+            original = case.original[metric.name]
+            # Below 0.5: the algorithm's solutions are more unsafe than the original.
             result = test(sample, original).reversed_if(metric.more_is_unsafe)
             rows.append(
                 {
@@ -146,6 +150,7 @@ def _nsga2_pairs(case: Case) -> list[tuple[str, str]]:
 
 
 def _samples(case: Case, sample_of: SampleFunction) -> Samples:
+    """The values of every indicator, which are empty for solutions that belong to no run, and of every metric."""
     indicators = pd.DataFrame()
     if case.has_runs and len(case.solutions):
         indicators = compute_indicators(case)
@@ -153,18 +158,29 @@ def _samples(case: Case, sample_of: SampleFunction) -> Samples:
     by_algorithm = {str(name): rows.droplevel("algorithm") for name, rows in indicators.groupby(level=0)}
     return {
         **{
-            name: (more, {one: by_algorithm[one][name] if one in by_algorithm else empty for one in case.algorithms})
-            for name, more in MORE_IS_BETTER.items()
+            name: (
+                more_is_better,
+                {
+                    algorithm: by_algorithm[algorithm][name] if algorithm in by_algorithm else empty
+                    for algorithm in case.algorithms
+                },
+            )
+            for name, more_is_better in MORE_IS_BETTER.items()
         },
         **{
-            metric.name: (metric.more_is_unsafe, {one: sample_of(case, one, metric) for one in case.algorithms})
+            metric.name: (
+                metric.more_is_unsafe,
+                {algorithm: sample_of(case, algorithm, metric) for algorithm in case.algorithms},
+            )
             for metric in case.scoring.metrics
         },
     }
 
 
 def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[JsonObject]:
-    """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`."""
+    """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`; frames take the
+    column that they list.
+    """
     return [
         {
             "setting": case.name,
@@ -172,6 +188,7 @@ def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Sample
             "other": second,
             "baseline": second,
             "metric": metric,
+            # Above 0.5: the first algorithm is better.
             **compare_samples(values[first], values[second]).reversed_if(not more_is_better)._asdict(),
         }
         for first, second in pairs
@@ -229,7 +246,7 @@ def rq2_runs(case: Case) -> pd.DataFrame:
         If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
     """
     frames = compare_over_runs(case)
-    _nsga2_pairs(case)
+    _nsga2_pairs(case)  # raises if RQ2 has no answer
     return frames["RQ2"]
 
 
@@ -246,7 +263,7 @@ def compare_pairs(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs, or runs of only one algorithm.
     """
-    samples = _samples_of_several(case, 2)
+    samples = _samples_over_runs(case, 2)
     rows = _add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples))
     return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
 
@@ -264,8 +281,9 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs, or fewer than three algorithms.
     """
-    tests, rows = dict[str, JsonObject](), list[JsonObject]()
-    for metric, (more_is_better, by_algorithm) in _samples_of_several(case, 3).items():
+    tests = dict[str, JsonObject]()
+    rows = list[JsonObject]()
+    for metric, (more_is_better, by_algorithm) in _samples_over_runs(case, 3).items():
         blocks = pd.DataFrame(by_algorithm).dropna()
         values = blocks.to_numpy(dtype=float)
         ranks = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
@@ -287,8 +305,8 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
     return pd.DataFrame([row | tests[row["metric"]] for row in rows], columns=RANK_COLUMNS, dtype=object)
 
 
-def _samples_of_several(case: Case, min_algorithms: int) -> Samples:
-    """The samples over runs of at least so many algorithms."""
+def _samples_over_runs(case: Case, min_algorithms: int) -> Samples:
+    """The samples over runs of at least so many algorithms; raises `UnanswerableError` if there are fewer."""
     if case.has_runs and len(case.algorithms) < min_algorithms:
         names = ", ".join(case.algorithms) or "none"
         raise UnanswerableError(
@@ -305,17 +323,23 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
 
 
 def _tests_over_runs(case: Case) -> pd.DataFrame:
-    """Each test of RQ1 and RQ2 over runs with an effect size, in words; columns question, algorithm, metric,
+    """Every test of RQ1 and RQ2 over runs, with algorithm and metric in words; columns question, algorithm, metric,
     effect_size, p_holm, ...
 
     `pooled_p` is the p-value over the paper's pooled solutions; `enough` is whether there are enough runs for the test
     to be significant.
     """
-    frames, titles = [], titles_of(case.scoring.metrics)
+    frames = []
+    titles = titles_of(case.scoring.metrics)
     for question, frame in compare_over_runs(case).items():
-        pooled_frame, group, counts = (
-            (rq1(case), "algorithm", ["runs"]) if question == "RQ1" else (rq2(case), "baseline", ["n1", "n2"])
-        )
+        if question == "RQ1":
+            pooled_frame = rq1(case)
+            group = "algorithm"
+            counts = ["runs"]
+        else:
+            pooled_frame = rq2(case)
+            group = "baseline"
+            counts = ["n1", "n2"]
         frames.append(
             frame.assign(
                 question=question,
@@ -335,8 +359,8 @@ def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
     """
     tests = _tests_over_runs(case).dropna(subset="effect_size")
     enough = tests.loc[tests["question"] == question, "enough"]
-    share = f"{(~enough).sum()} of the" if enough.any() else "all"
-    too_few = f"too few runs for {share} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."
+    how_many = f"{(~enough).sum()} of the" if enough.any() else "all"
+    too_few = f"too few runs for {how_many} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."
     return [
         *([] if enough.all() else [too_few]),
         *([significance_change_line(case)] if pooling and tests["enough"].any() else []),
@@ -349,8 +373,9 @@ def significance_change_line(case: Case) -> str:
 
     Example: "..., 3 of 28 tests are no longer significant: RQ1 NSGA-II SD, TET; RQ2 SafeFuzzer TET."
     """
-    tests, texts = _tests_over_runs(case), []
+    tests = _tests_over_runs(case)
     tests = tests[tests["enough"]].dropna(subset="p_holm")
+    texts = []
     was_significant, is_significant = (tests[column].astype(float) < ALPHA for column in ("pooled_p", "p_holm"))
     for word, changes in (
         ("no longer", tests[was_significant & ~is_significant]),
@@ -390,5 +415,5 @@ def summary_lines(case: Case) -> list[str]:
     try:
         _nsga2_pairs(case)
     except UnanswerableError as error:
-        lines[-1] = f"RQ2 over runs: {error.problem}."
+        lines[-1] = f"RQ2 over runs: {error.problem}."  # replaces RQ2's heading
     return [*lines, significance_change_line(case)] if tests["enough"].any() else lines

@@ -27,9 +27,7 @@ RARE_BELOW = 1e-2
 PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH_FAILURES = 100
-"""Plain Monte Carlo is kept if the share of failures in the pilot, times the number of requested vehicles, is at least
-this.
-"""
+"""Failures to expect among `samples` vehicles, by the pilot, from which on plain Monte Carlo is kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +55,8 @@ class RiskOptions(Options):
     unsafe: str | None = unsafe_option()
     method: str = option(
         "auto",
-        "Method: monte_carlo, subset_simulation, cross_entropy, or auto, which for a study with [variation] draws "
-        f"{PILOT_VEHICLES:,} vehicles and takes subset_simulation if OpenTURNS is installed, the probability is "
+        "Method: monte_carlo, subset_simulation, cross_entropy or auto. For a study with [variation], auto draws "
+        f"{PILOT_VEHICLES:,} vehicles. It then takes subset_simulation if OpenTURNS is installed, the probability is "
         f"below {RARE_BELOW:g} and --samples vehicles would have fewer than {ENOUGH_FAILURES} failures.",
         metavar="METHOD",
         kind=str,
@@ -107,4 +105,4 @@ def risk(
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_call(estimate_risk, RiskOptions, locals())
+    return answer_call(estimate_risk, RiskOptions, locals())  # the arguments by name, the subject first

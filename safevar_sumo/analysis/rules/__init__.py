@@ -56,4 +56,4 @@ def rules(
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_call(find_rules, RulesOptions, locals())
+    return answer_call(find_rules, RulesOptions, locals())  # the arguments by name, the subject first
