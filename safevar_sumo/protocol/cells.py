@@ -39,12 +39,7 @@ TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
 """The target's deceleration [m/s^2] and its headway at the start [s] in CCRb and CMRb; robustness layers vary both."""
 
 
-class CellRow(
-    Struct,
-    frozen=True,
-    forbid_unknown_fields=True,
-    rename={"vut_speed": "vut", "range_letters": "ranges", "target_speed": "target", "has_function_choice": "choice"},
-):
+class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
     """A row of a matrix: speeds of the vehicle under test (VUT) and of the target [km/h].
 
     Letters of columns: S (standard range), E (extended range), - (no cell); `has_function_choice`: the manufacturer
@@ -57,12 +52,7 @@ class CellRow(
     has_function_choice: bool = False
 
 
-class CellMatrix(
-    Struct,
-    frozen=True,
-    forbid_unknown_fields=True,
-    rename={"test_name": "test", "name_cell": "label", "first_cell": "first", "function_column": "function"},
-):
+class CellMatrix(Struct, frozen=True, forbid_unknown_fields=True):
     """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
 
     In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and
@@ -96,16 +86,14 @@ class CellMatrix(
         return self.rows[row].has_function_choice and self.test_name in WARNING_TESTS
 
 
-class Condition(Struct, frozen=True, forbid_unknown_fields=True, rename={"text": "condition"}):
+class Condition(Struct, frozen=True, forbid_unknown_fields=True):
     """A variation of a robustness layer in the calculator's words, and the criterion that must hold."""
 
     text: str
     criterion: str
 
 
-class Layer(
-    Struct, frozen=True, forbid_unknown_fields=True, rename={"test_name": "test", "name": "layer", "claim_cell": "cell"}
-):
+class Layer(Struct, frozen=True, forbid_unknown_fields=True):
     """A robustness layer that counts for a test; in the official template, `claim_cell` on `sheet` states whether the
     layer holds.
     """
@@ -193,20 +181,7 @@ def _leading_number(condition: str) -> float:
     return float(match[1])
 
 
-class Protocol(
-    Struct,
-    frozen=True,
-    eq=False,
-    forbid_unknown_fields=True,
-    dict=True,
-    rename={
-        "calculator_version": "calculator",
-        "starts_by_vut_speed": "mitigation",
-        "starts_by_measure": "criteria",
-        "points_by_test": "scenarios",
-        "matrices": "blocks",
-    },
-):
+class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=True):
     """A protocol; `points_by_test` holds the points of every test, simulated or not, as in `CellMatrix.points`.
 
     Measured values at which colours begin: for `mitigation` in `starts_by_vut_speed`, for other measures in
@@ -330,7 +305,8 @@ def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
     """Numbers of the cells in one of `parts` parts; cells with the same network share a part as far as possible."""
 
     def network_of(number: int) -> tuple[Any, ...]:
-        (model, parameters, _), test = protocol.cells[number].scenario, protocol.cells[number].matrix.test_name
+        model, parameters, _ = protocol.cells[number].scenario
+        test = protocol.cells[number].matrix.test_name
         variation = (parameters.get("heading", 0.0), "start_share" in parameters)
         return model, test in ("CPNA", "CPFA", "CPNCO"), variation, test
 

@@ -24,14 +24,15 @@ HEADER = """\
 # Derived by tests/rating/derive.py from euroncap-rating-2026 {0} (PyPI, Apache-2.0):
 # its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. \
 Do not edit.
-# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer chooses AEB or FCW.
+# range_letters: one for each column, S standard, E extended, - no cell; has_function_choice: the manufacturer chooses
+# AEB or FCW.
 
-calculator = "{0}\""""
+calculator_version = "{0}\""""
 BANDS = """
 # From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the \
 last
 # row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals.
-[mitigation]"""
+[starts_by_vut_speed]"""
 BEST_FIRST = ["green", "yellow", "orange", "brown", "red"]
 
 
@@ -60,22 +61,26 @@ def block(sheet, frame, name: str) -> list[str]:
     rows = []
     for k in range(n_rows):
         function = sheet.cell(top + k, headings["Function"]).value if "Function" in headings else "AEB"
-        speeds = f"vut = {number(sheet.cell(top + k, 1).value)}"
+        speeds = f"vut_speed = {number(sheet.cell(top + k, 1).value)}"
         if column_key == "impact_location":
-            speeds += f", target = {number(sheet.cell(top + k, headings['Target speed']).value)}"
+            speeds += f", target_speed = {number(sheet.cell(top + k, headings['Target speed']).value)}"
         mask = "".join(MASK[points[k, j].test_range] if (k, j) in points else "-" for j in range(n_columns))
-        rows.append(f'  {{ {speeds}, ranges = "{mask}"{"" if function else ", choice = true"} }},')
+        rows.append(f'  {{ {speeds}, range_letters = "{mask}"{"" if function else ", has_function_choice = true"} }},')
     total = data_model.TOTAL_SCORES[name]
     return [
         "",
-        "[[blocks]]",
-        f'test = "{test}"',
+        "[[matrices]]",
+        f'test_name = "{test}"',
         *([f'light = "{light}"'] if light else []),
         f'measure = "{measure(name)}"',
         f'sheet = "{sheet.title}"',
-        f'label = "A{top - 2}"',
-        f'first = "{sheet.cell(top, left).coordinate}"',
-        *([f'function = "{sheet.cell(top, headings["Function"]).column_letter}"'] if "Function" in headings else []),
+        f'name_cell = "A{top - 2}"',
+        f'first_cell = "{sheet.cell(top, left).coordinate}"',
+        *(
+            [f'function_column = "{sheet.cell(top, headings["Function"]).column_letter}"']
+            if "Function" in headings
+            else []
+        ),
         f"points = [{', '.join(f'{total[kind] or 0:g}' for kind in ('Standard', 'Extended', 'Robustness'))}]",
         f"{column_key}s = {quoted(columns)}",
         "rows = [",
@@ -117,10 +122,10 @@ def main() -> None:
     for vut in (10, 20, 30, 40, 50):
         print(f"{vut} = {bands('CCRs', {'VUT speed': f'{vut} km/h'}, BEST_FIRST)}")
     assert bands("CCRs", {"VUT speed": "130 km/h"}, BEST_FIRST) == bands("CCRs", {"VUT speed": "50 km/h"}, BEST_FIRST)
-    print("[criteria]")
+    print("[starts_by_measure]")
     print(f"avoidance = {bands('CCCscp', {'VUT speed': '50 km/h'}, BEST_FIRST)}")
     print(f"warning = {bands('CBLA', {'VUT speed': '50 km/h', 'Function': 'FCW'}, BEST_FIRST[::-1])}")
-    lines = ["", "# Points of every test of the stage: standard, extended, robustness.", "[scenarios]"]
+    lines = ["", "# Points of every test of the stage: standard, extended, robustness.", "[points_by_test]"]
     scenario: dict[str, list[float]] = {}
     for row in book["Scenario Scores"].iter_rows(min_row=2, values_only=True):
         name = row[4] or name  # noqa: F821
@@ -152,14 +157,14 @@ def layers(sheet, test: str) -> list[str]:
                 (conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), []
             )
             pairs = [pairs] if isinstance(pairs, tuple) else pairs
-            conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
+            conditions = [f'{{ text = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
             lines += [
                 "",
                 "[[layers]]",
-                f'test = "{test}"',
-                f'layer = "{layer}"',
+                f'test_name = "{test}"',
+                f'name = "{layer}"',
                 f'sheet = "{sheet.title}"',
-                f'cell = "{cell.coordinate}"',
+                f'claim_cell = "{cell.coordinate}"',
                 f"conditions = [{', '.join(conditions)}]",
             ]
     return lines
