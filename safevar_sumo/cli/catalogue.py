@@ -41,7 +41,7 @@ def list_command(section: str | None, as_json: bool) -> None:
 def _catalogue(studies: list[Study]) -> JsonObject:
     keys = ("name", "unit", "original", "lower", "upper", "threshold", "meaning", "counterpart")
     characteristics = {
-        name: [{key: getattr(item, key) for key in keys} for item in members]
+        name: [{key: getattr(characteristic, key) for key in keys} for characteristic in members]
         for name, members in _characteristics(studies).items()
     }
     return {
@@ -102,20 +102,20 @@ def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[
         if rows:
             print_names(console, title, rows, heads)
 
-    def texts(row: JsonObject, *keys: str) -> tuple[str, ...]:
+    def numbers_as_text(row: JsonObject, *keys: str) -> tuple[str, ...]:
         return tuple(f"{row[key]:g}" for key in keys)
 
     study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]
     show("Studies", study_rows, "name", "title", "vehicle, ADS, scenario, weather")
     for vehicle in catalogue["vehicles"]:
         keys = ("original", "lower", "upper", "threshold")
-        rows = [(row["name"], row["unit"], *texts(row, *keys)) for row in vehicle["characteristics"]]
+        rows = [(row["name"], row["unit"], *numbers_as_text(row, *keys)) for row in vehicle["characteristics"]]
         show(f"Vehicle {vehicle['name']}", rows, "characteristic", "unit", *keys)
         print_meanings(console, _characteristics(studies).get(vehicle["name"], ()))
     weather_rows = [
         (
             row["name"],
-            *texts(row, "road_friction", "visibility", "recognition_delay"),
+            *numbers_as_text(row, "road_friction", "visibility", "recognition_delay"),
             row["light"],
             "wet" if row["wet"] else "dry",
         )

@@ -47,12 +47,12 @@ def raise_mistakes(errors: Iterable[InputError]) -> None:
     if len(mistakes) == 1:
         raise mistakes[0]
     if mistakes:
-        legal = [error.legal for error in mistakes]
+        expected = [mistake.legal for mistake in mistakes]
         texts = [
-            f"{error.problem} (expected: {error.legal})"
-            if error.legal and error.legal not in legal[:i]
-            else error.problem
-            for i, error in enumerate(mistakes)
+            f"{mistake.problem} (expected: {mistake.legal})"
+            if mistake.legal and mistake.legal not in expected[:i]
+            else mistake.problem
+            for i, mistake in enumerate(mistakes)
         ]
         count = f"more than {MAX_MISTAKES}" if len(mistakes) > MAX_MISTAKES else len(mistakes)
         raise InputError(mistakes[0].source, f"{count} mistakes: {'; '.join(texts[:MAX_MISTAKES])}")
@@ -75,7 +75,9 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str = "") -> 
         for leaf in _leaves(error)
     ]
     for error in sorted(errors, key=lambda error: [str(key) for key in error.absolute_path]):
-        path, value, schema = [*([prefix] if prefix else []), *error.absolute_path], error.instance, error.schema
+        path = [*([prefix] if prefix else []), *error.absolute_path]
+        value = error.instance
+        schema = error.schema
         if error.validator == "additionalProperties":
             for key in [key for key in value if key not in schema["properties"]]:
                 yield _unknown_key(source, _path_text([*path, key]), key, schema["properties"])
@@ -114,14 +116,14 @@ def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str]) 
     """The error for an unknown key: it suggests tables of a study that have this key; then, outside of tables, also the
     nearest key of a table, else the nearest known key.
     """
-    keys = [
-        (field.name, inner)
+    known_keys = [
+        (field.name, known)
         for field in msgspec.structs.fields(Study)
-        for inner in getattr(field.type, "__struct_fields__", ())
+        for known in getattr(field.type, "__struct_fields__", ())
     ]
-    homes = [f"{table}.{inner}" for table, inner in keys if inner == key]
-    hint = did_you_mean(key, [*names, *(inner for _, inner in keys if key_path == key)])
-    homes = homes or [f"{table}.{inner}" for table, inner in keys if repr(inner) in hint and inner not in names]
+    homes = [f"{table}.{known}" for table, known in known_keys if known == key]
+    hint = did_you_mean(key, [*names, *(known for _, known in known_keys if key_path == key)])
+    homes = homes or [f"{table}.{known}" for table, known in known_keys if repr(known) in hint and known not in names]
     if homes and "[" not in key_path:
         hint = f"; did you mean {' or '.join(homes)}?"
     return InputError(source, f"{key_path}: there is no such key{hint}", one_of(names))
@@ -247,7 +249,8 @@ def contradictions_of_file(source: object, stated: Tables, tables: Tables) -> It
                 continue  # a shipped weather: its values are looked up later
             if locate_parameter(tables, name) is None:
                 yield missing_parameter(source, table, name)
-    rating, matrix = stated.get("rating"), tables.get("matrix")
+    rating = stated.get("rating")
+    matrix = tables.get("matrix")
     if (
         isinstance(rating, Mapping)
         and rating.get("claims")

@@ -21,8 +21,10 @@ from safevar_sumo.study import Study, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
-# Smallest width of a domain, and the share beta from that width on (method section 2).
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
+"""Smallest width of a domain, and the share beta of the width from which on the filter keeps changes (method section
+2).
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,18 +96,18 @@ class Characteristic:
                 if beyond
                 else f"a number in [{self.lower:g}, {self.upper:g}]"
             )
-            is_plausible = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
-            hint = f", or any with {switch}" if is_plausible and switch else ""
+            is_outside_domain = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            hint = f", or any with {switch}" if is_outside_domain and switch else ""
             raise InputError(
                 source,
-                f"{self.name} = {value}{' is outside its domain' if is_plausible else ''}",
+                f"{self.name} = {value}{' is outside its domain' if is_outside_domain else ''}",
                 f"{expected}{self.suffix}{otherwise}{hint}",
             )
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
-        A plausible value has at most 1000 times the largest magnitude in the domain, and is above 0 if the domain is.
+        A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0 if the domain is.
         """
         if beyond:
             return (np.abs(values) <= self.largest_plausible) & ((values > 0) | (self.lower <= 0))
@@ -161,7 +163,7 @@ class CharacteristicSet:
         return values
 
     def filter(self, settings: FloatArray) -> FloatArray:
-        """Reset each value that differs from the original by no more than its threshold (method section 2)."""
+        """Reset each value that differs from the original by no more than the threshold (method section 2)."""
         return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
 
     def changed(self, filtered: FloatArray) -> BoolArray:

@@ -57,7 +57,8 @@ def rating_in_words(rating: Rating) -> str:
     """The rating in a sentence: how many points the variant loses and in which test; without a variant, the original's
     points.
     """
-    maximum, variant = max_points(rating.protocol), rating.variant
+    maximum = max_points(rating.protocol)
+    variant = rating.variant
     if variant is None:
         return (
             f"The original vehicle earns {rating.original.points:.2f} of the {maximum:g} points of the tests that "
@@ -146,7 +147,8 @@ def _build_points_table(rating: Rating) -> WholeTable:
         title="Points: standard + extended + robustness = total",
     )
     for test_of_each in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True):
-        original_test, lost = test_of_each[0], round(test_of_each[0].total - test_of_each[-1].total, 2)
+        original_test = test_of_each[0]
+        lost = round(original_test.total - test_of_each[-1].total, 2)
         table.add_row(
             original_test.matrix.name,
             *(_format_sum(test.points) for test in test_of_each),
@@ -176,13 +178,15 @@ def _build_layers_table(rating: Rating) -> WholeTable:
         "test", "vehicle", "layers that hold", "layers that fail", "claimed layers", title="Robustness layers"
     )
     for test_of_each in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True):
-        name, layers = test_of_each[0].matrix.test_name, test_of_each[0].layers
+        name = test_of_each[0].matrix.test_name
+        original_layers = test_of_each[0].layers
         claimed = rating.original.rater.claims.get(name, ())
         for vehicle, test in zip(rating.vehicles, test_of_each, strict=True):
-            if test.matrix.light != "night" and (vehicle is rating.original or test.layers != layers):
+            if test.matrix.light != "night" and (vehicle is rating.original or test.layers != original_layers):
                 simulated = {layer: holds for layer, holds in test.layers.items() if layer not in claimed}
                 held, failed = (
-                    ", ".join(k for k, holds in simulated.items() if holds is is_held) for is_held in (True, False)
+                    ", ".join(layer for layer, holds in simulated.items() if holds is is_held)
+                    for is_held in (True, False)
                 )
                 table.add_row(name, vehicle.name, held, failed, ", ".join(claimed))
     return table
@@ -192,22 +196,22 @@ def print_matrices(console: Console, rating: Rating) -> None:
     """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the
     warning [s].
     """
-    numbers = rating.protocol.matrix_cell_numbers
+    cell_numbers = rating.protocol.matrix_cell_numbers
     for matrix in rating.protocol.matrices:
         meaning = "impact location [%]" if matrix.impact_locations else "speed of the target"
         columns = [f"{value:g}" for value in matrix.column_values]
         table = WholeTable("VUT", "target", right=columns, title=f"{matrix.name}: speeds [km/h], {meaning}")
         for row_number, row in enumerate(matrix.rows):
             keys = [(matrix.name, row_number, column) for column in range(len(row.range_letters))]
-            cells = [_format_cell(rating, numbers[key]) if key in numbers else Text("") for key in keys]
+            cells = [_format_cell(rating, cell_numbers[key]) if key in cell_numbers else Text("") for key in keys]
             target = "" if row.target_speed is None else f"{row.target_speed:g}"
             table.add_row(_format_vut_speed(matrix, row_number), target, *cells)
         console.print(table)
-    compared = "; original>variant where they differ" if rating.variant else ""
+    comparison = "; original>variant where they differ" if rating.variant else ""
     print_text(
         console,
         f"{LEGEND}. The number is the relative speed of the impact [km/h]; in rows with "
-        f"FCW it is the time to collision at the warning [s]{compared}.",
+        f"FCW it is the time to collision at the warning [s]{comparison}.",
     )
 
 
@@ -258,19 +262,21 @@ def _draw_matrix(axis: Axes, rating: Rating, matrix: CellMatrix) -> None:
     import seaborn as sns
     from matplotlib.colors import ListedColormap
 
-    columns, numbers = [*(f"{value:g}" for value in matrix.column_values), ""], rating.protocol.matrix_cell_numbers
-    colours = np.full((len(matrix.rows), len(columns) * len(rating.vehicles)), np.nan)
+    headings = [*(f"{value:g}" for value in matrix.column_values), ""]  # "": a gap after each vehicle
+    cell_numbers = rating.protocol.matrix_cell_numbers
+    colours = np.full((len(matrix.rows), len(headings) * len(rating.vehicles)), np.nan)
     letters = np.full(colours.shape, "", dtype="U2")
     for row, column in np.ndindex(colours.shape):
-        index, cell_column = divmod(column, len(columns))
-        number, vehicle = numbers.get((matrix.name, row, cell_column)), rating.vehicles[index]
-        if number is not None:
-            differs = vehicle.colour(number) != rating.original.colour(number)
-            colours[row, column] = vehicle.scores.colours[0, number]
-            letters[row, column] = _letter(vehicle, number) + "*" * differs
+        vehicle_number, cell_column = divmod(column, len(headings))
+        vehicle = rating.vehicles[vehicle_number]
+        cell_number = cell_numbers.get((matrix.name, row, cell_column))
+        if cell_number is not None:
+            differs = vehicle.colour(cell_number) != rating.original.colour(cell_number)
+            colours[row, column] = vehicle.scores.colours[0, cell_number]
+            letters[row, column] = _letter(vehicle, cell_number) + "*" * differs
     palette = ListedColormap(["#808080", *(f"#{rating.protocol.colours[colour]}" for colour in COLOURS)])
     rows = [_format_vut_speed(matrix, row) for row in range(len(matrix.rows))]
-    frame = pd.DataFrame(colours, rows, columns * len(rating.vehicles))
+    frame = pd.DataFrame(colours, rows, headings * len(rating.vehicles))
     sns.heatmap(
         frame, annot=letters, fmt="", cmap=palette, vmin=-1, vmax=len(COLOURS) - 1, cbar=False, linewidths=0.6, ax=axis
     )
@@ -290,7 +296,8 @@ def summarise_rated_solutions(
     `directory` is the results directory in these commands; the other parameters are those of
     `safevar_sumo.analysis.explain.compute.summarise_failures`, which calls this function for rated studies.
     """
-    original_points, points_column = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
+    points_column = RATING_POINTS.name
+    original_points = float(original.column(points_column)[0])
     unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
     has_loss = unsafe.rows(solutions)
     if not has_loss.any():

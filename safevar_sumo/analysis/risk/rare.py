@@ -68,10 +68,13 @@ class Response:
     """
 
     def __init__(self, evaluator: Evaluator, settings_of: SettingsFunction, unsafe: Unsafe) -> None:
-        self._evaluator, self.settings_of, self._unsafe = evaluator, settings_of, unsafe
-        self.names, self.dimensions = evaluator.characteristics.names, len(evaluator.characteristics)
+        self._evaluator = evaluator
+        self._unsafe = unsafe
+        self.settings_of = settings_of
+        self.names = evaluator.characteristics.names
+        self.dimensions = len(evaluator.characteristics)
         self.simulations = self.errors = self.failure_count = 0
-        self.nearest = np.zeros((0, self.dimensions))
+        self.nearest_failure = np.zeros((0, self.dimensions))
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
@@ -80,14 +83,15 @@ class Response:
 
     def record(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
         """Count known evaluations of points, remember the nearest failure among the points, and return the response."""
-        is_unsafe, margin = self._unsafe.of(evaluations), self._unsafe.margin(evaluations)
-        margin = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE_RESPONSE)
+        is_unsafe = self._unsafe.of(evaluations)
+        margin = self._unsafe.margin(evaluations)
+        response = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE_RESPONSE)
         self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
         self.failure_count += int(np.count_nonzero(is_unsafe))
-        failures = np.concatenate([self.nearest, points[is_unsafe]])
-        self.nearest = failures[np.argsort(np.linalg.norm(failures, axis=1), kind="stable")[:1]]
-        return np.where(is_unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
+        failures = np.concatenate([self.nearest_failure, points[is_unsafe]])
+        self.nearest_failure = failures[np.argsort(np.linalg.norm(failures, axis=1), kind="stable")[:1]]
+        return np.where(is_unsafe, np.minimum(response, -MIN_RESPONSE), np.maximum(response, MIN_RESPONSE))
 
 
 def load_openturns() -> Any:
@@ -109,12 +113,10 @@ def load_openturns() -> Any:
 
 def is_plateau(responses: FloatArray) -> bool:
     """Whether most of the responses nearest to failure (a share p0 of all) equal each other."""
-    nearest = np.sort(responses[responses > 0])[: max(int(LEVEL_SHARE * len(responses)), 2)]
-    if not len(nearest):
+    lowest = np.sort(responses[responses > 0])[: max(int(LEVEL_SHARE * len(responses)), 2)]
+    if not len(lowest):
         return False
-    return bool(
-        np.count_nonzero(nearest == nearest[-1]) >= PLATEAU_SHARE * len(nearest) or nearest[-1] >= SAFE_RESPONSE
-    )
+    return bool(np.count_nonzero(lowest == lowest[-1]) >= PLATEAU_SHARE * len(lowest) or lowest[-1] >= SAFE_RESPONSE)
 
 
 def estimate_rare(response: Response, method: str, confidence: float, seed: int) -> Estimate:
@@ -139,22 +141,27 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
         and np.mean([probability for probability, _ in estimates[:REPEATS]]) < VERY_RARE_BELOW
     ):
         estimates.append(estimate_once(response, (seed + 7919 * len(estimates)) % 2**31))
-    probabilities, variations = np.array(estimates).T
-    mean, repeats = float(np.mean(probabilities)), len(estimates)
+    probabilities, coefficients = np.array(estimates).T
+    mean = float(np.mean(probabilities))
+    repeats = len(estimates)
     failures, errors = response.failure_count, response.errors  # without those around the design point
-    variation, interval, design_point = math.nan, (0.0, MIN_PROBABILITY), None
+    coefficient_of_variation = math.nan
+    interval = (0.0, MIN_PROBABILITY)
+    design_point = None
     remark = "no failure was found: either there is none, or the response does not lead to it"
     if mean > 0:
-        spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
-        variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
+        observed = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
+        estimated = INFLATION * math.sqrt(float(np.mean(np.square(coefficients))) / repeats)
+        coefficient_of_variation = max(observed, estimated)
         quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR_DEGREES))
-        factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
-        interval, remark = (mean / factor, min(mean * factor, 1.0)), ""
+        factor = math.exp(quantile * math.sqrt(math.log1p(coefficient_of_variation**2)))
+        interval = (mean / factor, min(mean * factor, 1.0))
+        remark = ""
         (setting,) = response.settings_of(_find_design_point(response, np.random.default_rng(seed))).tolist()
         design_point = dict(zip(response.names, setting, strict=True))
     return Estimate(
         probability=max(mean, 0.0),
-        coefficient_of_variation=variation,
+        coefficient_of_variation=coefficient_of_variation,
         interval=interval,
         failures=failures,
         errors=errors,
@@ -172,7 +179,8 @@ def _failure_event(ot: Any, response: Callable[[Any], FloatArray], dimensions: i
 
 def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float]:
     """Probability and coefficient of variation of a subset simulation."""
-    ot, is_stagnant = load_openturns(), False
+    ot = load_openturns()
+    is_stagnant = False
     algorithm = ot.SubsetSampling(_failure_event(ot, response, response.dimensions), PROPOSAL_WIDTH, LEVEL_SHARE)
     algorithm.setBlockSize(round(LEVEL_SHARE * LEVEL_SIZE))
     algorithm.setMaximumOuterSampling(round(1 / LEVEL_SHARE))
@@ -233,11 +241,11 @@ def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArr
     failure.
     """
     for search_round in range(SEARCH_ROUNDS):
-        nearest = response.nearest
-        shape = SEARCH_SETTINGS, response.dimensions
-        spread = (
+        nearest = response.nearest_failure
+        shape = (SEARCH_SETTINGS, response.dimensions)
+        points_around = (
             nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1))) + rng.normal(size=shape) * 0.4 / 2**search_round
         )
         response(nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis])
-        response(spread)
-    return response.nearest
+        response(points_around)
+    return response.nearest_failure
