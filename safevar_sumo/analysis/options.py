@@ -147,6 +147,8 @@ InputError
     If an argument is wrong, or inputs have changed since the results were computed.
 SimulationError
     If the original vehicle cannot be simulated."""
+POINT_ARGUMENT = """point
+    Name of the only point of the study's matrix to simulate; by default all."""
 QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
@@ -159,7 +161,8 @@ def document_options(options: type[Options]) -> Callable[[QuestionFunction], Que
         arguments = [
             f"{name}\n{indent(definition.argument_text, '    ')}" for name, definition in options.definitions().items()
         ]
-        function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, COMMON_ARGUMENTS])
+        point = [POINT_ARGUMENT] if "point" in function.__annotations__ else []
+        function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, *point, COMMON_ARGUMENTS])
         return function
 
     return append_arguments

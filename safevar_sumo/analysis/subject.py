@@ -148,6 +148,21 @@ def study_in(subject: Study | Case) -> Study:
     return subject if isinstance(subject, Study) else subject.study
 
 
+def reduce_to_point(subject: Study | Case, point: str | None) -> Study | Case:
+    """A study or results at one point of the study's matrix; the subject itself without a point.
+
+    Raises
+    ------
+    InputError
+        If the study has no such point.
+    """
+    from safevar_sumo.sumo.matrix import study_at
+
+    if point is None:
+        return subject
+    return study_at(subject, point, source="point") if isinstance(subject, Study) else at_point(subject, point)
+
+
 def at_point(case: Case, point: str) -> Case:
     """Results at one point of the study's matrix: their solutions and the original vehicle, simulated again there.
 
@@ -161,7 +176,7 @@ def at_point(case: Case, point: str) -> Case:
     from safevar_sumo.sumo.matrix import evaluate, study_at
     from safevar_sumo.sumo.system import assemble
 
-    study, names = study_at(case.study, point, source="--point"), list(case.characteristics.names)
+    study, names = study_at(case.study, point, source="point"), list(case.characteristics.names)
     system = assemble(study)
     scoring = system.measuring.scoring
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[names].to_numpy(float)])
@@ -241,6 +256,7 @@ def answer_call(
 
     source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]
     subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=results_only)
+    subject = reduce_to_point(subject, arguments.get("point"))
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))

@@ -274,16 +274,11 @@ def load_results_or_study(source: str, point: str | None = None, *, results_only
 
 
 def _load_subject(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
-    from safevar_sumo.analysis.subject import at_point, study_or_case
-    from safevar_sumo.sumo.matrix import study_at
+    from safevar_sumo.analysis.subject import reduce_to_point, study_or_case
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         subject = study_or_case(source, as_it_is_now=as_it_is_now(), results_only=results_only)
     for warning in caught:
         print_warning(warning.message)
-    if point is None:
-        return subject
-    if isinstance(subject, Study):
-        return study_at(subject, point, source="--point")
-    return at_point(subject, point)
+    return reduce_to_point(subject, point)

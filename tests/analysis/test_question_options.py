@@ -5,6 +5,7 @@ follow.
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import shlex
 import subprocess
@@ -26,6 +27,7 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import commands
+from tests.in_process import InlinePool, refused, run
 
 OTHER_DEFAULT = """
 import inspect, pathlib, sys, types
@@ -69,6 +71,7 @@ def test_a_function_takes_and_documents_the_options_of_its_record(options: type[
         "jobs": None,
         "progress": False,
         "as_it_is_now": False,
+        **({} if options is RatingOptions else {"point": None}),
     }
     heads = re.findall(r"^(\w+)\n    \w", inspect.getdoc(function) or "", re.MULTILINE)
     assert sorted(heads) == sorted([*arguments, "InputError", "SimulationError"])
@@ -98,6 +101,17 @@ def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
         for name, value in vars(options).items()
         if value != getattr(type(options), name)
     )
+
+
+@pytest.mark.slow
+def test_a_question_takes_the_point_that_its_command_takes() -> None:
+    point = "CPFA, speed 40, wet"
+    typed = ["rules", "wear", "--samples", "64", "--point", point, "--json"]
+    answer = sv.rules("wear", samples=64, point=point, pool=InlinePool()).to_dict()
+    assert json.dumps(answer, indent=2) == run(*typed).stdout.strip()
+    refused("rules", "wear", "--point", "CPFB", message=("--point: 'CPFB'", "expected: one of 26 points"))
+    with pytest.raises(sv.InputError, match="point: 'CPFB'"):
+        sv.rules("wear", point="CPFB")
 
 
 @pytest.mark.slow

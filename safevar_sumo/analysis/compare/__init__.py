@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_call, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_call, reduce_to_point, study_or_case
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ def compare(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> SystemComparison:
     """Simulate the same settings in two systems: which settings are unsafe in one of them only, how do limits differ?
 
@@ -60,5 +61,5 @@ def compare(
     from safevar_sumo.analysis.compare.compute import compare_systems
 
     arguments = locals()
-    other = study_or_case(b, as_it_is_now=as_it_is_now)
+    other = reduce_to_point(study_or_case(b, as_it_is_now=as_it_is_now), point)
     return answer_call(partial(compare_systems, other=other), CompareOptions, arguments)

@@ -72,6 +72,7 @@ def explain(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> Explained:
     """Explain failures: their minimal causes with boundaries, the reason in words, and the robustness.
 

@@ -46,6 +46,7 @@ def opinion(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> Opinions:
     """Drive minimal causes of failures again with CommonRoad's multi-body vehicle with Pacejka's tyres.
 

@@ -66,6 +66,7 @@ def repair(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> Repairs:
     """Find the smallest changes of a driving system that survive the promised wear, and their price on a new vehicle.
 

@@ -94,6 +94,7 @@ def risk(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> Risk:
     """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides
     whether one occurs.

@@ -46,6 +46,7 @@ def rules(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> Rules:
     """Find rules in physical units that say where a study is unsafe.
 

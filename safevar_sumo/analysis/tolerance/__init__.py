@@ -63,6 +63,7 @@ def tolerance(
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    point: str | None = None,
 ) -> Tolerance:
     """Find how far characteristics may go: each by itself, with `pairs` also two together, and all together.
 
