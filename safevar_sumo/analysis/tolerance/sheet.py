@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.tables import LATEX_NEEDS, Table, markdown_table, render_latex
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, JsonObject
@@ -231,10 +231,11 @@ class LimitsSheet:
         axis.set_yticks([-i for i in range(len(self.rows))])
         axis.set_yticklabels([escape_dollars(row.characteristic.short_name) for row in self.rows], fontsize=FONT)
         axis.set_xlim(-0.02, 1.02)
+        axis.set_ylim(0.5 - len(self.rows), 0.5)
         axis.set_xticks([])
         axis.set_xlabel(
-            "domain from its lower to its upper end; dot: new; light: safe alone; dark: safe with all others at "
-            "theirs; line: specified",
+            "domain from its lower to its upper end; dot: new; line: specified;\n"
+            "light: safe alone; dark: safe with all others at theirs",
             fontsize=FONT - 1,
         )
         return figure
@@ -256,7 +257,9 @@ def _draw_row(axis: Axes, height: float, row: LimitRow) -> None:
             continue
         for text, value, side in zip(row.texts(ends), ends, ("left", "right"), strict=True):
             if text and value is not None:
-                axis.text(place(value), height + offset, f"{text}{one.suffix}", ha=side, fontsize=FONT - 1.5)
+                axis.text(
+                    place(value), height + offset, f"{text}{as_formula(one.suffix)}", ha=side, fontsize=FONT - 1.5
+                )
     for limit in () if row.specified is None else (row.specified.at_least, row.specified.at_most):
         if limit is not None:
             axis.plot([place(limit)] * 2, [height - 0.3, height + 0.3], color=VERMILION, linewidth=1.5, zorder=3)
