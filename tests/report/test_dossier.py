@@ -148,3 +148,4 @@ def test_the_pack_with_all_sections_verifies(packed: tuple[dict[str, Any], Path,
     assert result["same"] == result["claims"]
     names = {claim["claim"] for claim in result["table"]}
     assert {"checks", "dossier", "validation rows", "answer explain", "answer tolerance", "answer risk"} <= names
+    assert any(name.startswith("setting explain.") for name in names)

@@ -49,7 +49,7 @@ runs = 1
 @pytest.fixture(scope="module")
 def pack(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("pack") / "pack.zip"
-    run("evidence", str(slippery), "--out", str(out), "--explain")
+    run("evidence", str(slippery), "--out", str(out), "--risk")
     return out
 
 
@@ -121,8 +121,7 @@ def test_every_claim_is_the_same_in_another_folder(pack: Path, slippery: Path, i
     assert result["claims"] == result["same"] == len(result["table"])
     names = [claim["claim"] for claim in result["table"]]
     assert sum(name.startswith("solution ") for name in names) == solutions
-    assert "answer explain" in names
-    assert any(name.startswith("setting explain.") for name in names)
+    assert "answer risk" in names
 
 
 @pytest.mark.slow
@@ -130,20 +129,20 @@ def test_the_packed_answer_has_the_bytes_that_its_command_prints(pack: Path, sli
     description, files = read_pack(pack)
     (study,) = description.studies
     (answer,) = study.answers
-    assert answer.command == "python -m safevar_sumo explain results/slippery --json"
+    assert answer.command == "python -m safevar_sumo risk results/slippery --json"
     printed = run(*answer.command.replace("results/slippery", str(slippery)).split()[3:]).stdout
-    assert files[f"{study.folder}/answers/explain.json"].decode() == printed
+    assert files[f"{study.folder}/answers/risk.json"].decode() == printed
 
 
 @pytest.mark.slow
 def test_a_changed_claim_differs(pack: Path, tmp_path: Path) -> None:
-    path = changed(pack, tmp_path / "it.zip", "explain.json", digit_of(r'"robustness": 0\.(\d+)'))
+    path = changed(pack, tmp_path / "it.zip", "risk.json", digit_of(r'"probability": 0\.(\d+)'))
     claim = next(claim for claim in not_same(path) if claim["claim"] != "dossier")
-    assert claim["claim"] == "answer explain"
-    assert "robustness" in claim["packed"]
-    assert "robustness" in claim["here"]
-    path = changed(pack, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"limit":(\d+)'))
-    assert {claim["claim"] for claim in not_same(path)} == {"answer explain"}
+    assert claim["claim"] == "answer risk"
+    assert "probability" in claim["packed"]
+    assert "probability" in claim["here"]
+    path = changed(pack, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"samples":(\d+)'))
+    assert {claim["claim"] for claim in not_same(path)} == {"answer risk"}
 
 
 @pytest.mark.slow
