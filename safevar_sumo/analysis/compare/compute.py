@@ -45,15 +45,7 @@ def compare_systems(
     names = list(sets[0].names)
     _require_same_characteristics(*(one.study for one in evaluators))
     orders = [[names.index(name) for name in one.names] for one in sets]
-    lower = np.max([one.lower[np.argsort(order)] for one, order in zip(sets, orders, strict=True)], axis=0)
-    upper = np.min([one.upper[np.argsort(order)] for one, order in zip(sets, orders, strict=True)], axis=0)
-    if (lower > upper).any():
-        name = names[int(np.argmax(lower > upper))]
-        raise InputError(
-            evaluators[1].study.source,
-            f"{name}: the domains of the two studies do not overlap",
-            "studies with a common domain of each characteristic",
-        )
+    lower, upper = _common_domain(evaluators, orders)
     solutions = [
         _solutions_of(source, one, names) for source, one in zip("ab", subjects, strict=True) if isinstance(one, Case)
     ]
@@ -95,6 +87,21 @@ def compare_systems(
         weather=_weather_table(subjects),
         remarks=(f"{left_out} outside the other system's domain left out",) if outside.any() else (),
     )
+
+
+def _common_domain(evaluators: tuple[Evaluator, Evaluator], orders: list[list[int]]) -> tuple[FloatArray, FloatArray]:
+    """The ends of the domain that both systems have, in the order of the first one's characteristics."""
+    pairs = [(one.characteristics, order) for one, order in zip(evaluators, orders, strict=True)]
+    lower = np.max([one.lower[np.argsort(order)] for one, order in pairs], axis=0)
+    upper = np.min([one.upper[np.argsort(order)] for one, order in pairs], axis=0)
+    if (lower > upper).any():
+        name = evaluators[0].characteristics.names[int(np.argmax(lower > upper))]
+        raise InputError(
+            evaluators[1].study.source,
+            f"{name}: the domains of the two studies do not overlap",
+            "studies with a common domain of each characteristic",
+        )
+    return lower, upper
 
 
 def _require_same_characteristics(a: Study, b: Study) -> None:
