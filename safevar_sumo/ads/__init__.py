@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.ads.aeb import Aeb
+from safevar_sumo.ads.autoware import AutowareAeb
 from safevar_sumo.ads.base import REACTION_PARAMETERS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
 from safevar_sumo.ads.fmu import FmuAds
@@ -14,6 +15,7 @@ ADS: Mapping[str, type[Any]] = {
     "acc": Acc,
     "aeb": Aeb,
     "apollo": Apollo,
+    "autoware_aeb": AutowareAeb,
     "competent_driver": CompetentDriver,
     "full_braking": FullBraking,
     "fuzzy_safety": FuzzySafety,

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import force_setattr
 
-from safevar_sumo.ads.base import Ads, Memory
+from safevar_sumo.ads.base import Ads, GuardedAds, Memory, PerVehicleAds
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 from safevar_sumo.study.schema import FreeParameter
 
@@ -23,7 +23,7 @@ CHANGEABLE = msgspec.convert(
 
 
 class VariedAds(Ads):
-    """A shipped ADS with own values of some `names` for each vehicle: `values` has shape (m, number of names).
+    """An ADS with own values of some `names` for each vehicle: `values` has shape (m, number of names).
 
     With K points, vehicle i of each group of m has row i.
     """
@@ -32,9 +32,19 @@ class VariedAds(Ads):
         self._ads, self._names, self._values = ads, names, values
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
+        columns = [np.tile(column, n // len(column)) for column in self._values.T]
         own: Any = copy.copy(self._ads)
-        for name, column in zip(self._names, self._values.T, strict=True):
-            force_setattr(own, name, np.tile(column, n // len(column)))
+        if isinstance(own, PerVehicleAds):
+            drivers = own.start(n, nominal, step)
+            for name, column in zip(self._names, columns, strict=True):
+                for driver, value in zip(drivers, column.tolist(), strict=True):
+                    setattr(driver, name, value)
+            return own, drivers
+        model = own
+        if isinstance(own, GuardedAds):
+            model = own._ads = copy.copy(own._ads)
+        for name, column in zip(self._names, columns, strict=True):
+            (force_setattr if isinstance(model, msgspec.Struct) else object.__setattr__)(model, name, column)
         return own, own.start(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:

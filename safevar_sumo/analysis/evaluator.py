@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.campaign.batches import VERIFIED_SETTINGS, ask_why_no_verdict, evaluate_all, inputs_of
-from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.evaluation import EVERYTHING, Inputs, Selection, pack_study
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool, wait_for_result
 from safevar_sumo.campaign.retrying import RetryingPool
@@ -70,25 +70,27 @@ class Evaluator:
                 groups = [self.evaluate(settings[feasible], stage), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
                 return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
-        return self._evaluate_shown(settings, stage, verified=self._verified)
+        return self._evaluate_shown(settings, stage, self._verified)
 
-    def evaluate_parameters(
-        self, rows: FloatArray, parameters: tuple[str, ...], points: tuple[int, ...], stage: str
-    ) -> Evaluations:
+    def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings with the values of some parameters of the ADS beside them, shape (M, n + P), at some
-        points of the study's matrix; without `points`, at all.
+        points.
         """
-        return self._evaluate_shown(rows, stage, verified=0, parameters=parameters, points=points)
+        return self._evaluate_shown(rows, stage, 0, selection, self._inputs)
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return inputs_of(self.study, self._pool)
 
     def _evaluate_shown(
         self,
         settings: FloatArray,
         stage: str,
-        *,
         verified: int,
-        parameters: tuple[str, ...] = (),
-        points: tuple[int, ...] = (),
+        selection: Selection = EVERYTHING,
+        inputs: Inputs | None = None,
     ) -> Evaluations:
+        """Evaluate settings while progress is shown."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, total = 0, len(np.unique(settings, axis=0))
@@ -99,7 +101,7 @@ class Evaluator:
             done += increment
             self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, parameters, points)
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection, inputs)
         self.simulated += total
         return evaluations
 

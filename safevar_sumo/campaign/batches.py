@@ -8,14 +8,13 @@ import math
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 import platformdirs
 
-from safevar_sumo.campaign.evaluation import Inputs, network_digests, pack_study
+from safevar_sumo.campaign.evaluation import EVERYTHING, Inputs, Selection, network_digests, pack_study
 from safevar_sumo.campaign.pool import Pool, wait_for_first, wait_for_result
 from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import InputError, UserCodeError
@@ -48,13 +47,11 @@ _passed_checks: set[str] = set()
 """Identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
 
 
-def choose_batch_size(study: Study, points: tuple[int, ...] = ()) -> tuple[int, bool]:
+def choose_batch_size(study: Study, selection: Selection = EVERYTHING) -> tuple[int, bool]:
     """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
     SUMO.
     """
-    system = assemble(study, study.source)
-    if points:
-        system = replace(system, matrix=tuple(system.points[number] for number in points))
+    system = selection.of(assemble(study, study.source))
     return settings_per_batch(system, Engine.RECORDED), is_recorded(system)
 
 
@@ -64,22 +61,22 @@ def evaluate_all(
     pool: Pool,
     done: Callable[[int], None] = lambda number: None,
     verified: int = VERIFIED_SETTINGS,
-    parameters: tuple[str, ...] = (),
-    points: tuple[int, ...] = (),
+    selection: Selection = EVERYTHING,
+    inputs: Inputs | None = None,
 ) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
 
     User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO,
     until `verified` ones of the study have been.
-    `done` is called with the number of settings of every finished batch. With `parameters` or `points`, see
-    `pack_study`, nothing is verified in SUMO.
+    `done` is called with the number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO;
+    a caller that evaluates many times may keep the `inputs` (`inputs_of`).
     """
-    retrying_pool, inputs = RetryingPool(pool, study), inputs_of(study, pool)
-    work = pack_study(study, inputs, parameters=parameters, points=points)
+    retrying_pool, inputs = RetryingPool(pool, study), inputs_of(study, pool) if inputs is None else inputs
+    work = pack_study(study, inputs, selection=selection)
     check_code(study, inputs, retrying_pool)
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     if work not in _batch_sizes:
-        _batch_sizes[work] = choose_batch_size(study, points)
+        _batch_sizes[work] = choose_batch_size(study, selection)
     best_size, is_recorded = _batch_sizes[work]
     share = len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers)
     size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
@@ -88,7 +85,7 @@ def evaluate_all(
     sample_size = max(min(verified - _verified_counts.get(work, 0), len(distinct_settings)), 0)
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     sumo_future = recorded_future = None
-    if is_recorded and len(sample) and not (parameters or points):
+    if is_recorded and len(sample) and selection == EVERYTHING:
         sumo_work, recorded_work = works_for_sumo(study, inputs)
         sumo_future = retrying_pool.submit(sumo_work, distinct_settings[sample])
         if recorded_work:

@@ -16,7 +16,6 @@ from typing import IO
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
@@ -38,6 +37,25 @@ Evaluate = Callable[[bytes, FloatArray], Evaluations]
 """A function that evaluates settings of a packed study, as `evaluate_batch` does."""
 
 
+class Selection(msgspec.Struct, frozen=True):
+    """Which parameters of the ADS have values in every row of the settings, after the characteristics; the numbers of
+    the only points to simulate, without any all; with `arrays`, one ADS drives all rows, with arrays as parameters.
+    """
+
+    parameters: tuple[str, ...] = ()
+    points: tuple[int, ...] = ()
+    arrays: bool = True
+
+    def of(self, system: System) -> System:
+        """The system at the selected points."""
+        points = tuple(system.points[number] for number in self.points)
+        return replace(system, matrix=points) if points else system
+
+
+EVERYTHING = Selection()
+"""All points, with the parameters of the study."""
+
+
 class Task(msgspec.Struct, frozen=True):
     """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
 
@@ -51,8 +69,7 @@ class Task(msgspec.Struct, frozen=True):
     check: bool
     cells: tuple[int, int] | None
     empty_road: bool
-    parameters: tuple[str, ...]
-    points: tuple[int, ...]
+    selection: Selection
 
 
 def pack_study(
@@ -64,8 +81,7 @@ def pack_study(
     check: bool = False,
     cells: tuple[int, int] | None = None,
     empty_road: bool = False,
-    parameters: tuple[str, ...] = (),
-    points: tuple[int, ...] = (),
+    selection: Selection = EVERYTHING,
 ) -> bytes:
     """Pack a study for a worker as bytes.
 
@@ -85,17 +101,13 @@ def pack_study(
     empty_road
         Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's
         `reasons`.
-    parameters
-        Parameters of the ADS whose values follow the characteristics in every row of the settings.
-    points
-        Numbers of the only points to simulate; by default all.
+    selection
+        Parameters of the ADS that vary, and points; by default no parameter, and all points.
     """
     if inputs is None:
         inputs = {"network": network_digests(assemble(study))}
     shared_inputs = {layer: dict(inputs[layer]) for layer in LAYERS_OF_FILES if layer in inputs}
-    return msgspec.msgpack.encode(
-        Task(study, shared_inputs, engine, afresh, check, cells, empty_road, parameters, points)
-    )
+    return msgspec.msgpack.encode(Task(study, shared_inputs, engine, afresh, check, cells, empty_road, selection))
 
 
 @lru_cache(maxsize=8)
@@ -129,7 +141,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
             evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
         elif task.cells is not None:
             evaluations = evaluate_cells(system, settings, task.cells, task.engine)
-        elif task.parameters or task.points:
+        elif task.selection != EVERYTHING:
             evaluations = _evaluate_parameters(system, task, settings)
         else:
             evaluations = evaluate(system, settings, task.engine)
@@ -140,23 +152,19 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate rows of n characteristics and the values of some parameters of the ADS, at the points of a task.
-
-    A shipped ADS drives all rows at once, with arrays as its parameters; any other has an own instance for each set of
-    values.
-    """
-    n = len(system.characteristics)
-    settings, values = rows[:, :n], rows[:, n:]
-    if task.points:
-        system = replace(system, matrix=tuple(system.points[number] for number in task.points))
-    if (task.study.ads.model in ADS and len(rows) <= settings_per_batch(system, task.engine)) or not task.parameters:
-        ads = VariedAds(system.ads, task.parameters, values) if task.parameters else system.ads
-        return replace(evaluate(replace(system, ads=ads), settings, task.engine), settings=rows)
+    """Evaluate rows of n characteristics and the values of some parameters of the ADS, at the points of a task."""
+    selection, n = task.selection, len(system.characteristics)
+    settings, values, system = rows[:, :n], rows[:, n:], selection.of(system)
+    if not values.size:
+        return evaluate(system, settings, task.engine)
+    if selection.arrays and len(rows) <= settings_per_batch(system, task.engine):
+        system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
+        return replace(evaluate(system, settings, task.engine), settings=rows)
     distinct_values, set_of_row = np.unique(values, axis=0, return_inverse=True)
     batches, order = [], []
     for number, own_values in enumerate(distinct_values):
         members = np.flatnonzero(set_of_row.ravel() == number)
-        own_study = with_parameters(task.study, dict(zip(task.parameters, own_values.tolist(), strict=True)))
+        own_study = with_parameters(task.study, dict(zip(selection.parameters, own_values.tolist(), strict=True)))
         own_system = replace(system, ads=assemble(own_study).ads)
         batches.append(replace(evaluate(own_system, settings[members], task.engine), settings=rows[members]))
         order.append(members)

@@ -120,9 +120,8 @@ class Retries:
         """The error, with a command that reproduces it if the error has no command yet."""
         if COMMAND_PREFIX in error.problem:
             return error
-        return UserCodeError(
-            error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal
-        )
+        command = reproduction_command(self._study, setting[0, : len(self.characteristics)])
+        return UserCodeError(error.source, f"{error.problem}{COMMAND_PREFIX}{command}", error.legal)
 
 
 class RetryingPool:

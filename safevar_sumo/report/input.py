@@ -14,6 +14,7 @@ from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
+from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
@@ -47,6 +48,7 @@ def page_options() -> JsonObject:
         RiskOptions(samples=SAMPLED_VEHICLES),
         RulesOptions(samples=SAMPLED_VEHICLES),
         CompareOptions(),
+        RepairOptions(),
     )
     return {options.question: options for options in all_options}
 

@@ -31,6 +31,7 @@ from safevar_sumo.analysis.rating.render import (
     rating_in_words,
     test_in_words,
 )
+from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.figures import draw_figures
@@ -71,6 +72,7 @@ DOMAIN_QUESTIONS: Mapping[str, Callable[..., Any]] = {
     "tolerance": find_tolerances,
     "risk": estimate_risk,
     "rules": find_rules,
+    "repair": find_repairs,
 }
 """Functions that answer the questions about the whole domain, by the name of the section and of the command."""
 HIDDEN_COLUMNS = ("lower", "upper", "not_simulated")
@@ -191,6 +193,7 @@ SECTIONS = {
     "tolerance": "Tolerances",
     "risk": "Share of unsafe vehicles",
     "rules": "Failure regions",
+    "repair": "Repair",
     "compare": "The two systems compared",
     "questions": "Research questions",
     "trust": "Limits and trust",
@@ -227,7 +230,9 @@ def make_report(
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     if len(inputs) != 2 and "compare" in only:
         raise InputError("only", f"compare needs two results, and there are {len(inputs)}", "two results directories")
+    has_promise = all(data.case.study.repair.promise or data.case.study.limits for data in inputs)
     left_out = {*([] if paper else ["questions"]), *(["compare"] if len(inputs) != 2 else [])}
+    left_out |= set() if has_promise else {"repair"}
     sections = {
         name: heading for name, heading in SECTIONS.items() if name in only or (not only and name not in left_out)
     }
@@ -315,7 +320,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         "figures": {
             name: figure_data(result.figure(), result.to_frame())
             for name, result in answers.items()
-            if name != "rules" and not result.to_frame().empty
+            if name not in ("rules", "repair") and not result.to_frame().empty
         },
         **{name: make() for name, make in makers.items() if name in sections},
     }

@@ -28,7 +28,7 @@ NATIVE = load_study("native")
 SYSTEMS = {
     name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))) for name in ADS
 }
-TAKE_OVER = {"aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
+TAKE_OVER = {"aeb", "autoware_aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
 """ADSs that keep the initial speed."""
 KNOWN = assemble(load_study("sun")).nominal
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from msgspec.structs import force_setattr
 
+from safevar_sumo.ads.autoware import AutowareAeb
 from safevar_sumo.ads.car_following import Krauss
 from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.records import Nominal, Observation, PedalTables
@@ -157,3 +161,27 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     acceleration = (min(safe_speed, 13.89) - speed) / (STEP + KNOWN.actuator_lag)
     assert command.throttle[0] == pytest.approx(min(max(acceleration / KNOWN.accel, 0), 1), abs=1e-6)
     assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)
+
+
+def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
+    speed = np.repeat([30, 40, 60], 2) / 3.6
+    deceleration, jerk = np.tile([3.0, 2.5], 3), np.tile([3.0, 1.5], 3)
+    ads = copy.copy(AutowareAeb())
+    force_setattr(ads, "target_acceleration", deceleration)
+    force_setattr(ads, "target_jerk", jerk)
+    ramp = deceleration / jerk
+    while_ramp = speed * ramp - jerk * ramp**3 / 6
+    after = speed - jerk * ramp**2 / 2
+    stop = speed * ads.command_delay + while_ramp + after**2 / (2 * deceleration)
+    margins = speed * ads.t_response + speed**2 / (2 * ads.a_ego_min) + ads.longitudinal_offset_margin - stop
+    assert margins == pytest.approx([3.6, -1.3, 4.5, -3.2, 6.1, -8.5], abs=0.06)
+    gap, step = ads.distance(speed, np.zeros(6)) - 1e-9, 0.001
+    memory = ads.start(6, KNOWN, step)
+    for sample in range(12_000):
+        held = COASTING / (FULL + COASTING) + 0 * speed
+        now = Observation(sample * step, speed, gap, speed, 0 * speed, 0 * speed, 1.0, throttle=held)
+        command, memory = ads.drive(now, memory)
+        pull = command.throttle * (FULL + COASTING) - COASTING - command.brake * BRAKING
+        following = np.maximum(speed + pull * step, 0.0)
+        gap, speed = gap - (speed + following) / 2 * step, following
+    assert gap == pytest.approx(margins, abs=0.01)

@@ -21,7 +21,7 @@ def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         many,
         "choose_batch_size",
-        lambda study, *points: (100, False) if study.name == "made-up" else batches(study, *points),
+        lambda study, *selection: (100, False) if study.name == "made-up" else batches(study, *selection),
     )
     monkeypatch.setattr(many, "pack_study", pack_study)
     monkeypatch.setattr(many, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool))

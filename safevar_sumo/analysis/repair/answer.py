@@ -7,22 +7,28 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 import tomli_w
 from rich.table import Table
 
+from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, new_panels
 from safevar_sumo.analysis.repair.attack import Proof
 from safevar_sumo.analysis.repair.price import Price
 from safevar_sumo.analysis.repair.problem import Parameter, Promise
 from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.campaign.evaluation import with_parameters
+from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.schema import NAME_PATTERN
 from safevar_sumo.sumo.empty_road import summary_entry
+from safevar_sumo.terminal import WholeTable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class NotRepairable(NamedTuple):
@@ -33,6 +39,17 @@ class NotRepairable(NamedTuple):
     limits: dict[str, float]
     point: str
     share: float
+
+
+class Exchange(NamedTuple):
+    """What the promise of a characteristic costs: by how many metres the ADS has to brake earlier at its worst point;
+    None if it is not `repairable`.
+    """
+
+    characteristic: str
+    promise: float
+    metres_earlier: float | None
+    repairable: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +101,8 @@ class Repairs:
         If today's system keeps the promise already: its proof on fresh wear.
     largest_promise
         If no change survives the promise: the largest part of it that some change keeps; None if there is none.
+    curve
+        The exchange rate between promised wear and metres that the driving system brakes earlier, if requested.
     unread
         Parameters that no simulation reads, so that they were not searched.
     """
@@ -101,6 +120,7 @@ class Repairs:
     attacks: int
     simulations: int
     counterexamples: int
+    curve: tuple[Exchange, ...] = ()
     no_verdict: str = ""
 
     def to_dict(self) -> list[JsonObject]:
@@ -121,7 +141,8 @@ class Repairs:
             "counterexamples": self.counterexamples,
             **largest,
         }
-        return [*(one.to_dict() for one in self.repairs), summary, *summary_entry(self.no_verdict)]
+        exchanges = [{"record": "exchange", **one._asdict()} for one in self.curve]
+        return [*(one.to_dict() for one in self.repairs), *exchanges, summary, *summary_entry(self.no_verdict)]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each repair: `parameters`, `changed`, `largest_change`, and the price [m, s, m/s^2, m/s^3]."""
@@ -140,6 +161,29 @@ class Repairs:
         ]
         columns = ["parameters", "changed", "largest_change", "metres_earlier_mean", "metres_earlier_worst"]
         return pd.DataFrame(rows, columns=[*columns, "seconds_earlier", "largest_deceleration", "largest_jerk"])
+
+    def figure(self) -> Figure:
+        """Promised wear against metres that the driving system brakes earlier; what no parameter repairs is shaded.
+
+        Raises
+        ------
+        InputError
+            If no curve was computed.
+        """
+        if not self.curve:
+            raise InputError("plot", "there is no curve", "a characteristic for the curve")
+        (one,) = (one for one in self.promise.characteristics if one.name == self.curve[0].characteristic)
+        figure, (axis,) = new_panels(
+            f"{self.study.name}: promised wear and earlier braking", 1, 1, (4.0, 2.6), min_width=4.6, title_height=1.0
+        )
+        repaired = [(part.promise, part.metres_earlier) for part in self.curve if part.metres_earlier is not None]
+        axis.plot([end for end, _ in repaired], [metres for _, metres in repaired], "o-", color=BLUE)
+        lost = [part.promise for part in self.curve if not part.repairable]
+        if lost:
+            axis.axvspan(min(lost), max(lost), facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white")
+        axis.set_xlabel(f"promised {one.name} [{as_formula(one.unit)}]", fontsize=FONT)
+        axis.set_ylabel("brakes earlier [m]", fontsize=FONT)
+        return figure
 
     def repaired_study(self) -> Study:
         """The study with the first repair."""
@@ -182,6 +226,8 @@ class Repairs:
             for one in self.repairs[1:]:
                 yield f"  or                 {self._changes_in_words(one)}: {_price_in_words(one.price)}"
             yield f"  checked            {_proof_in_words(first.proof)}{_held_out_in_words(first.held_out)}"
+        if self.curve:
+            yield self._curve_table()
         for name in self.unread:
             yield f"  not searched       no simulation reads {name}"
         for part in self.not_repairable:
@@ -193,6 +239,14 @@ class Repairs:
             ]
             place = f" ({part.point})" if part.point else ""
             yield f"  not repairable     {' with '.join(limits)}{place}: needs another part, not a parameter"
+
+    def _curve_table(self) -> WholeTable:
+        name = self.curve[0].characteristic
+        table = WholeTable(f"promise of {name}", right=("brakes earlier [m]",), title="The exchange rate")
+        for one in self.curve:
+            metres = "-" if one.metres_earlier is None else f"{one.metres_earlier:.2f}"
+            table.add_row(f"{one.promise:.4g}", metres if one.repairable else "no parameter repairs it")
+        return table
 
     def _changes_in_words(self, repair: Repair) -> str:
         return ", ".join(

@@ -11,8 +11,9 @@ import numpy as np
 from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
 from safevar_sumo.analysis.explain.causes import cause_key, describe_causes, find_minimal_causes
 from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.repair.answer import NotRepairable, Repair, Repairs
+from safevar_sumo.analysis.repair.answer import Exchange, NotRepairable, Repair, Repairs
 from safevar_sumo.analysis.repair.attack import Proof, attack, prove
+from safevar_sumo.analysis.repair.curve import exchange_rate
 from safevar_sumo.analysis.repair.held_out import check_unseen
 from safevar_sumo.analysis.repair.price import NewCar, Price, benign_scenes, drive_new_car, price_of
 from safevar_sumo.analysis.repair.problem import Problem, Promise, default_margin, parameters_of
@@ -104,8 +105,12 @@ class _Finder:
             self._refuse_unread()
             repairs = self._repairs()
             largest = None if repairs else self._largest_promise(vehicles[can])
+        curve = list[Exchange]()
+        if options.curve is not None:
+            curve = exchange_rate(problem, len(self.system.matrix), self._price, options.curve, repairs)
         return Repairs(
             study=study,
+            curve=tuple(curve),
             promise=problem.promise,
             margin=problem.margin,
             parameters=tuple(problem.parameters),

@@ -12,7 +12,7 @@ from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.opinion.compute import assemble_both_systems
 from safevar_sumo.analysis.repair.problem import Problem, degrees_of
 from safevar_sumo.campaign.evaluation import with_parameters
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import WEATHERS, equals_clear
 from safevar_sumo.sumo.matrix import evaluate
@@ -41,8 +41,11 @@ def check_unseen(problem: Problem, values: Mapping[str, float], vehicles: FloatA
         there = replace(
             system, matrix=tuple(point._replace(name=name) for name, point in points.items()), weather=weather
         )
-        able = degrees_of(evaluate(replace(there, ads=best_driver), settings)) >= problem.margin
-        checks["weathers"][weather.name] = _count(there, settings[able], problem.margin)
+        try:
+            able = degrees_of(evaluate(replace(there, ads=best_driver), settings)) >= problem.margin
+            checks["weathers"][weather.name] = _count(there, settings[able], problem.margin)
+        except UserCodeError:
+            continue  # a user's vehicle that knows no wet road
     try:
         ours, second = assemble_both_systems(study)
         problem.evaluator.progress("second vehicle model", 0, 1)

@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec.structs import asdict, replace as replace_in
 
+from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
 from safevar_sumo.analysis.preventability import approach_parameters
-from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.errors import InputError, UserCodeError, unknown_name
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, ModelTable, Study, limits_of, unit_text
 from safevar_sumo.study.limits import limit_mistakes
 from safevar_sumo.sumo.system import assemble
@@ -23,6 +25,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 DEFAULT_MARGIN = 0.3
 """Safety degree to keep of a study that states no error of its model [m]."""
 MAX_PARAMETERS = 8
+ARRAY_CHECKS = 8
+"""Sets of parameters with which a user's ADS is tried as one for all vehicles."""
 MAX_CORNERS = 256
 """Largest number of corners of the promised part; of a part with more, so many random ones are taken."""
 PREFIX = "ads.parameters."
@@ -216,9 +220,30 @@ class Problem:
 
     def evaluate(self, shares: FloatArray, wear: FloatArray, stage: str, points: Sequence[int] = ()) -> Evaluations:
         """Row i: parameters i with vehicle i, at the worst of some points; without any, at the worst of all."""
-        rows = np.concatenate([wear, self.values(shares)], axis=1)
-        names = tuple(one.name for one in self.parameters)
-        return self.evaluator.evaluate_parameters(rows, names, tuple(points), stage)
+        return self._select(shares, wear, stage, points, arrays=self.takes_arrays)
+
+    def _select(
+        self, shares: FloatArray, wear: FloatArray, stage: str, points: Sequence[int], *, arrays: bool
+    ) -> Evaluations:
+        selection = Selection(tuple(one.name for one in self.parameters), tuple(points), arrays)
+        return self.evaluator.evaluate_selection(np.concatenate([wear, self.values(shares)], axis=1), selection, stage)
+
+    @cached_property
+    def takes_arrays(self) -> bool:
+        """Whether one ADS may drive vehicles with different parameters: a shipped one, or the user's if a sample has
+        the same results to the bit. Otherwise each set of parameters has an own instance.
+        """
+        table = self.study.ads
+        if table.kind or table.model in ADS:
+            return not table.kind
+        shares = sobol_points(ARRAY_CHECKS, len(self.parameters), 0)
+        wear = self.promise.settings(sobol_points(ARRAY_CHECKS, len(self.promise.columns), 1))
+        stage = "does the driving system take arrays?"
+        try:
+            together = self._select(shares, wear, stage, (), arrays=True)
+        except UserCodeError:
+            return False
+        return not any(differences(self._select(shares, wear, stage, (), arrays=False).results, together.results))
 
     def degrees(self, shares: FloatArray, wear: FloatArray, stage: str, points: Sequence[int] = ()) -> FloatArray:
         """Safety degrees as `evaluate`; infinite without a conflict, and minus infinity where nothing was simulated."""

@@ -18,6 +18,8 @@ from safevar_sumo.records import BoolArray, FloatArray
 
 SOBOL_SETS, DIAGONAL_SETS, LINE_SETS = 4096, 256, 64
 """Sets of parameters in a subset's box, on each of its diagonals, and on a line back to the parameters of today."""
+THINNING = 16
+"""Factor by which an ADS has fewer sets that needs an own instance for each."""
 MAX_ZOOMS, LEAST_GAIN = 8, 0.002
 """Boxes searched in turn, each as large as the smallest change so far; the search ends when a box gains less."""
 FIRST_VEHICLES = 16
@@ -37,6 +39,7 @@ class Search:
     def __init__(self, problem: Problem, vehicles: FloatArray, seen: Sequence[int]) -> None:
         self.problem, self.vehicles, self.seen = problem, vehicles, list(seen)
         self.failures: list[Failure] = []
+        self._thinning = 1 if problem.takes_arrays else THINNING
 
     def add(self, vehicles: FloatArray) -> None:
         """Add counterexamples, which are tried first."""
@@ -141,8 +144,8 @@ class Search:
         """Candidates in the box of a subset that goes `half` of the ranges from today, and on its diagonals."""
         today, columns = self.problem.today, list(subset)
         lower, upper = np.maximum(today - half, 0.0)[columns], np.minimum(today + half, 1.0)[columns]
-        inner = lower + sobol_points(SOBOL_SETS, len(columns), zoom) * (upper - lower)
-        steps = np.arange(1, DIAGONAL_SETS + 1) / DIAGONAL_SETS * half
+        inner = lower + sobol_points(SOBOL_SETS // self._thinning, len(columns), zoom) * (upper - lower)
+        steps = np.arange(self._thinning, DIAGONAL_SETS + 1, self._thinning) / DIAGONAL_SETS * half
         diagonals = [today[columns] + np.outer(steps, signs) for signs in product((-1.0, 1.0), repeat=len(columns))]
         points = np.concatenate([inner, np.clip(np.concatenate(diagonals), 0.0, 1.0)])
         shares = np.tile(today, (len(points), 1))

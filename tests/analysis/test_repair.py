@@ -1,0 +1,182 @@
+"""Repairs against a closed form, and their price where a driving system always brakes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.ads import ADS
+from safevar_sumo.ads.varied import CHANGEABLE
+from safevar_sumo.analysis.repair import attack, compute, smallest
+from safevar_sumo.scenarios.benign import benign_points
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import run
+
+SPEED, MARGIN, GAP_TODAY = 10.0, 0.3, 6.6
+
+MODELS = """
+import numpy as np
+from typing import NamedTuple
+from safevar_sumo.records import Command
+from safevar_sumo.vehicles import SumoType
+
+
+class State(NamedTuple):
+    speed: np.ndarray
+    throttle: np.ndarray
+    brake: np.ndarray
+    gear: np.ndarray
+
+
+class Sled:
+    UNITS = {"grip": "m/s^2", "paint": "-"}
+
+    def prepare(self, characteristics, road_friction, step):
+        return {**characteristics, "step": step}
+
+    def sumo_type(self, prepared):
+        n = np.ones_like(prepared["grip"])
+        return SumoType(1000 * n, 3 * n, prepared["grip"], 40 * n, 0.1 * n)
+
+    def at_rest(self, prepared):
+        nothing = np.zeros_like(prepared["grip"])
+        return State(nothing, nothing, nothing, nothing)
+
+    def at_speed(self, prepared, speed):
+        nothing = np.zeros_like(prepared["grip"])
+        return State(speed, nothing, nothing, nothing)
+
+    def sense(self, prepared, state, seen):
+        return seen, state
+
+    def advance(self, prepared, state, command):
+        acceleration = 3 * command.throttle - prepared["grip"] * command.brake
+        speed = np.maximum(state.speed + acceleration * prepared["step"], 0.0)
+        return State(speed, command.throttle, command.brake, state.gear)
+
+
+class Brakes:
+    def __init__(self, gap=6.6, always=0.0, colour=1.0):
+        self.gap, self.always, self.colour = gap, always, colour
+
+    def start(self, n, nominal, step):
+        return np.zeros(n, dtype=bool)
+
+    def drive(self, seen, braking):
+        braking = braking | (seen.gap <= self.gap) | (self.always + 0 * seen.speed >= 0.5)
+        return Command(np.zeros(len(seen.speed)), braking.astype(float)), braking
+"""
+
+STUDY = """
+name = "planted"
+title = "A sled that brakes at a gap"
+weather = "clear"
+step_length = 0.005
+
+[scenario]
+model = "car_to_car"
+parameters = { test = "CCRs", speed = 36.0, headway = 2.5, time_after = 2.5 }
+
+[vehicle]
+model = "models:Sled"
+
+[vehicle.characteristics]
+grip = { unit = "m/s^2", original = 8, lower = 1.8, upper = 9 }
+paint = { unit = "-", original = 1, lower = 0.5, upper = 2 }
+
+[ads]
+model = "models:Brakes"
+parameters = { gap = 6.6, always = 0.0, colour = 1.0 }
+
+[metrics]
+ttc_threshold = 1.5
+
+[search]
+algorithms = ["rs"]
+population = 20
+evaluations = 40
+runs = 1
+seed = 1
+
+[repair]
+gap = { lower = 2.0, upper = 32.0, unit = "m", meaning = "gap at which it brakes" }
+always = { lower = 0.0, upper = 1.0, unit = "-", meaning = "from a half on it brakes without reason" }
+colour = { lower = 0.0, upper = 2.0, unit = "-", meaning = "colour of its box" }
+
+[repair.promise]
+grip = { at_least = 3 }
+"""
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, number in (("SOBOL_SETS", 256), ("DIAGONAL_SETS", 64)):
+        monkeypatch.setattr(smallest, name, number)
+    monkeypatch.setattr(attack, "RANDOM_ATTACKS", 64)
+    monkeypatch.setattr(compute, "SOBOL_VEHICLES", 32)
+    monkeypatch.setattr(attack, "MAX_UNSAFE_SHARE", 0.01)
+    (tmp_path / "models.py").write_text(MODELS)
+    (tmp_path / "planted.toml").write_text(STUDY)
+    return tmp_path / "planted.toml"
+
+
+def gap_for(grip: float) -> float:
+    """The gap at which a sled has to brake so that it stops `MARGIN` before the obstacle."""
+    return MARGIN + SPEED**2 / (2 * grip)
+
+
+@pytest.mark.slow
+def test_repair_price_and_curve_of_a_planted_system_equal_the_closed_form(planted: Path, tmp_path: Path) -> None:
+    found = sv.repair(planted, change=["gap", "colour"], curve="grip", jobs=2)
+    assert found.unread == ("colour",)
+    (repair,) = found.repairs
+    assert repair.values["gap"] == pytest.approx(gap_for(3), rel=0.01)
+    assert repair.price.worst == repair.price.mean == pytest.approx(gap_for(3) - GAP_TODAY, rel=0.01)
+    assert repair.proof.unsafe == 0
+    assert repair.proof.at_most <= 0.01
+    for one in found.curve:
+        assert one.repairable == (gap_for(one.promise) < 25.0)
+        if one.repairable:
+            assert one.metres_earlier == pytest.approx(
+                max(gap_for(one.promise) - GAP_TODAY, 0), rel=0.01, abs=0.11
+            )  # two steps
+
+
+@pytest.mark.slow
+def test_always_braking_has_its_price_and_a_kept_promise_writes_no_file(planted: Path, tmp_path: Path) -> None:
+    (repair,) = sv.repair(planted, change=["always"], jobs=2).repairs
+    assert repair.price.needless is not None
+    scenes, repaired, original = repair.price.needless
+    assert scenes >= 6
+    assert (repaired, original) == (scenes, 0)
+    out = tmp_path / "kept.toml"
+    done = run("repair", str(planted), "--promise", "grip>=7.9", "--out", str(out))
+    assert "keeps this promise" in done.stdout
+    assert not out.exists()
+
+
+def test_every_changeable_parameter_is_a_number_of_its_driving_system() -> None:
+    assert {"aeb", "world_on_rails", "apollo", "idm", "acc", "rss", "fuzzy_safety"} <= CHANGEABLE.keys() <= ADS.keys()
+    for ads, table in CHANGEABLE.items():
+        assert set(table) <= set(ADS[ads].__struct_fields__)
+        assert all(row.lower < row.upper and row.unit and row.meaning for row in table.values())
+
+
+@pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
+def test_there_are_at_least_forty_benign_scenes(name: str) -> None:
+    scenes = benign_points(assemble(sv.load_study(name)).points)
+    assert len({scene.name for scene in scenes}) == len(scenes) >= 40
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
+def test_nobody_needs_to_brake_in_a_benign_scene(name: str) -> None:
+    blind = {"model": "aeb", "parameters": {"reach": 0.001}}
+    system = assemble(sv.load_study(name, ads=blind))
+    benign = replace(system, matrix=tuple(benign_points(system.points)))
+    for result in simulate_all_points(benign, system.characteristics.original[None]):
+        assert not result.evaluations.collided[0], result.point.name
