@@ -46,6 +46,9 @@ def file_schema() -> Parameters:
             table.pop("required", None)
     # A file has the parameters of an algorithm in a table such as [search.nsga2].
     tables["SearchTable"]["additionalProperties"] = {"type": "object", "description": "The algorithm's parameters."}
+    tables["RepairTable"]["additionalProperties"] = {
+        "$ref": "#/$defs/FreeParameter"
+    }  # and those of an ADS under [repair]
     del study["required"]
     _describe_keys(study, tables)
     study["properties"] = {"extends": EXTENDS, **study["properties"]}
