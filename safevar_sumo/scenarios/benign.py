@@ -28,7 +28,7 @@ BESIDE = (-50.0, -40.0)
 """Places beside the vehicle's path [% of the width from its left corner]: the pedestrian walks there, or drives by."""
 LANE_WIDTH = 3.5
 """Distance of the next lane [m]."""
-HEADWAYS = (2.0, 2.5, 3.0, 4.0, 5.0)
+HEADWAYS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
 """Distances of a car in the next lane at the start, as time headways [s]."""
 CITY_SPEEDS = (20.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
 """Speeds with a car in the next lane of a study whose vehicle starts at rest [km/h]."""
@@ -93,7 +93,7 @@ def _scenes_like(scenario: Scenario) -> Iterable[tuple[str, Scenario]]:
             yield name, replace(scenario, impact_location=place)
     if isinstance(scenario, Crossing | Along | CarToCar):
         length, width = scenario.vut_length, scenario.vut_width
-        for headway in HEADWAYS[::2] if isinstance(scenario, Crossing | Along) else HEADWAYS:
+        for headway in HEADWAYS[::4] if isinstance(scenario, Crossing | Along) else HEADWAYS:
             name = f"{scenario.speed:g} km/h, a car in the next lane {headway:g} s ahead"
             yield name, NextLane(speed=scenario.speed, headway=headway, vut_length=length, vut_width=width)
     if isinstance(scenario, LeadVehicleStopped):

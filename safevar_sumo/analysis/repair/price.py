@@ -76,12 +76,13 @@ def drive_new_car(study: Study, values: Mapping[str, float], benign: Sequence[Po
         if onset is not None:
             begins[:, column] = result.runs.trace.position[onset, 0], result.runs.trace.time[onset]
     jerk = OPTIONAL_METRICS["max_jerk"]
+    jerks = [float(jerk(result.runs, system.metrics_table)[0]) for result in results]
     return NewCar(
         begins[0],
         begins[1],
         np.array([float(result.evaluations.f_safe[0]) for result in results]),
         max(_deceleration(result) for result in results),
-        float(np.nanmax([float(jerk(result.runs, system.metrics_table)[0]) for result in results])),
+        max((value for value in jerks if np.isfinite(value)), default=0.0),
         np.array(_brakes_in(system, benign)) if benign else None,
     )
 
