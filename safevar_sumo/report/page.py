@@ -39,6 +39,7 @@ from safevar_sumo.analysis.research_questions.tables import BoldText, lay_out
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.subject import answer_question
+from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
@@ -123,6 +124,13 @@ def figure_data(figure: Figure, frame: pd.DataFrame) -> JsonObject:
     """An answer's figure, with its values as a table."""
     shown = frame[[name for name in frame if name not in HIDDEN_COLUMNS]].set_index("characteristic")
     return {**_picture("", figure), "table": table_data(shown, "Values of the figure")}
+
+
+def limits_data(tolerance: Tolerance) -> JsonObject:
+    """The limits sheet as a table; without columns that say nothing here."""
+    sheet = tolerance.sheet.to_frame().set_index("characteristic")
+    without = ["part"] if tolerance.limits else ["part", "specified", "kept"]
+    return table_data(sheet.drop(columns=without), "Limits, rounded to the safe side")
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
@@ -299,9 +307,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         "title": data.case.study.title,
         "anchor": data.anchor(),
         "replays": replays,
-        "limits": table_data(answers["tolerance"].sheet.to_frame().set_index("characteristic"), "Limits")
-        if "tolerance" in answers
-        else None,
+        "limits": limits_data(answers["tolerance"]) if "tolerance" in answers else None,
         "failures": [describe_failure(data, failure) for failure in choices],
         "picture": _picture("failure", data.draw_failure(choices[0])) if choices and "verdict" in sections else None,
         "sheet": _picture("limits", answers["tolerance"].sheet.figure()) if "tolerance" in answers else None,
