@@ -50,8 +50,11 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
     assert same_bits(together.take([0]), evaluate(system, population[:1]))
 
 
-def test_the_original_vehicle_does_not_collide(any_system: System) -> None:
+def test_the_original_vehicle_does_not_collide(any_system: System, request: pytest.FixtureRequest) -> None:
     original = evaluate(any_system, any_system.characteristics.original[np.newaxis])
+    if request.node.callspec.id == "autoware_december":  # what docs/autoware.md is about
+        assert original.outcome[0] == Outcome.COLLISION
+        return
     assert original.outcome[0] in (Outcome.STOPPED, Outcome.PASSED)
     assert original.f_safe[0] > 0
     assert original.f_diff[0] == original.f_num_diff[0] == 0
