@@ -153,7 +153,7 @@ def opinion(
 @add_question(
     ToleranceOptions,
     "STUDY|DIR",
-    file_option("--plot", "Draw the profiles to this file: png, pdf or svg."),
+    file_option("--plot", "Draw the profiles, or the curve of --trade, to this file: png, pdf or svg."),
     click.option(
         "--format",
         "format_name",

@@ -22,6 +22,7 @@ from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.analysis.tolerance.sheet import safe_text
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
@@ -345,8 +346,9 @@ def test_limits_are_rounded_to_the_safe_side() -> None:
 def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:
     study = tmp_path / "mine.toml"
     study.write_text(f'extends = "native"\n[limits]\ndecel = {{ at_least = {limit}, source = "workshop" }}\n')
-    done = run("tolerance", str(study), "--characteristics", "decel,brakeGain", "--jobs", "1", "--json", expect=code)
-    today, decel, gain, joint = json.loads(done.stdout)
+    flags = ("--characteristics", "decel,brakeGain", "--trade", "decel,brakeGain", "--jobs", "1", "--json")
+    done = run("tolerance", str(study), *flags, expect=code)
+    today, decel, gain, joint, trade = json.loads(done.stdout)
     assert list(today) == ["study", "unsafe", "alone", "pairs", "joint"]
     keys = "characteristic unit original alone together specified kept margin first_failure"
     assert list(decel["limit"]) == keys.split()
@@ -358,3 +360,43 @@ def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, c
     assert list(joint["joint"]) == keys.split()
     assert joint["joint"]["box"]["decel"][0] == float(limit)
     assert ("failed: limit of decel: outside by" in done.stderr) == (code == 3)
+    (low, high), curve = decel["limit"]["alone"], trade["trade"]["curve"]
+    assert (curve[0]["value"], curve[-1]["value"]) == (low, high)
+    assert gain["limit"]["alone"] in [point["safe"] for point in curve if point["value"] == decel["limit"]["original"]]
+
+
+def test_a_trade_follows_the_line_between_safe_and_unsafe() -> None:
+    """Unsafe: (a - 5) + 2 (b - 5) + 3 (c - 5) > 6; c up to 6 takes 3 of the 6."""
+    study = made_up_study(3)
+
+    def answer(**options: Any) -> Tolerance:
+        pool = Plant(study, lambda rows: (rows - 5) @ LINEAR > 6)
+        return tolerance(study, unsafe="collision", pool=pool, **options)
+
+    plain, free, held = answer(), answer(trade=["b", "a"]), answer(trade=["b", "a"], limits=["c <= 6", "a <= 5.5"])
+    for result, room, last in ((free, 6.0, 8.0), (held, 3.0, 6.5)):
+        assert result.trade is not None
+        values = list(result.trade.curve)
+        assert (values[0], values[-1]) == (0.0, pytest.approx(last, abs=1e-4))
+        assert 5.0 in values
+        assert len(values) == 11
+        for value, ends in result.trade.curve.items():
+            assert ends == (0.0, pytest.approx(min(10.0, 5 + room - 2 * (value - 5)), abs=1e-4))
+    record = json.loads(json.dumps(free.to_dict(), allow_nan=False))
+    assert list(record["trade"]) == ["characteristics", "units", "fixed", "curve"]
+    del record["trade"]
+    assert json.dumps(record) == json.dumps(plain.to_dict()), "all else stays"
+    assert held.trade is not None
+    assert held.trade.to_dict()["fixed"] == {"c": [None, 6.0]}
+    assert [str(cell) for column in held.trade.table().columns for cell in list(column.cells)[-2:]] == [
+        *("5.7", "6.5"),
+        *("0.0*", "0.0*"),
+        *("6.4", "5.0"),
+    ]
+    assert held.figure().axes[0].get_xlabel() == "b [N m]"
+
+
+@pytest.mark.parametrize("names", ["a", "a,b,c", "a,a", "a,wheel", ""])
+def test_a_trade_needs_two_characteristics(names: str) -> None:
+    with pytest.raises(InputError, match=r"^trade: "):
+        tolerance(made_up_study(3), trade=names.split(","), pool=Plant(made_up_study(3), nowhere))

@@ -49,6 +49,17 @@ class ToleranceOptions(Options):
             "study: all other characteristics get the largest box that is safe with these."
         ),
     )
+    trade: tuple[str, ...] | None = option(
+        None,
+        "How far B may go at values of A, from the original to where A is unsafe by itself; others with limits are at "
+        "these.  [default: none]",
+        metavar="A,B",
+        form="commas",
+        python=(
+            "Two characteristics: find how far the second may go at values of the first, from the original to where "
+            "the first is unsafe by itself; others with limits are at these. By default none."
+        ),
+    )
 
 
 @document_options(ToleranceOptions)
@@ -59,6 +70,7 @@ def tolerance(
     characteristics: Sequence[str] | None = None,
     pairs: bool = ToleranceOptions.pairs,
     limits: Sequence[str] = ToleranceOptions.limits,
+    trade: Sequence[str] | None = None,
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,

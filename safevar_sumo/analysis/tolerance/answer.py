@@ -14,6 +14,7 @@ from safevar_sumo.analysis.explain.sentences import situation_in_words
 from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
 from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
 from safevar_sumo.analysis.tolerance.sheet import Ends, Failure, LimitRow, LimitsSheet
+from safevar_sumo.analysis.tolerance.trade import Trade
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -58,7 +59,8 @@ class Tolerance:
     (`joint`).
 
     `limits` are those that the user specified, `together` the box with them, None without limits or without a box;
-    `first_failures` are evaluations of what fails first beyond the limit of a characteristic, by name.
+    `first_failures` are evaluations of what fails first beyond the limit of a characteristic, by name. `trade` is the
+    curve of two characteristics, None if not requested.
     """
 
     study: Study
@@ -71,6 +73,7 @@ class Tolerance:
     limits: Mapping[str, Limit] = field(default_factory=dict)
     together: JointLimits | None = None
     first_failures: Mapping[str, Evaluations] = field(default_factory=dict)
+    trade: Trade | None = None
 
     @property
     def sheet(self) -> LimitsSheet:
@@ -147,12 +150,12 @@ class Tolerance:
         ).reset_index()
 
     def to_dict(self) -> JsonObject | list[JsonObject]:
-        """The JSON of `tolerance`; with limits a list that ends with the limits' records."""
-        record = self._to_record()
+        """The JSON of `tolerance`; with limits a list that ends with the limits' records, and at last the trade-off."""
+        record, trade = self._to_record(), {} if self.trade is None else {"trade": self.trade.to_dict()}
         if not self.limits:
-            return record
+            return {**record, **trade}
         joint = {"joint": None} if self.together is None else self.together.to_dict()
-        return [record, *self.sheet.to_dict(), joint]
+        return [record, *self.sheet.to_dict(), joint, *([trade] if trade else [])]
 
     def _to_record(self) -> JsonObject:
         return {
@@ -198,6 +201,8 @@ class Tolerance:
             yield from map(_losses_in_words, self.alone)
         else:
             yield self._box_in_words() if self.together is None else self._together_in_words()
+        if self.trade is not None:
+            yield self.trade.table() if self.trade.curve else f"{self.trade.title}."
 
     def _box_in_words(self) -> str:
         box = self.joint
@@ -233,7 +238,11 @@ class Tolerance:
         )
 
     def figure(self) -> Figure:
-        """The safety degree, or points, over each domain; the original is marked, unsafe intervals are shaded."""
+        """The safety degree, or points, over each domain; the original is marked, unsafe intervals are shaded. With a
+        trade-off, its curve instead.
+        """
+        if self.trade is not None:
+            return self.trade.figure(self.study.name)
         column = RATING_POINTS.name if is_rated(self.study) else SAFETY_DEGREE
         title = f"{self.study.name}: one characteristic at a time (unsafe: {self.unsafe})"
         figure, axes = new_panels(title, len(self.alone), 4, (2.3, 1.75), min_width=4.6, title_height=1.0)

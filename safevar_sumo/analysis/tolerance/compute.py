@@ -14,6 +14,7 @@ from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
 from safevar_sumo.analysis.tolerance.boxes import find_safe_box, random_settings
 from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan, scan_pairs
+from safevar_sumo.analysis.tolerance.trade import find_trade
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -37,6 +38,10 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
     limits = _limits_of(study, options, columns)
     if options.pairs and len(columns) < 2:
         raise InputError("pairs", "one characteristic makes no pair", "at least two characteristics")
+    if options.trade is not None:
+        if len(options.trade) != 2:
+            raise InputError("trade", repr(",".join(options.trade)), "two characteristics, separated by a comma")
+        _check_names("trade", options.trade, list(study.vehicle.characteristics))
     original = evaluator.evaluate_original()
     unsafe = evaluator.choose_criterion(options.unsafe, source, original)
     # A box of a rated study would take thousands of whole test matrices. Characteristics that constraints tie so
@@ -64,19 +69,23 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
         limits=limits,
         together=together,
         first_failures=_first_failures(evaluator, scans, together),
+        trade=None if options.trade is None else find_trade(evaluator, options.trade, unsafe, limits),
     )
 
 
 def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int]:
-    names, chosen = list(study.vehicle.characteristics), characteristics or ()
+    names = list(study.vehicle.characteristics)
+    _check_names("characteristics", characteristics or (), names)
+    return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
+
+
+def _check_names(source: str, chosen: Sequence[str], names: Sequence[str]) -> None:
+    """Raise an error if a chosen name is unknown or given twice."""
     for name in chosen:
         if name not in names:
-            raise unknown_name("characteristics", f"there is no characteristic {name!r}", name, names)
+            raise unknown_name(source, f"there is no characteristic {name!r}", name, names)
     if len(set(chosen)) < len(chosen):
-        raise InputError(
-            "characteristics", f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once"
-        )
-    return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
+        raise InputError(source, f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once")
 
 
 def _limits_of(study: Study, options: ToleranceOptions, columns: Sequence[int]) -> dict[str, Limit]:

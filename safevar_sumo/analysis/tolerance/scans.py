@@ -117,17 +117,23 @@ class OneAtATimeScan:
         }
 
 
-def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, one at a time."""
+def scan(
+    evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, others: FloatArray | None = None
+) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, one at a time; each with the other values of its row of `others`, shape
+    (K, n), by default as in the original.
+    """
+    if others is None:
+        others = np.tile(evaluator.characteristics.original, (len(columns), 1))
     scanned, rated = [evaluator.characteristics.members[column] for column in columns], is_rated(evaluator.study)
     number = RATED_SCAN_VALUES if rated else SCAN_VALUES
     values = [np.union1d(np.linspace(one.lower, one.upper, number), one.original) for one in scanned]
-    profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
+    profiles = _evaluate_profiles(evaluator, columns, others, values, unsafe)
     for _ in range(RATED_ROUNDS if rated else ROUNDS):
         values = [_values_between_states(profile) for profile in profiles]
         if not any(map(len, values)):
             break
-        finer_profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
+        finer_profiles = _evaluate_profiles(evaluator, columns, others, values, unsafe)
         profiles = [
             pd.concat(both, ignore_index=True).sort_values("value", ignore_index=True)
             for both in zip(profiles, finer_profiles, strict=True)
@@ -144,14 +150,14 @@ def _values_between_states(profile: pd.DataFrame) -> FloatArray:
 
 
 def _evaluate_profiles(
-    evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe
+    evaluator: Evaluator, columns: Sequence[int], others: FloatArray, values: Sequence[FloatArray], unsafe: Unsafe
 ) -> list[pd.DataFrame]:
     """The profile of each characteristic at its `values`."""
-    original, ends = evaluator.characteristics.original, np.cumsum([len(its_values) for its_values in values])[:-1]
+    ends = np.cumsum([len(its_values) for its_values in values])[:-1]
     settings = np.concatenate(
         [
-            _settings_with(original, [column], its_values[:, np.newaxis])
-            for column, its_values in zip(columns, values, strict=True)
+            _settings_with(row, [column], its_values[:, np.newaxis])
+            for row, column, its_values in zip(others, columns, values, strict=True)
         ]
     )
     evaluations = evaluator.evaluate(settings, "one characteristic at a time")
@@ -165,9 +171,9 @@ def _evaluate_profiles(
     return [frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)]
 
 
-def _settings_with(original: FloatArray, columns: Sequence[int], values: FloatArray) -> FloatArray:
-    """The original with K rows of values in some columns, shape (K, n)."""
-    settings = np.tile(original, (len(values), 1))
+def _settings_with(setting: FloatArray, columns: Sequence[int], values: FloatArray) -> FloatArray:
+    """A setting with K rows of values in some columns, shape (K, n)."""
+    settings = np.tile(setting, (len(values), 1))
     settings[:, list(columns)] = values
     return settings
 
