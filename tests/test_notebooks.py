@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import io
 import tempfile
@@ -27,6 +28,22 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_there_are_no_others() -> None:
     assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, "answers", "rating"}
+
+
+@pytest.mark.parametrize("name", [*SHOWN, "answers", "rating"])
+def test_a_notebook_needs_only_the_public_names(name: str) -> None:
+    cells = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4).cells
+    code = "\n".join(cell.source for cell in cells if cell.cell_type == "code").replace("%matplotlib inline", "")
+    nodes = list(ast.walk(ast.parse(code)))
+    assert not [node for node in nodes if isinstance(node, ast.ImportFrom) and "safevar_sumo" in (node.module or "")]
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    assert [module for module in names if "safevar_sumo" in module] == ["safevar_sumo"]
+    used = {
+        node.attr
+        for node in nodes
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sv"
+    }
+    assert used <= set(sv.__all__)
 
 
 @pytest.mark.parametrize("name", SHOWN)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 DPI = 200
 PICTURE_METADATA: Mapping[str, JsonObject] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 """Metadata by file ending; they keep the date out of the file, so that equal figures have equal bytes."""
-FONT = 8
+FONT_SIZE = 8
 DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
 """Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without
@@ -42,17 +42,17 @@ def new_figure(
         [
             "seaborn-v0_8-whitegrid",
             {
-                "font.size": FONT,
-                "axes.labelsize": FONT,
-                "axes.titlesize": FONT,
-                "xtick.labelsize": FONT,
-                "ytick.labelsize": FONT,
+                "font.size": FONT_SIZE,
+                "axes.labelsize": FONT_SIZE,
+                "axes.titlesize": FONT_SIZE,
+                "xtick.labelsize": FONT_SIZE,
+                "ytick.labelsize": FONT_SIZE,
             },
         ]
     ):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
-    figure.suptitle(escape_dollars(title), fontsize=FONT + 2)
+    figure.suptitle(escape_dollars(title), fontsize=FONT_SIZE + 2)
     return figure, axes
 
 

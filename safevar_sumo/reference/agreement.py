@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, new_panels, save
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels, save
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
@@ -211,7 +211,7 @@ def plot_agreement(
             characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")),
             "error of SD",
         )
-    figure.supxlabel("orange: collides in the reference or here", fontsize=FONT)
+    figure.supxlabel("orange: collides in the reference or here", fontsize=FONT_SIZE)
     save(figure, path, "plot")
 
 
@@ -221,7 +221,7 @@ def _draw_scatter(axis: Axes, reference: FloatArray, here: FloatArray, is_collis
     x, y = _defined_pairs(reference, here)
     axis.axline((float(x[0]), float(x[0])) if x.size else (0, 0), slope=1, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
-    axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT)
+    axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT_SIZE)
     axis.set(xlabel=f"reference: {label}", ylabel=f"here: {label}")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
-from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, VERMILION, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, VERMILION, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.answer import WEATHER, Answer
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
 from safevar_sumo.analysis.research_questions.tables import as_json
@@ -251,7 +251,7 @@ class SystemComparison:
             points.scatter(x, y, s=4, color=colour, label=label, linewidths=0, rasterized=True)
         points.axline((0, 0), slope=1, color="black", linewidth=0.6)
         points.set(xlabel="safety degree in A [m, below 0: -m/s]", ylabel="safety degree in B [m, below 0: -m/s]")
-        points.legend(fontsize=FONT - 1, markerscale=2)
+        points.legend(fontsize=FONT_SIZE - 1, markerscale=2)
         limits = self._limits[::-1]
         for row, both in enumerate(limits):
             lower, width = both[0].characteristic.lower, both[0].characteristic.upper - both[0].characteristic.lower
@@ -264,7 +264,7 @@ class SystemComparison:
         bars.set(xlabel="share of A's domain [-]")
         bars.grid(visible=False, axis="y")
         figure.legend(
-            *bars.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT
+            *bars.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT_SIZE
         )
         return figure
 

@@ -102,6 +102,9 @@ class BrakingComparison(NamedTuple):
     parts: dict[str, float]
     point: str = ""
 
+    def __str__(self) -> str:
+        return sentence(self)
+
 
 def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is nearest; None if it

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, 
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.explain.sentences import DISTINCT_CAUSE, LABELS, answer_in_words
-from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import Unsafe
@@ -244,6 +244,6 @@ class Explained:
         axis.set_xlabel(f"share of {self.analysed} failures [%]")
         axis.grid(visible=False, axis="y")
         figure.legend(
-            *axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT
+            *axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT_SIZE
         )
         return figure

@@ -11,7 +11,7 @@ import pandas as pd
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.figures import FONT, escape_dollars, new_panels
+from safevar_sumo.analysis.figures import FONT_SIZE, escape_dollars, new_panels
 from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, max_points
 from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
@@ -252,9 +252,9 @@ def matrices_figure(rating: Rating) -> Figure:
     figure.supxlabel(
         f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; "
         "asterisk: colour differs from the original's",
-        fontsize=FONT,
+        fontsize=FONT_SIZE,
     )
-    figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
+    figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT_SIZE)
     return figure
 
 
@@ -281,11 +281,11 @@ def _draw_matrix(axis: Axes, rating: Rating, matrix: CellMatrix) -> None:
         frame, annot=letters, fmt="", cmap=palette, vmin=-1, vmax=len(COLOURS) - 1, cbar=False, linewidths=0.6, ax=axis
     )
     axis.grid(False)
-    axis.tick_params(labelsize=FONT - 2, length=0, rotation=0)
+    axis.tick_params(labelsize=FONT_SIZE - 2, length=0, rotation=0)
     totals = " / ".join(
         f"{test.total:.2f}" for vehicle in rating.vehicles for test in vehicle.tests if test.matrix is matrix
     )
-    axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT)
+    axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT_SIZE)
 
 
 def summarise_rated_solutions(

@@ -13,7 +13,7 @@ import pandas as pd
 import tomli_w
 from rich.table import Table
 
-from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, new_panels
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
 from safevar_sumo.analysis.repair.attack import Proof
 from safevar_sumo.analysis.repair.price import Price
 from safevar_sumo.analysis.repair.problem import Parameter, Promise
@@ -181,8 +181,8 @@ class Repairs:
         lost = [part.promise for part in self.curve if not part.repairable]
         if lost:
             axis.axvspan(min(lost), max(lost), facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white")
-        axis.set_xlabel(f"promised {one.name} [{as_formula(one.unit)}]", fontsize=FONT)
-        axis.set_ylabel("brakes earlier [m]", fontsize=FONT)
+        axis.set_xlabel(f"promised {one.name} [{as_formula(one.unit)}]", fontsize=FONT_SIZE)
+        axis.set_ylabel("brakes earlier [m]", fontsize=FONT_SIZE)
         return figure
 
     def repaired_study(self) -> Study:

@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.analysis.figures import (
     BLUE,
-    FONT,
+    FONT_SIZE,
     SKY_BLUE,
     VERMILION,
     as_formula,
@@ -155,7 +155,7 @@ def draw_critical_differences(case: Case) -> Figure:
     figure.supxlabel(
         "bars of one critical difference: ranks whose bars overlap are not distinguished "
         f"(Nemenyi's test at {ALPHA:g})",
-        fontsize=FONT,
+        fontsize=FONT_SIZE,
     )
     return figure
 
@@ -182,7 +182,7 @@ def draw_attainment_surfaces(case: Case) -> Figure:
             border = np.vstack([[minimised[0, 0], worst[1]], minimised, [worst[0], minimised[-1, 1]]]) * signs
             label = labels.get(percentage, "at least one run")
             axis.step(*border.T, where="post", color=colour, linestyle=dashes, label=label)
-        axis.set_title(_title(algorithm), fontsize=FONT)
+        axis.set_title(_title(algorithm), fontsize=FONT_SIZE)
         _label_axes(axis, objectives)
     _add_legend_below(figure, axes[0])
     return figure
@@ -198,7 +198,9 @@ def _label_axes(axis: Axes, objectives: Sequence[Objective]) -> None:
 
 def _add_legend_below(figure: Figure, axis: Axes) -> None:
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT_SIZE
+    )
 
 
 def _title(algorithm: str) -> str:
@@ -222,7 +224,7 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
         axis.boxplot(samples, tick_labels=numbers, widths=0.8, patch_artist=True, boxprops={"facecolor": SKY_BLUE})
         runs = counts["run"].nunique()
         axis.set(xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)")
-        axis.set_title(escape_dollars(case.name), fontsize=FONT)
+        axis.set_title(escape_dollars(case.name), fontsize=FONT_SIZE)
         axis.locator_params(axis="y", integer=True, min_n_ticks=1)
     return figure
 
@@ -272,16 +274,16 @@ def draw_change_sizes(case: Case) -> Figure:
         axis.set_xlim(low, high)
         axis.set_title(
             f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
-            fontsize=min(FONT, FONT * LONGEST_NAME / len(characteristic.name)),
+            fontsize=min(FONT_SIZE, FONT_SIZE * LONGEST_NAME / len(characteristic.name)),
         )
-        axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT)
+        axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT_SIZE)
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         axis.locator_params(axis="y", nbins=4, integer=True, min_n_ticks=1)
     figure.supylabel(f"number of critical solutions (of {len(changes_of_solutions)})", fontsize=9)
     figure.supxlabel(
         "orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
         "each axis spans the characteristic's domain",
-        fontsize=FONT,
+        fontsize=FONT_SIZE,
     )
     return figure
 

@@ -12,7 +12,7 @@ import pandas as pd
 from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import Interval
-from safevar_sumo.analysis.figures import BLUE, FONT, GREY, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, escape_dollars, new_figure
 from safevar_sumo.analysis.risk import RARE_BELOW
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -258,11 +258,11 @@ class Risk(Estimate):
                 places = np.arange(len(names)) + shift
                 axis.barh(places, rows[index], height=0.36, color=colour, label=label, xerr=error, error_kw=ERROR_STYLE)
             axis.set_yticks(np.arange(len(names)), names)
-            axis.set_title(escape_dollars(output), fontsize=FONT)
+            axis.set_title(escape_dollars(output), fontsize=FONT_SIZE)
             axis.set(xlabel="share of the variance [-]", xlim=(0, 1))
             axis.grid(visible=False, axis="y")
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=FONT_SIZE)
         return figure
 
 

@@ -11,7 +11,15 @@ from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.sentences import situation_in_words
-from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
+from safevar_sumo.analysis.figures import (
+    BLUE,
+    DEGREE_LABEL,
+    FONT_SIZE,
+    VERMILION,
+    as_formula,
+    escape_dollars,
+    new_panels,
+)
 from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
 from safevar_sumo.analysis.tolerance.sheet import Ends, Failure, LimitRow, LimitsSheet
 from safevar_sumo.analysis.tolerance.trade import Trade
@@ -250,9 +258,9 @@ class Tolerance:
             if axis is not axes[0]:
                 axis.sharey(axes[0])  # so that steep profiles stand out
             _draw_profile(axis, scan, column)
-        figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
+        figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT_SIZE)
         dashed = ";\nbelow a dashed line: collisions" if column == SAFETY_DEGREE else ""
-        figure.supxlabel(f"dot: the original vehicle; hatched: unsafe{dashed}", fontsize=FONT)
+        figure.supxlabel(f"dot: the original vehicle; hatched: unsafe{dashed}", fontsize=FONT_SIZE)
         return figure
 
 
@@ -311,6 +319,6 @@ def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
     if column == SAFETY_DEGREE and profile.min() <= 0:
         axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
     axis.set_xlim(characteristic.lower, characteristic.upper)
-    axis.set_title(escape_dollars(characteristic.name), fontsize=FONT)
+    axis.set_title(escape_dollars(characteristic.name), fontsize=FONT_SIZE)
     axis.set_xlabel(f"[{as_formula(characteristic.unit)}]")
     axis.locator_params(axis="x", nbins=4)

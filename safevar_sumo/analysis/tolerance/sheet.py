@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.tables import LATEX_NEEDS, Table, markdown_table, render_latex
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, JsonObject
@@ -212,7 +212,9 @@ class LimitsSheet:
         """The sheet as a table for the terminal; columns without any entry are left out."""
         frame = self.to_frame().drop(columns=["part", "fails first"])
         frame = frame[[name for name in frame if (frame[name] != NONE).any()]]
-        table = WholeTable(*frame.columns, title="Limits, rounded to the safe side")
+        heads = {"limit alone": "alone", "limit with all others at theirs": "all at limits"}
+        title = "Limits of each alone, and of all at their limits, rounded to the safe side"
+        table = WholeTable(*frame.rename(columns=heads).columns, title=title)
         for cells in frame.itertuples(index=False):
             table.add_row(*cells)
         return table
@@ -229,14 +231,14 @@ class LimitsSheet:
         for position, row in enumerate(self.rows):
             _draw_row(axis, -position, row)
         axis.set_yticks([-i for i in range(len(self.rows))])
-        axis.set_yticklabels([escape_dollars(row.characteristic.short_name) for row in self.rows], fontsize=FONT)
+        axis.set_yticklabels([escape_dollars(row.characteristic.short_name) for row in self.rows], fontsize=FONT_SIZE)
         axis.set_xlim(-0.02, 1.02)
         axis.set_ylim(0.5 - len(self.rows), 0.5)
         axis.set_xticks([])
         axis.set_xlabel(
             "domain from its lower to its upper end; dot: new; line: specified;\n"
             "light: safe alone; dark: safe with all others at theirs",
-            fontsize=FONT - 1,
+            fontsize=FONT_SIZE - 1,
         )
         return figure
 
@@ -258,7 +260,7 @@ def _draw_row(axis: Axes, height: float, row: LimitRow) -> None:
         for text, value, side in zip(row.texts(ends), ends, ("left", "right"), strict=True):
             if text and value is not None:
                 axis.text(
-                    place(value), height + offset, f"{text}{as_formula(one.suffix)}", ha=side, fontsize=FONT - 1.5
+                    place(value), height + offset, f"{text}{as_formula(one.suffix)}", ha=side, fontsize=FONT_SIZE - 1.5
                 )
     for limit in () if row.specified is None else (row.specified.at_least, row.specified.at_most):
         if limit is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator, Interval
-from safevar_sumo.analysis.figures import BLUE, FONT, as_formula, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, as_formula, escape_dollars, new_figure
 from safevar_sumo.analysis.tolerance.scans import scan
 from safevar_sumo.analysis.tolerance.sheet import safe_text
 from safevar_sumo.metrics import Unsafe
@@ -91,7 +91,7 @@ class Trade:
         ):
             limit(one.lower, one.upper)
             label(f"{escape_dollars(one.name)} [{as_formula(one.unit)}]")
-        figure.supxlabel("dot: the original vehicle; bars: safe", fontsize=FONT)
+        figure.supxlabel("dot: the original vehicle; bars: safe", fontsize=FONT_SIZE)
         return figure
 
 
