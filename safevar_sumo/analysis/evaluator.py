@@ -10,6 +10,7 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
+from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.campaign.batches import VERIFIED_SETTINGS, ask_why_no_verdict, evaluate_all, inputs_of
 from safevar_sumo.campaign.evaluation import EVERYTHING, Inputs, Selection, pack_study
@@ -233,6 +234,14 @@ class Evaluator:
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
         return Evaluator(study, self._pool, self.progress, self._verified if verified is None else verified)
+
+    def for_sets(self, fits: int) -> list[Evaluator]:
+        """An evaluator for each of the first `fits` parameter sets, the study's own first; none without [spread].
+
+        Scene and equations are the study's, so that nothing is simulated in SUMO once more.
+        """
+        studies = studies_of_sets(self.study)[:fits] if fits and self.study.spread else []
+        return [self.for_study(study, verified=0) for study in studies]
 
 
 @contextmanager

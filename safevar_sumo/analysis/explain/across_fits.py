@@ -9,7 +9,6 @@ import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator, Interval
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes, necessity_frame
-from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.preventability import Preventability, assess_preventability
 from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.metrics import Unsafe
@@ -73,15 +72,6 @@ class AcrossFits(NamedTuple):
 def _in_words(ends: Interval) -> str:
     low, high = map(share_in_words, ends)
     return low if low == high else f"{low} to {high}"
-
-
-def evaluators_of_sets(evaluator: Evaluator, fits: int) -> list[Evaluator]:
-    """An evaluator for each of the first `fits` parameter sets, the study's own first; none without a table [spread].
-
-    Scene and equations are the study's, so that nothing is simulated in SUMO once more.
-    """
-    studies = studies_of_sets(evaluator.study)[:fits] if fits and evaluator.study.spread else []
-    return [evaluator.for_study(study, verified=0) for study in studies]
 
 
 def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[MinimalCause], unsafe: Unsafe) -> list[int]:

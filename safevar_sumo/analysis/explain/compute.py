@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.across_fits import count_holding, evaluators_of_sets, measure_across_fits
+from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
 from safevar_sumo.analysis.explain.causes import (
     MinimalCause,
@@ -87,7 +87,7 @@ def explain_failures(
     if not options.solutions:
         reasons = _add_distinct_causes(found, evaluator, sample, reasons, causes, options.top)
     sample_causes = [causes[row] for row in sample]
-    models = evaluators_of_sets(evaluator, options.fits if statistics else 0)
+    models = evaluator.for_sets(options.fits if statistics else 0)
     preventability = assess_preventability(evaluator, _collisions(study, found.evaluations))
     changed = characteristics.changed(settings[sample])
     necessity = necessity_frame(characteristics, changed, sample_causes, len(found.rows))

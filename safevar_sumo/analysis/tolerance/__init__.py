@@ -38,6 +38,15 @@ class ToleranceOptions(Options):
         ),
     )
     pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
+    fits: int = option(
+        8,
+        "Number of vehicle models that fit the published data about as well (sets of [spread]) with which each "
+        "characteristic is scanned again; 0 leaves this out.",
+        kind=int,
+        low=0,
+        high=1000,
+        metavar="N",
+    )
     limits: tuple[str, ...] = option(
         (),
         "A limit in the characteristic's unit, beside those of [limits] in STUDY: find how far all others may go then, "
@@ -69,6 +78,7 @@ def tolerance(
     unsafe: Criterion | None = None,
     characteristics: Sequence[str] | None = None,
     pairs: bool = ToleranceOptions.pairs,
+    fits: int = ToleranceOptions.fits,
     limits: Sequence[str] = ToleranceOptions.limits,
     trade: Sequence[str] | None = None,
     pool: Pool | None = None,

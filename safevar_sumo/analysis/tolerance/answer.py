@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -189,6 +189,7 @@ class Tolerance:
         yield _scan_table(self.alone)
         yield "* the end of the domain: values beyond it were not simulated."
         yield meanings(scan.characteristic for scan in self.alone)
+        yield from _across_fits_in_words(self.alone)
         worst = sorted(self.unsafe_pairs, key=lambda pair: -pair.unsafe_share)
         table = WholeTable(
             "pair",
@@ -291,6 +292,20 @@ def _limit_in_words(characteristic: Characteristic, value: float) -> str:
     """A value with its change from the original, and a star if it is an end of the domain."""
     at_end = "*" if value in (characteristic.lower, characteristic.upper) else ""
     return f"{value:.5g} ({(value - characteristic.original) / abs(characteristic.original):+.1%}){at_end}"
+
+
+def _across_fits_in_words(scans: Sequence[OneAtATimeScan]) -> Iterator[str]:
+    """How far the ends of the safe intervals depend on the fit; nothing without fits."""
+    moving, sets = [], max((scan.across_fits.sets for scan in scans if scan.across_fits), default=0)
+    for one, across in ((scan.characteristic, scan.across_fits) for scan in scans):
+        moving += [
+            f"the safe interval of {one.name} {word} {one.text(low)} to {one.text(high)}{one.suffix}"
+            for word, (low, high) in zip(("begins at", "ends at"), across.range if across else (), strict=False)
+            if one.text(low) != one.text(high)
+        ]
+    if sets:
+        fits = f"With {sets} vehicle models that fit the published data about as well,"
+        yield f"{fits} {'; '.join(moving) if moving else 'all safe intervals are the same'}."
 
 
 def _losses_in_words(scan: OneAtATimeScan) -> str:

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
 from safevar_sumo.analysis.tolerance.boxes import find_safe_box, random_settings
 from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
-from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan, scan_pairs
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan_pairs, scan_with_sets
 from safevar_sumo.analysis.tolerance.trade import find_trade
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Unsafe
@@ -50,7 +50,7 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
     if needs_box:
         bounds = evaluator.characteristics.lower, evaluator.characteristics.upper
         random_settings(evaluator, columns, *bounds, 1, np.random.default_rng(study.search.seed))
-    scans = scan(evaluator, columns, unsafe)
+    scans = scan_with_sets(evaluator, columns, unsafe, 0 if is_rated(study) else options.fits)
     pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
     box, together = SafeBox(), None
     if needs_box:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -35,6 +35,13 @@ PARTS_PER_SIDE, PLANE_ROUNDS, MAX_SQUARES = 4, 4, 12
 5120th of the domain), and maximum number of squares divided in each round."""
 
 
+class EndsAcrossFits(NamedTuple):
+    """Ranges of the two ends of a safe interval over `sets` parameter sets of [spread], the study's own among them."""
+
+    sets: int
+    range: tuple[Interval, Interval]
+
+
 @dataclass(frozen=True, kw_only=True)
 class OneAtATimeScan:
     """The scan of one characteristic.
@@ -45,10 +52,13 @@ class OneAtATimeScan:
         Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe", "not_simulated" or
         "infeasible"), and in a rated study `rating_points`, in the order of the values, which are closer together where
         the state changes.
+    across_fits
+        How the ends of the safe interval move over the study's parameter sets; None without any.
     """
 
     characteristic: Characteristic
     profile: pd.DataFrame
+    across_fits: EndsAcrossFits | None = None
 
     def intervals(self, state: str) -> list[Interval]:
         """All intervals of a state, each from its first to its last value."""
@@ -114,6 +124,7 @@ class OneAtATimeScan:
             "unsafe": self.unsafe,
             "not_simulated": self.not_simulated,
             **({"infeasible": infeasible} if infeasible else {}),
+            **({} if self.across_fits is None else {"across_fits": self.across_fits._asdict()}),
         }
 
 
@@ -139,6 +150,23 @@ def scan(
             for both in zip(profiles, finer_profiles, strict=True)
         ]
     return [OneAtATimeScan(characteristic=one, profile=profile) for one, profile in zip(scanned, profiles, strict=True)]
+
+
+def scan_with_sets(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, fits: int) -> list[OneAtATimeScan]:
+    """Scan with the study's own parameters, and with its other sets, whose safe intervals give ranges of the ends."""
+    own, *others = [scan(one, columns, unsafe) for one in evaluator.for_sets(fits) or [evaluator]]
+    return [
+        replace(one, across_fits=_ends_across_fits([one, *same])) if others else one
+        for one, *same in zip(own, *others, strict=True)
+    ]
+
+
+def _ends_across_fits(scans: Sequence[OneAtATimeScan]) -> EndsAcrossFits | None:
+    intervals = [one.safe for one in scans if one.safe is not None]
+    if not intervals:
+        return None
+    low, high = zip(*intervals, strict=True)
+    return EndsAcrossFits(len(intervals), ((min(low), max(low)), (min(high), max(high))))
 
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:
