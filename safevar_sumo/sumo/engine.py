@@ -58,7 +58,8 @@ def open_world(
 
 def engine_api(engine: Engine) -> Api:
     if engine is Engine.LIBSUMO:
-        import libsumo
+        with redirect_stdout(sys.stderr):  # it warns of a pyarrow of another version
+            import libsumo
 
         return libsumo
     import traci

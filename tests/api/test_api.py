@@ -134,6 +134,23 @@ def test_unusable_settings_are_reported_before_any_simulation(settings: object, 
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
 
 
+def test_results_are_written_as_parquet_if_an_engine_is_there(
+    results: sv.Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "solutions.parquet"
+    with monkeypatch.context() as patched:
+        patched.setitem(sys.modules, "pyarrow", None)
+        patched.setitem(sys.modules, "fastparquet", None)
+        with pytest.raises(sv.InputError, match="pyarrow is not installed"):
+            results.to_parquet(file)
+    assert not list(tmp_path.iterdir())
+    assert f"<p>&lt;Results of {results.study.name}" in results._repr_html_()
+    pytest.importorskip("pyarrow")
+    for evaluations, frame in ((False, results.solutions), (True, results.evaluations)):
+        results.to_parquet(file, evaluations=evaluations)
+        pd.testing.assert_frame_equal(pd.read_parquet(file), frame.reset_index(drop=True), check_dtype=False)
+
+
 def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     again = sv.load(results.directory)
     pd.testing.assert_frame_equal(again.solutions, results.solutions)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -18,6 +18,7 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.robustness import draw_neighbours, is_borderline, robustness_in_words
+from safevar_sumo.analysis.figures import FONT_SIZE, new_figure
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehicle
@@ -32,6 +33,9 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, answer_as_html, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MODEL_IN_WORDS = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
 
@@ -148,6 +152,22 @@ class Opinions:
                 f"  with our model {one.here}; {one.because}",
             ]
         return lines
+
+    def figure(self) -> Figure:
+        """The safety degree of each cause with both models; on the line they agree."""
+        figure, axes = new_figure(f"{self.study.name}: causes with two vehicle models", 1, 1, (4.6, 4.0))
+        axis = axes[0, 0]
+        for verdict, marker in zip(get_args(Verdict), "xos^", strict=True):
+            causes = [one for one in self.opinions if one.opinion == verdict and one.there.safety_degree is not None]
+            ends = [[end.safety_degree for end in (one.here, one.there)] for one in causes]
+            if ends:
+                axis.plot(*zip(*ends, strict=True), marker, label=verdict)
+        axis.axline((0, 0), slope=1, color="black", linewidth=0.8, linestyle="--")
+        axis.set_xlabel("safety degree with our model [m, or -m/s]")
+        axis.set_ylabel("with the second model [m, or -m/s]")
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(fontsize=FONT_SIZE)
+        return figure
 
     _repr_html_ = answer_as_html
 

@@ -25,7 +25,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.schema import NAME_PATTERN
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.terminal import WholeTable
+from safevar_sumo.terminal import WholeTable, answer_as_html
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -188,6 +188,8 @@ class Repairs:
     def repaired_study(self) -> Study:
         """The study with the first repair."""
         return with_parameters(self.study, self.repairs[0].values)
+
+    _repr_html_ = answer_as_html
 
     def __repr__(self) -> str:
         return f"<Repairs of {self.study.name}: {self.verdict}>"

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Interval, clopper_pearson
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import join_phrases, number_of
@@ -26,6 +27,9 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.terminal import answer_as_html, constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_SETTINGS = 10
 """Minimum number of unsafe settings, and of safe settings, that rules need."""
@@ -130,6 +134,33 @@ class Rules:
             ],
             columns=["rule", "characteristic", "at_least", "at_most", "density", "coverage"],
         )
+
+    def figure(self) -> Figure:
+        """The density and coverage of each rule, with their 95 % intervals."""
+        members = CharacteristicSet.of(self.study).members
+        figure, axes = new_figure(
+            f"{self.study.name}: rules (unsafe: {self.unsafe})", 1, 1, (7.2, 1.1 + 0.5 * len(self.rules))
+        )
+        axis, places = axes[0, 0], [-number for number in range(len(self.rules))]
+        for kind, colour in (("density", VERMILION), ("coverage", BLUE)):
+            for place, rule in zip(places, self.rules, strict=True):
+                axis.plot(
+                    getattr(rule, f"{kind}_interval") or (math.nan, math.nan), [place] * 2, color=colour, linewidth=1.5
+                )
+            axis.plot(
+                self.to_frame().drop_duplicates("rule")[kind].astype(float), places, "o", color=colour, label=kind
+            )
+        conditions = [
+            [_condition_in_words(one, *rule.limits[one.name]) for one in members if one.name in rule.limits]
+            for rule in self.rules
+        ]
+        texts = ["\n".join(phrases) or "everywhere" for phrases in conditions]
+        axis.set_yticks(places, list(map(escape_dollars, texts)), fontsize=FONT_SIZE - 1)
+        axis.set_xlim(-0.02, 1.02)
+        axis.set_ylim(0.5 - max(len(places), 1), 0.5)
+        axis.set_xlabel("unsafe share within a rule (density), share of all unsafe within it (coverage)")
+        axis.legend(fontsize=FONT_SIZE)
+        return figure
 
     _repr_html_ = answer_as_html
 
