@@ -142,6 +142,10 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 CommandFunction = Callable[..., Any]
+OptionValue = Any
+"""The value of an option, as click converts it."""
+JsonAnswer = JsonObject | list[JsonObject]
+"""What a command prints with --json."""
 Decorator = Callable[[CommandFunction], CommandFunction]
 
 

@@ -24,6 +24,8 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
     CommandFunction,
     Decorator,
+    JsonAnswer,
+    OptionValue,
     add_flags,
     as_it_is_now_option,
     check_output,
@@ -69,11 +71,11 @@ def add_question(
     return add
 
 
-def _show(result: Any, as_json: bool | None, plot: Path | None = None) -> Any:
+def _show(result: Any, as_json: bool | None, plot: Path | None = None) -> JsonAnswer:
     """Print an answer, unless `as_json` is None, and draw its figure to a file, if one is named; returns the answer's
     JSON.
     """
-    answer = result.to_dict()
+    answer: JsonAnswer = result.to_dict()
     if as_json:
         print_json(answer)
     elif as_json is not None:
@@ -92,8 +94,8 @@ def _show(result: Any, as_json: bool | None, plot: Path | None = None) -> Any:
     file_option("--out", "Write causes.json, causes.csv and a figure there.", metavar="DIR"),
 )
 def explain(
-    source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any
-) -> Any:
+    source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: OptionValue
+) -> JsonAnswer:
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change
     is enough, why.
     """
@@ -136,7 +138,7 @@ def opinion(
     jobs: int | None,
     as_json: bool,
     unsafe: str | None,
-) -> Any:
+) -> JsonAnswer:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
@@ -164,8 +166,14 @@ def opinion(
     ),
 )
 def tolerance(
-    source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, format_name: str, **values: Any
-) -> Any:
+    source: str,
+    point: str | None,
+    jobs: int | None,
+    as_json: bool,
+    plot: Path | None,
+    format_name: str,
+    **values: OptionValue,
+) -> JsonAnswer:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
@@ -185,7 +193,9 @@ def tolerance(
 @add_question(
     RiskOptions, "STUDY|DIR", file_option("--plot", "Draw the sensitivity indices to this file: png, pdf or svg.")
 )
-def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> Any:
+def risk(
+    source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: OptionValue
+) -> JsonAnswer:
     """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which
     characteristics decide it.
     """
@@ -206,8 +216,14 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     file_option("--plot", "Draw the curve to this file: png, pdf or svg."),
 )
 def repair(
-    source: str, point: str | None, jobs: int | None, as_json: bool, out: Path | None, plot: Path | None, **values: Any
-) -> Any:
+    source: str,
+    point: str | None,
+    jobs: int | None,
+    as_json: bool,
+    out: Path | None,
+    plot: Path | None,
+    **values: OptionValue,
+) -> JsonAnswer:
     """Find the smallest change of the driving system of STUDY that survives the promised wear, and what it costs."""
     from safevar_sumo.analysis.repair.answer import write_repair
     from safevar_sumo.analysis.repair.compute import find_repairs
@@ -226,7 +242,7 @@ def repair(
 
 
 @add_question(RulesOptions, "STUDY|DIR")
-def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> Any:
+def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: OptionValue) -> JsonAnswer:
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of
     a search.
     """
@@ -245,8 +261,14 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
     file_option("--plot", "Draw safety degrees and limits of both to this file: png, pdf or svg."),
 )
 def compare(
-    source: str, other: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
-) -> Any:
+    source: str,
+    other: str,
+    point: str | None,
+    jobs: int | None,
+    as_json: bool,
+    plot: Path | None,
+    **values: OptionValue,
+) -> JsonAnswer:
     """Compare two systems, A and B, studies or results directories: simulate the same settings in both, and say which
     are unsafe in one of them only.
     """
@@ -293,7 +315,7 @@ def rating(
     force: bool,
     jobs: int | None,
     as_json: bool,
-) -> Any:
+) -> JsonAnswer:
     """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.rating.compute import rate_variant, remarks

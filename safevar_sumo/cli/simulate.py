@@ -17,6 +17,7 @@ from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
     CommandTarget,
+    JsonAnswer,
     as_it_is_now_option,
     check_output,
     combine_values,
@@ -100,7 +101,7 @@ def simulate_command(
     point: str | None,
     spread: bool,
     as_json: bool,
-) -> Any:
+) -> JsonAnswer:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
     target = load_target(study, solution, choice)
     system = assemble(target.study, target.source)

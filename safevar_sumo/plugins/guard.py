@@ -21,6 +21,8 @@ from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+UserValue = Any
+"""What user code returns, before it is checked."""
 INFINITY = float("inf")
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
@@ -91,7 +93,7 @@ def accepts(function: Any, count: int) -> bool:
     return True
 
 
-def read_only_copy(value: Any) -> Any:
+def read_only_copy(value: UserValue) -> Any:
     """A deep copy of a record in which every array is read-only."""
     if isinstance(value, np.ndarray):
         copy = value.copy()
@@ -202,13 +204,13 @@ class Guard(NamedTuple):
         except (OSError, TypeError):
             return ""
 
-    def elements(self, method: str, value: Any, expected: str, count: int = 2) -> tuple[Any, ...]:
+    def elements(self, method: str, value: UserValue, expected: str, count: int = 2) -> tuple[Any, ...]:
         """The elements of a result that must be a tuple or list of `count` elements."""
         if not isinstance(value, tuple | list) or len(value) != count:
             raise self._wrong_result(_short_text(value), method, expected)
         return tuple(value)
 
-    def field(self, method: str, value: Any, name: str) -> Any:
+    def field(self, method: str, value: UserValue, name: str) -> Any:
         """An attribute that a result must have."""
         try:
             return getattr(value, name)
@@ -219,7 +221,7 @@ class Guard(NamedTuple):
         self,
         method: str,
         quantity: str,
-        value: Any,
+        value: UserValue,
         shape: tuple[int, ...],
         lowest: float = -INFINITY,
         highest: float = INFINITY,
@@ -254,12 +256,12 @@ class Guard(NamedTuple):
             numbers[~is_valid] = 0.0
         return numbers
 
-    def booleans(self, method: str, quantity: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
+    def booleans(self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...]) -> BoolArray:
         """A result as a new array of bool."""
         return self._array(method, quantity, value, shape, "b", f"truth values, shape {shape}").astype(bool)
 
     def _array(
-        self, method: str, quantity: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str
+        self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...], kinds: str, expected: str
     ) -> np.ndarray:
         try:
             array = np.asarray(value)

@@ -1,7 +1,7 @@
 """Scenarios by name; and the weathers that a study can name: weather.toml beside this module, and their words."""
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,6 @@ from safevar_sumo.scenarios.base import (
     Scenario,
     Scene,
     World,
-    distance_in_words,
-    pre_crash_sentence,
 )
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
@@ -93,3 +91,16 @@ def weather_in_words(weather: Weather) -> str:
     named.
     """
     return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"
+
+
+def distance_in_words(scenario: Scenario, safety_degree: float) -> str:
+    """A safety degree above 0 as text; adds `from centre to centre` where the scenario measures so."""
+    return f"{safety_degree:.2f} m{' from centre to centre' if scenario.centre_to_centre else ''}"
+
+
+def pre_crash_sentence(points: Iterable[Point]) -> str:
+    """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has a type."""
+    points = tuple(points)
+    types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
+    light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
+    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else ""

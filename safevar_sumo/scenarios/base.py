@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
 
@@ -288,19 +288,6 @@ OBSTACLES: Mapping[str, str] = {
     PreCrash.LEAD_DECELERATING: "a braking vehicle ahead",
 }
 """What is in the way, by the pre-crash type."""
-
-
-def distance_in_words(scenario: Scenario, safety_degree: float) -> str:
-    """A safety degree above 0 as text; adds `from centre to centre` where the scenario measures so."""
-    return f"{safety_degree:.2f} m{' from centre to centre' if scenario.centre_to_centre else ''}"
-
-
-def pre_crash_sentence(points: Iterable[Point]) -> str:
-    """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has a type."""
-    points = tuple(points)
-    types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
-    light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
-    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else ""
 
 
 MAX_DURATION = 3600.0

@@ -24,11 +24,13 @@ from safevar_sumo.study.schema import (
     StudyLike as StudyLike,
     VehicleTable as VehicleTable,
     Weather as Weather,
-    fmus_of as fmus_of,
     label_of as label_of,
     study_names as study_names,
     study_path as study_path,
     tables_of as tables_of,
+)
+from safevar_sumo.study.user_code import (
+    fmus_of as fmus_of,
     user_code_names as user_code_names,
     user_code_packages as user_code_packages,
 )

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band
-from safevar_sumo.study import load_study
+from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, with_values
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan_with_sets
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool
 
 GAP = "ads.parameters.brake_gap"
 OWN = float(load_study("sun").ads.parameters["brake_gap"])
@@ -61,3 +65,17 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
     other = load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"})
     assert not other.spread
     assert not other.model_error
+
+
+def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
+    friction = list(load_study("sun").vehicle.characteristics).index("tireFric")
+    gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
+    study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
+
+    def ends(one: Study, fits: int) -> OneAtATimeScan:
+        return scan_with_sets(Evaluator(one, InlinePool()), [friction], Unsafe(below=1.5), fits)[0]
+
+    of_each = [ends(with_values(study, {gap: value}), 0).safe for value in gaps]
+    low, high = zip(*(interval for interval in of_each if interval), strict=True)
+    assert len({*low}) > 1, "the fits differ"
+    assert ends(study, 8).across_fits == (len(low), ((min(low), max(low)), (min(high), max(high))))

@@ -15,23 +15,22 @@ from hypothesis import given, settings, strategies as st
 
 from safevar_sumo import risk, rules, tolerance
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.model_spread import with_values
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.rules.compute import Rule, Rules
 from safevar_sumo.analysis.tolerance import ToleranceOptions, boxes, compute
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
-from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan, scan_with_sets
+from safevar_sumo.analysis.tolerance.scans import scan
 from safevar_sumo.analysis.tolerance.sheet import safe_text
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
-from safevar_sumo.study import Limit, Study, load_study
+from safevar_sumo.study import Limit, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
-from tests.in_process import InlinePool, run
+from tests.in_process import run
 
 
 def of(
@@ -403,17 +402,3 @@ def test_a_trade_follows_the_line_between_safe_and_unsafe() -> None:
 def test_a_trade_needs_two_characteristics(names: str) -> None:
     with pytest.raises(InputError, match=r"^trade: "):
         tolerance(made_up_study(3), trade=names.split(","), pool=Plant(made_up_study(3), nowhere))
-
-
-def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
-    friction = list(load_study("sun").vehicle.characteristics).index("tireFric")
-    gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
-    study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
-
-    def ends(one: Study, fits: int) -> OneAtATimeScan:
-        return scan_with_sets(Evaluator(one, InlinePool()), [friction], Unsafe(below=1.5), fits)[0]
-
-    of_each = [ends(with_values(study, {gap: value}), 0).safe for value in gaps]
-    low, high = zip(*(interval for interval in of_each if interval), strict=True)
-    assert len({*low}) > 1, "the fits differ"
-    assert ends(study, 8).across_fits == (len(low), ((min(low), max(low)), (min(high), max(high))))

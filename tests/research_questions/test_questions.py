@@ -29,9 +29,8 @@ from safevar_sumo.analysis.research_questions.comparisons import (
     rq1_runs,
     rq2,
     rq2_runs,
-    significance_change_line,
-    summary_lines,
 )
+from safevar_sumo.analysis.research_questions.over_runs import significance_change_line, summary_lines
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples, correct_by_holm
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import MetricsTable

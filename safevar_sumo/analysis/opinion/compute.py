@@ -177,6 +177,7 @@ class Opinions:
 
 SIMULATION_LIMIT = 12_000
 """Approximate number of simulations that search the minimal causes, the same as for a report."""
+STAGE = "second vehicle model"
 CHANGE_SHARES = np.arange(1, 10) / 10
 """Shares of a cause's changes that the second model simulates, to locate the share from which they are unsafe."""
 
@@ -231,10 +232,9 @@ def judge_causes(
     system, vehicle = assemble_both_systems(study)
     second_system = replace(system, vehicle=vehicle)
     original = system.characteristics.original
-    stage = "second vehicle model"
     changed = [system.characteristics.setting(cause.changes, "cause", beyond=True) for _, cause in causes]
     settings = np.stack([original, *changed])
-    progress(stage, 0, len(settings))
+    progress(STAGE, 0, len(settings))
     # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
     ours = evaluate(system, settings)
@@ -268,23 +268,15 @@ def judge_causes(
                     f"{largest_safe_share:.0%} to {largest_safe_share + CHANGE_SHARES[0]:.0%} of the changes are "
                     f"enough with the second model, {cause.fraction:.1%} with ours"
                 )
-            seed = study.search.seed
-            if reason := _why_borderline(
-                second_system, settings[row], cause.robustness, fails_there[row], unsafe, seed
-            ):
+            seed, robustness = study.search.seed, cause.robustness
+            if reason := _why_borderline(second_system, settings[row], robustness, fails_there[row], unsafe, seed):
                 verdict = "borderline"
                 because = f"{reason}; {because}"
+        changes, here = dict(cause.changes), ends_here[row]
         opinions.append(
-            Opinion(
-                solution=solution,
-                changes=dict(cause.changes),
-                here=ends_here[row],
-                there=there,
-                opinion=verdict,
-                because=because,
-            )
+            Opinion(solution=solution, changes=changes, here=here, there=there, opinion=verdict, because=because)
         )
-        progress(stage, row + 1, len(settings))
+        progress(STAGE, row + 1, len(settings))
     return Opinions(
         study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0]
     )

@@ -31,13 +31,13 @@ from safevar_sumo.analysis.research_questions.changes import (
 )
 from safevar_sumo.analysis.research_questions.comparisons import (
     compare_pairs,
-    notes_over_runs,
     rank_algorithms,
     rq1,
     rq1_runs,
     rq2,
     rq2_runs,
 )
+from safevar_sumo.analysis.research_questions.over_runs import notes_over_runs
 from safevar_sumo.analysis.research_questions.statistics import fewest_runs
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts

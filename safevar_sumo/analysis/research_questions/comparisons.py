@@ -16,15 +16,8 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import (
-    ALGORITHM_TITLES,
-    NSGA2,
-    Case,
-    UnanswerableError,
-    defined_solutions,
-)
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, defined_solutions
 from safevar_sumo.analysis.research_questions.statistics import (
-    ALPHA,
     INDICATOR_TITLES,
     MORE_IS_BETTER,
     TwoSampleTest,
@@ -32,11 +25,10 @@ from safevar_sumo.analysis.research_questions.statistics import (
     compute_indicators,
     correct_by_holm,
     critical_difference,
-    fewest_runs,
     friedman_test,
     signed_rank_test,
 )
-from safevar_sumo.analysis.words import number_of, two_decimals
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import JsonObject
 
@@ -132,11 +124,11 @@ def rq2(case: Case) -> pd.DataFrame:
     UnanswerableError
         If NSGA-II is missing, or there is no other algorithm.
     """
-    rows = _rows_of_pairs(case, _nsga2_pairs(case), _samples(case, pooled_values))
+    rows = _rows_of_pairs(case, nsga2_pairs(case), _samples(case, pooled_values))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 
 
-def _nsga2_pairs(case: Case) -> list[tuple[str, str]]:
+def nsga2_pairs(case: Case) -> list[tuple[str, str]]:
     """NSGA-II with every other algorithm; raises `UnanswerableError` if NSGA-II is missing, or there is no other
     algorithm.
     """
@@ -206,7 +198,7 @@ def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
     """
     rows = {"RQ1": _rows_against_original(case, run_means, signed_rank_test)}
     if NSGA2 in case.algorithms and len(case.algorithms) > 1:
-        rows["RQ2"] = _rows_of_pairs(case, _nsga2_pairs(case), _samples(case, run_means))
+        rows["RQ2"] = _rows_of_pairs(case, nsga2_pairs(case), _samples(case, run_means))
     _add_holm([row for rows_of_question in rows.values() for row in rows_of_question])
     return {name: pd.DataFrame(rows[name], columns=RUNS_COLUMNS[name], dtype=object) for name in rows}
 
@@ -246,7 +238,7 @@ def rq2_runs(case: Case) -> pd.DataFrame:
         If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
     """
     frames = compare_over_runs(case)
-    _nsga2_pairs(case)  # raises if RQ2 has no answer
+    nsga2_pairs(case)  # raises if RQ2 has no answer
     return frames["RQ2"]
 
 
@@ -320,100 +312,3 @@ def _samples_over_runs(case: Case, min_algorithms: int) -> Samples:
 def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
     """Titles of metrics and quality indicators in tables, by name."""
     return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
-
-
-def _tests_over_runs(case: Case) -> pd.DataFrame:
-    """Every test of RQ1 and RQ2 over runs, with algorithm and metric in words; columns question, algorithm, metric,
-    effect_size, p_holm, ...
-
-    `pooled_p` is the p-value over the paper's pooled solutions; `enough` is whether there are enough runs for the test
-    to be significant.
-    """
-    frames = []
-    titles = titles_of(case.scoring.metrics)
-    for question, frame in compare_over_runs(case).items():
-        if question == "RQ1":
-            pooled_frame = rq1(case)
-            group = "algorithm"
-            counts = ["runs"]
-        else:
-            pooled_frame = rq2(case)
-            group = "baseline"
-            counts = ["n1", "n2"]
-        frames.append(
-            frame.assign(
-                question=question,
-                algorithm=frame[group].map(lambda name: ALGORITHM_TITLES.get(name, name)),
-                metric=frame["metric"].map(titles),
-                pooled_p=pooled_frame["p_value"],
-                enough=frame[counts].min(axis=1) >= fewest_runs(question),
-            )
-        )
-    return pd.concat(frames, ignore_index=True)
-
-
-def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
-    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs.
-
-    With `pooling`, also the `significance_change_line`, if at least one test of RQ1 or RQ2 has enough runs.
-    """
-    tests = _tests_over_runs(case).dropna(subset="effect_size")
-    enough = tests.loc[tests["question"] == question, "enough"]
-    how_many = f"{(~enough).sum()} of the" if enough.any() else "all"
-    too_few = f"too few runs for {how_many} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."
-    return [
-        *([] if enough.all() else [too_few]),
-        *([significance_change_line(case)] if pooling and tests["enough"].any() else []),
-    ]
-
-
-def significance_change_line(case: Case) -> str:
-    """One line: the tests with enough runs that are significant (p < ALPHA) only for the paper's pooled solutions, or
-    only over runs.
-
-    Example: "..., 3 of 28 tests are no longer significant: RQ1 NSGA-II SD, TET; RQ2 SafeFuzzer TET."
-    """
-    tests = _tests_over_runs(case)
-    tests = tests[tests["enough"]].dropna(subset="p_holm")
-    texts = []
-    was_significant, is_significant = (tests[column].astype(float) < ALPHA for column in ("pooled_p", "p_holm"))
-    for word, changes in (
-        ("no longer", tests[was_significant & ~is_significant]),
-        ("now", tests[~was_significant & is_significant]),
-    ):
-        groups = changes.dropna(subset="pooled_p").groupby(["question", "algorithm"], sort=False)["metric"]
-        named = "; ".join(f"{question} {name} {', '.join(metrics)}" for (question, name), metrics in groups)
-        count = groups.size().sum()
-        if count:
-            texts.append(f"{count} of {len(tests)} tests {'is' if count == 1 else 'are'} {word} significant: {named}")
-    return (
-        "With one value for each run and Holm's correction for the number of tests, instead of the paper's pooled "
-        f"solutions, {'. '.join(texts) or 'the same tests are significant'}."
-    )
-
-
-def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk."""
-    try:
-        tests = _tests_over_runs(case)
-    except UnanswerableError as error:
-        return [f"RQ1 and RQ2 over runs: {error.problem}."]
-    lines = list[str]()
-    for question, meaning, heading in (
-        ("RQ1", "below 0.5: the runs are more unsafe than the original vehicle", "{} against the original vehicle"),
-        ("RQ2", "above 0.5: NSGA-II is better", "NSGA-II against {}"),
-    ):
-        lines.append(f"{question} over runs: A12 {meaning}; * p < {ALPHA:g} after Holm's correction")
-        for name, group in tests[tests["question"] == question].groupby("algorithm", sort=False):
-            marks = np.where(group["p_holm"].astype(float) < ALPHA, "*", "")
-            effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
-            untestable = ", ".join(group.loc[~group["enough"] & group["effect_size"].notna(), "metric"])
-            too_few = (
-                f"; too few runs for a test ({fewest_runs(question)} are needed): {untestable}" if untestable else ""
-            )
-            lines.append(f"  A12 of {heading.format(name)}: {', '.join(effects)}{too_few}")
-    try:
-        _nsga2_pairs(case)
-    except UnanswerableError as error:
-        lines[-1] = f"RQ2 over runs: {error.problem}."  # replaces RQ2's heading
-    return [*lines, significance_change_line(case)] if tests["enough"].any() else lines
