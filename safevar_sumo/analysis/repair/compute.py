@@ -93,20 +93,16 @@ class _Finder:
         can = np.ones(len(vehicles), dtype=bool)
         can[failing] = problem.repairable(vehicles[failing])
         not_repairable = self._describe(vehicles[~can], float(np.mean(~can)))
-        if not can.any():
-            raise InputError(
-                "promise", "no driving system keeps any of the promised vehicles safe", "a smaller promise"
-            )
         self.search = Search(problem, vehicles[can], self._seen())
         repairs: list[Repair] = []
-        proof_of_today = None if failing[can].any() else self._proof_of_today()
+        proof_of_today = None if failing[can].any() or not can.any() else self._proof_of_today()
         largest = None
-        if proof_of_today is None:
+        if can.any() and proof_of_today is None:
             self._refuse_unread()
             repairs = self._repairs()
-            largest = None if repairs else self._largest_promise(vehicles[can])
+            largest = None if repairs else self._largest_promise(self.search.vehicles)
         curve = list[Exchange]()
-        if options.curve is not None:
+        if options.curve is not None and can.any():
             curve = exchange_rate(problem, len(self.system.matrix), self._price, options.curve, repairs)
         return Repairs(
             study=study,
@@ -236,28 +232,33 @@ class _Finder:
             lost = [subset for subset, failing in failures.items() if len(failing)]
             if lost:
                 self.search.add(np.concatenate([failures[subset] for subset in lost]))
-                found = self._smallest(found)
+                found = self._smallest(found, kept)
         return []
 
-    def _smallest(self, found: dict[Subset, FloatArray]) -> dict[Subset, FloatArray]:
+    def _smallest(
+        self, found: dict[Subset, FloatArray], kept: Sequence[Subset] | None = None
+    ) -> dict[Subset, FloatArray]:
         """The smallest change of each subset of 1, 2, 3 parameters, up to one more than the first number that works.
 
-        Of the changes that are known, only those that new counterexamples break are sought again, in a larger box.
+        Of the changes that are known, only those that new counterexamples break are sought again, in a larger box; only
+        those of the subsets `kept`, unless none of the others survives.
         """
         search, count = self.search, len(self.problem.parameters)
         starts = {subset: float(search.change(one)) + EARLIER_BOX for subset, one in found.items()}
         result, worked = self._surviving(found), 0
+        if not result:
+            kept = None
         for size in range(1, min(MOST_CHANGED, count) + 1):
             limits = {}
             for subset in combinations(range(count), size):
                 inner = [float(search.change(one)) for key, one in result.items() if set(key) < set(subset)]
-                limits[subset] = min([1.0, *(change - 0.005 for change in inner)])
-            open_subsets = [subset for subset in limits if subset not in result]
-            result |= search.smallest(open_subsets, limits, starts)
+                if subset not in result and (kept is None or subset in kept):
+                    limits[subset] = min([1.0, *(change - 0.005 for change in inner)])
+            result |= search.smallest(list(limits), limits, starts)
             worked = worked or (size if any(len(subset) <= size for subset in result) else 0)
             if worked and size > worked:
                 break
-        return result if len(self._surviving(result)) == len(result) else self._smallest(result)
+        return result if len(self._surviving(result)) == len(result) else self._smallest(result, kept)
 
     def _surviving(self, found: dict[Subset, FloatArray]) -> dict[Subset, FloatArray]:
         """The changes that survive all counterexamples; failures of the others join those that candidates are tried
