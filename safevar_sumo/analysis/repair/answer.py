@@ -240,7 +240,8 @@ class Repairs:
                 if name == one.name
             ]
             place = f" ({part.point})" if part.point else ""
-            yield f"  not repairable     {' with '.join(limits)}{place}: needs another part, not a parameter"
+            part_text = " with ".join(limits) or "even the original"
+            yield f"  not repairable     {part_text}{place}: needs another part, not a parameter"
 
     def _curve_table(self) -> WholeTable:
         name = self.curve[0].characteristic
