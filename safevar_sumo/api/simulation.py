@@ -324,9 +324,8 @@ def evaluate(
     pandas.DataFrame
         One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated,
         f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined),
-        collision_speed [m/s], outcome. A setting that cannot be simulated has the outcome simulator-error, a setting
-        that leaves a test's speed before the driving system acts has the outcome invalid-test. Both have no metrics,
-        and count neither as failures nor as successes.
+        collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated, invalid-test if it leaves a
+        test's speed before the driving system acts. These have no metrics, and are neither failures nor successes.
 
     Raises
     ------
