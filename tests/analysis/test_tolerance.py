@@ -22,13 +22,11 @@ from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.analysis.tolerance.scans import scan
-from safevar_sumo.analysis.tolerance.sheet import safe_text
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Limit, load_study
-from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
 from tests.in_process import run
 
@@ -334,13 +332,6 @@ def test_the_box_with_limits_holds_no_known_solution() -> None:
     box = box_of(3, nowhere, {"a": Limit(at_most=8)}, known=[[7.0, 8.0, 9.0]])
     assert box.known_unsafe_inside == 0
     assert any(high < value for (_, high), value in zip(box.box.values(), (7.0, 8.0, 9.0), strict=True))
-
-
-def test_limits_are_rounded_to_the_safe_side() -> None:
-    one = CharacteristicSet.of(load_study("wear")).members[0]
-    assert safe_text(one, 2.3178, upwards=True) == "2.32"
-    assert safe_text(one, 2.3278, upwards=False) == "2.32"
-    assert safe_text(one, 7.999, upwards=True) == "8.00"
 
 
 @pytest.mark.slow

@@ -44,7 +44,8 @@ class Failure(NamedTuple):
         if unsafe.points is not None:
             return cls("", str(run.outcome[0]), f"the car {unsafe.in_words}", alone)
         if run.collided[0]:
-            impact = "" if speed else f" with {-KMH_PER_MS * degree:.2g} km/h"
+            impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
+            impact = "" if speed or impact_speed < 1 else f" with {impact_speed:.2g} km/h"
             text = f"the car hits {scenario.obstacle()}{speed or impact}"
         else:
             text = f"the car keeps only {distance_in_words(scenario, degree)} from {scenario.obstacle()}{speed}"
