@@ -117,14 +117,12 @@ def test_a_question_takes_the_point_that_its_command_takes() -> None:
 @pytest.mark.slow
 def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
     commanded = (
-        ["explain", str(slippery)],
+        ["explain", str(slippery), "--limit", "4000", "--top", "2"],
         ["tolerance", str(slippery), "--characteristics", "mass,tireFric", "--pairs"],
         ["risk", str(slippery), "--samples", "300"],
         ["rules", str(slippery), "--samples", "1000"],
     )
     for arguments in commanded:
-        one, two, again = (
-            CliRunner().invoke(commands, [*arguments, "--json", "--jobs", jobs]).stdout for jobs in ("1", "2", "2")
-        )
-        assert one == two == again
+        one, two = (CliRunner().invoke(commands, [*arguments, "--json", "--jobs", jobs]).stdout for jobs in ("1", "2"))
+        assert one == two
         assert one

@@ -237,12 +237,12 @@ def radius_of(probability: float, n: int) -> float:
         ("cross_entropy", "linear", 8, 1e-6),
     ],
 )
-def test_analytic_probabilities_over_twenty_seeds(method: str, shape: str, n: int, probability: float) -> None:
+def test_analytic_probabilities_over_ten_seeds(method: str, shape: str, n: int, probability: float) -> None:
     limit = linear(beta_of(probability)) if shape == "linear" else curved(radius_of(probability, n))
-    estimates = [rare(limit, n, seed, method=method) for seed in range(20)]
+    estimates = [rare(limit, n, seed, method=method) for seed in range(10)]
     assert {one.method for one in estimates} == {method}
-    assert np.mean([one.probability for one in estimates]) == pytest.approx(probability, rel=0.1)
-    assert sum(one.interval[0] <= probability <= one.interval[1] for one in estimates) >= 18
+    assert np.mean([one.probability for one in estimates]) == pytest.approx(probability, rel=0.15)
+    assert sum(one.interval[0] <= probability <= one.interval[1] for one in estimates) >= 9
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import re
 import shlex
 import shutil
@@ -70,10 +69,6 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
             "rules",
         ):  # the page says the other lines in other words, beside what they belong to
             assert said == lines
-    assert (
-        " ".join(json.loads(output_of([*printed["explain"], "--json"]))[0]["because"].replace("^2", "²").split())
-        in text
-    )
 
 
 def output_of(typed: list[str]) -> str:

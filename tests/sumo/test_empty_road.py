@@ -106,13 +106,13 @@ def test_a_traci_controller_sees_nobody(
     assert bool(said) == bool(expected)
 
 
-@pytest.fixture(params=["0.0, 1.0", "0.0, 0.0"])
-def still(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A study file whose driving system always returns the same pedals."""
+@pytest.fixture
+def still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A study file whose driving system does nothing."""
     monkeypatch.chdir(tmp_path)
     Path("still.py").write_text(
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self, seen):\n"
-        f"        return {request.param}\n"
+        "        return 0.0, 0.0\n"
     )
     Path("still.toml").write_text('extends = "smoke"\nname = "still"\n[ads]\nmodel = "still:Still"\nparameters = {}\n')
     return "still.toml"
