@@ -4,32 +4,20 @@ traffic as the vehicle's sensors report it.
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict, deque
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
-from safevar_sumo.ads.base import STEP_DECIMALS, DelayLine
+from safevar_sumo.ads.base import DelayLine
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import VUT, Point, Scenario, Scene
 from safevar_sumo.scenarios.base import Frame, ScenarioMemory, World
 from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, scene_of
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld, SampledRecording, absence_error
-from safevar_sumo.sumo.world import SumoWorld, begin
+from safevar_sumo.sumo.world import begin
 
-LEADER_RANGE = 1000.0  # distance within which SUMO looks for a leader [m]
-MOTION = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
-SENSED_FUNCTIONS: Mapping[str, tuple[str, ...]] = {
-    "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
-    "person": MOTION,
-}
-"""TraCI's functions, by domain, that return values of other actors that sensors can measure."""
-Values = dict[str, Any]
-"""An actor's values, by function; its length, too."""
 OCCLUDED_VALUES = np.array([[np.inf], [np.inf], [0.0], [0.0]])
 """Gap and lateral position [m], lateral speed and speed [m/s] of an occluded obstacle."""
 
@@ -226,94 +214,3 @@ def _table(columns: Sequence[Any], length: int) -> Any:
     for k, column in enumerate(columns):
         table[:, k] = column if np.ndim(column) == 0 else column[np.minimum(np.arange(length), len(column) - 1)]
     return table
-
-
-class Snapshot(NamedTuple):
-    """The traffic at one time: values by function of the vehicle itself, and of other actors by domain and name; the
-    leader with its gap [m].
-    """
-
-    own: Values
-    actors: Mapping[str, dict[str, Values]]
-    leader: tuple[str, float] | None
-
-
-class SensedTraffic:
-    """The traffic around N vehicles in their copies of the network, delayed and limited by the vehicles' sensors."""
-
-    def __init__(self, world: SumoWorld, step: float) -> None:
-        self._world = world
-        self._past = [
-            deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS)))
-            for age in (world.sensors.latency / step).tolist()
-        ]
-        self._sensed: dict[int, Snapshot] = {}
-        self._names: dict[tuple[int, str], list[str]] = {}
-
-    def record_step(self) -> None:
-        """Record the traffic of this step; must be called in every step."""
-        self._sensed, self._names = {}, {}
-        for copy, past in enumerate(self._past):
-            if past.maxlen != 1:
-                past.append(self._take_snapshot(copy))
-
-    def snapshot(self, copy: int) -> Snapshot:
-        """What the sensors of a vehicle report now; the first snapshot until the latency is over."""
-        if copy not in self._sensed:
-            past = self._past[copy]
-            if past.maxlen == 1:
-                past.append(self._take_snapshot(copy))
-            reach, scale = (float(values[copy]) for values in self._world.sensors[1:])
-            self._sensed[copy] = _limit_to_range(past[0], reach, scale)
-        return self._sensed[copy]
-
-    def _take_snapshot(self, copy: int) -> Snapshot:
-        api, vut = self._world.api, copied_id(copy, VUT)
-        if self._world.has_left(vut):
-            return Snapshot({}, {domain: {} for domain in SENSED_FUNCTIONS}, None)
-        if not self._names:
-            self._names = defaultdict(list)
-            for domain in SENSED_FUNCTIONS:
-                for number, name in map(copy_and_name, getattr(api, domain).getIDList()):
-                    self._names[number, domain].append(name)
-        actors: dict[str, dict[str, Values]] = {}
-        for domain, functions in SENSED_FUNCTIONS.items():
-            getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]
-            actors[domain] = {
-                actor: {name: get(copied_id(copy, actor)) for name, get in getters}
-                for actor in self._names[copy, domain]
-            }
-        own, leader = actors["vehicle"].pop(VUT), api.vehicle.getLeader(vut, LEADER_RANGE)
-        return Snapshot(own, actors, (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None)
-
-
-def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
-    """The snapshot without actors beyond the sensors' range, and with distances multiplied by the sensors' scale."""
-    if not snapshot.own or (reach == math.inf and scale == 1):
-        return snapshot
-
-    def seen(values: Values) -> Values:
-        own = snapshot.own
-        return values | {
-            name: tuple(here + scale * (there - here) for here, there in zip(own[name], values[name], strict=True))
-            for name in MOTION[:2]
-            if scale != 1
-        }
-
-    actors = {
-        domain: {
-            name: seen(values)
-            for name, values in members.items()
-            if _distance(snapshot.own["getPosition"], values, values["getLength"] * (domain == "vehicle")) <= reach
-        }
-        for domain, members in snapshot.actors.items()
-    }
-    leader = snapshot.leader if snapshot.leader and snapshot.leader[0] in actors["vehicle"] else None
-    return Snapshot(snapshot.own, actors, leader and (leader[0], leader[1] * scale))
-
-
-def _distance(position: tuple[float, float], values: Values, length: float) -> float:
-    """Distance from a position to the nearer end of an actor, whose front and rear are `length` apart [m]."""
-    heading, (x, y) = math.radians(values["getAngle"]), values["getPosition"]
-    rear = x - length * math.sin(heading), y - length * math.cos(heading)
-    return min(math.dist(position, (x, y)), math.dist(position, rear))

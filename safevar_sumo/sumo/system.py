@@ -34,8 +34,7 @@ from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, 
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import check_network, network_remarks
-from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.traci_module import substitute_traci
+from safevar_sumo.sumo.traci_controller import TraciController, substitute_traci
 from safevar_sumo.vehicles import (
     CHANGES,
     VEHICLES,

@@ -2,126 +2,122 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
-from collections.abc import Mapping
+from collections import defaultdict, deque
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, NamedTuple
 
+from safevar_sumo.ads.base import STEP_DECIMALS
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.copies import copied_id
-from safevar_sumo.sumo.perception import SENSED_FUNCTIONS, SensedTraffic
-from safevar_sumo.sumo.traci_module import (
-    COMMANDS,
-    Arguments,
-    CommandedSpeed,
-    Named,
-    Value,
-    all_arguments,
-    full_name,
-    real_traci,
-    refuse_own_loop,
-)
-from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.sumo.copies import copied_id, copy_and_name
+from safevar_sumo.sumo.engine import Engine, engine_api
+from safevar_sumo.sumo.world import Api, SumoWorld
 
-DISPLAY_FUNCTIONS = ("setColor", "highlight")
+Value = Any
+"""An argument or a result of a function of TraCI."""
+Arguments = tuple[Value, ...]
+Command = Callable[[str, float, float, Arguments], None]
+"""Processes a command of the vehicle domain: its name, the time [s], the vehicle's speed [m/s], and its arguments."""
+Values = dict[str, Value]
+"""An actor's values, by function; its length, too."""
+Variables = dict[int, tuple[str, Arguments]]
+"""Requested variables, each with its function and that function's arguments after the actor's id."""
+
+COMMANDS: Mapping[str, tuple[str, ...]] = {
+    "setSpeed": ("speed",),
+    "slowDown": ("speed", "duration"),
+    "setAcceleration": ("acceleration", "duration"),
+    "setAccel": ("accel",),
+    "setDecel": ("decel",),
+    "setMaxSpeed": ("speed",),
+    "setSpeedMode": ("mode",),
+}
+"""The commands that a controller may give, each with its numeric arguments."""
 LISTS = ("getIDList", "getIDCount")
-CONSTANT_FUNCTIONS = (
+MOTION = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
+SENSED: Mapping[str, tuple[str, ...]] = {
+    "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
+    "person": MOTION,
+}
+"""Functions, by domain, that return values of other actors that sensors can measure."""
+CONSTANT = (
     "getTypeID",
     "getLength",
     "getWidth",
     "getHeight",
     "getMinGap",
     "getVehicleClass",
-    "getShapeClass",
-    "getColor",
     "getAccel",
     "getDecel",
     "getEmergencyDecel",
-    "getApparentDecel",
     "getMaxSpeed",
     "getTau",
     "getMass",
 )
 """Functions that return properties of actors that are visible at once or follow from the actor's type."""
-OWN_FUNCTIONS = (
+OWN = (
     "getLeader",
     "getRoute",
     "getRouteID",
     "getRouteIndex",
     "getDistance",
     "getDrivingDistance",
-    "getDrivingDistance2D",
     "getAllowedSpeed",
-    "getSpeedFactor",
     "getSpeedMode",
-    "getSlope",
     "getWaitingTime",
-    "getAccumulatedWaitingTime",
-    "getTimeLoss",
     "getNextTLS",
-    "isStopped",
     "getFollowSpeed",
     "getSecureGap",
     "getStopSpeed",
-    "getImperfection",
-    "getActionStepLength",
-    "getDeparture",
 )
 """Functions that return values of the vehicle under test alone."""
-ACTORS_ON_ROAD = ("getLastStepVehicleIDs", "getLastStepVehicleNumber", "getLastStepPersonIDs")
-QUERIES: Mapping[str, tuple[str, ...]] = {
-    "": ("getVersion", "isLibsumo", "hasGUI"),
-    "vehicle": (*LISTS, *SENSED_FUNCTIONS["vehicle"], *CONSTANT_FUNCTIONS, *OWN_FUNCTIONS),
-    "person": (*LISTS, *SENSED_FUNCTIONS["person"], *CONSTANT_FUNCTIONS),
+SUBSCRIPTIONS = ("subscribe", "getSubscriptionResults", "getAllSubscriptionResults")
+CALLS: Mapping[str, tuple[str, ...]] = {
+    "vehicle": (*LISTS, *SENSED["vehicle"], *CONSTANT, *OWN, *COMMANDS, *SUBSCRIPTIONS),
+    "person": (*LISTS, *MOTION, *CONSTANT, *SUBSCRIPTIONS),
     "simulation": (
         "getTime",
         "getDeltaT",
-        "getMinExpectedNumber",
-        "getNetBoundary",
         "getDistance2D",
         "getDistanceRoad",
         "convert2D",
-        "convert3D",
         "convertGeo",
         "convertRoad",
     ),
-    "edge": (*LISTS, *ACTORS_ON_ROAD, "getLaneNumber", "getStreetName", "getFromJunction", "getToJunction", "getAngle"),
+    "edge": (*LISTS, "getLaneNumber", "getFromJunction", "getToJunction", "getAngle"),
     "lane": (
         *LISTS,
-        *ACTORS_ON_ROAD[:2],
         "getEdgeID",
         "getLength",
         "getWidth",
         "getShape",
         "getMaxSpeed",
-        "getFriction",
         "getAllowed",
         "getDisallowed",
         "getLinkNumber",
         "getLinks",
         "getFoes",
-        "getInternalFoes",
     ),
-    "junction": (*LISTS, "getPosition", "getShape", "getIncomingEdges", "getOutgoingEdges"),
+    "junction": (*LISTS, "getPosition", "getShape"),
     "trafficlight": (
         *LISTS,
         "getRedYellowGreenState",
         "getPhase",
-        "getPhaseName",
         "getPhaseDuration",
-        "getSpentDuration",
         "getNextSwitch",
         "getProgram",
         "getControlledLanes",
         "getControlledLinks",
     ),
-    "vehicletype": (*LISTS, *CONSTANT_FUNCTIONS[1:], "getSpeedFactor", "getImperfection"),
+    "vehicletype": (*LISTS, *CONSTANT[1:]),
     "route": (*LISTS, "getEdges"),
 }
-"""The functions that a controller may query, by domain; "" is the module itself."""
+"""The functions that a controller may call, by domain."""
 VARIABLES: Mapping[str, str] = {
-    "TRACI_ID_LIST": "getIDList",
-    "ID_COUNT": "getIDCount",
     "VAR_POSITION": "getPosition",
     "VAR_POSITION3D": "getPosition3D",
     "VAR_SPEED": "getSpeed",
@@ -136,65 +132,133 @@ VARIABLES: Mapping[str, str] = {
     "VAR_SIGNALS": "getSignals",
     "VAR_LEADER": "getLeader",
     "VAR_DISTANCE": "getDistance",
+    "VAR_ALLOWED_SPEED": "getAllowedSpeed",
     "VAR_LENGTH": "getLength",
     "VAR_WIDTH": "getWidth",
-    "VAR_HEIGHT": "getHeight",
     "VAR_TYPE": "getTypeID",
-    "VAR_VEHICLECLASS": "getVehicleClass",
-    "VAR_MINGAP": "getMinGap",
-    "VAR_ALLOWED_SPEED": "getAllowedSpeed",
     "VAR_MAXSPEED": "getMaxSpeed",
-    "VAR_ACCEL": "getAccel",
-    "VAR_DECEL": "getDecel",
-    "VAR_TAU": "getTau",
-    "VAR_ROUTE_ID": "getRouteID",
-    "VAR_WAITING_TIME": "getWaitingTime",
-    "VAR_TIME": "getTime",
-    "VAR_DELTA_T": "getDeltaT",
 }
 """TraCI's variables for subscriptions, each with the function that returns the same value."""
-DEFAULT_VARIABLES: Mapping[str, tuple[str, ...]] = {
-    "vehicle": ("VAR_ROAD_ID", "VAR_LANEPOSITION"),
-    "person": ("VAR_ROAD_ID", "VAR_LANEPOSITION"),
-    "simulation": ("VAR_TIME",),
-}
-"""Domains for subscriptions, each with the variables of a subscription that names none."""
-CONTEXT_DOMAINS = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
+DEFAULT_VARIABLES = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 INVALID_NUMBER = -1073741824
 """Value that SUMO returns for a property of an actor that is not on the road."""
+LEADER_RANGE = 1000.0
+"""Distance within which SUMO looks for a leader [m]."""
+OWN_LOOP = "safevar_sumo itself starts, advances and ends the simulation"
 
-Variables = dict[int, tuple[str, Arguments]]
-"""Requested variables, each with its function and that function's arguments after the actor's id."""
+
+@cache
+def real_traci() -> Api:
+    """The original module traci, not its substitute for controllers; must be called before controllers run."""
+    return engine_api(Engine.TRACI)
+
+
+def refused(domain: str, name: str, problem: str) -> InputError:
+    """The error for a call of a controller."""
+    legal = "the body of your script's loop, without this call, as a function step(traci, vehicle_id), with calls of "
+    return InputError(f"traci.{domain}.{name}".replace("..", "."), problem, legal + ", ".join(CALLS.get(domain, CALLS)))
+
+
+class Snapshot(NamedTuple):
+    """The traffic at one time: values by function of the vehicle itself, and of other actors by domain and name; the
+    leader with its gap [m].
+    """
+
+    own: Values
+    actors: Mapping[str, dict[str, Values]]
+    leader: tuple[str, float] | None
+
+
+class SensedTraffic:
+    """The traffic around N vehicles in their copies of the network, delayed and limited by the vehicles' sensors."""
+
+    def __init__(self, world: SumoWorld, step: float) -> None:
+        self._world = world
+        ages = (world.sensors.latency / step).tolist()
+        self._past = [deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS))) for age in ages]
+        self.record_step()
+
+    def record_step(self) -> None:
+        """Record the traffic of this step; must be called in every later step. `seen` is what the sensors of each
+        vehicle report now: the first snapshot until the latency is over.
+        """
+        names: dict[tuple[int, str], list[str]] = defaultdict(list)
+        for domain in SENSED:
+            for copy, name in map(copy_and_name, getattr(self._world.api, domain).getIDList()):
+                names[copy, domain].append(name)
+        self.seen = []
+        for copy, (past, reach, scale) in enumerate(zip(self._past, *self._world.sensors[1:], strict=True)):
+            past.append(self._snapshot(copy, names))
+            self.seen.append(_limit_to_range(past[0], float(reach), float(scale)))
+
+    def is_on_road(self, copy: int) -> bool:
+        """Whether a vehicle has not left the road."""
+        return bool(self._past[copy][-1].own)
+
+    def _snapshot(self, copy: int, names: Mapping[tuple[int, str], list[str]]) -> Snapshot:
+        api, vut = self._world.api, copied_id(copy, VUT)
+        if self._world.has_left(vut):
+            return Snapshot({}, {domain: {} for domain in SENSED}, None)  # for good
+        actors: dict[str, dict[str, Values]] = {}
+        for domain, functions in SENSED.items():
+            getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]
+            actors[domain] = {
+                actor: {name: get(copied_id(copy, actor)) for name, get in getters} for actor in names[copy, domain]
+            }
+        own, leader = actors["vehicle"].pop(VUT), api.vehicle.getLeader(vut, LEADER_RANGE)
+        return Snapshot(own, actors, (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None)
+
+
+def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
+    """The snapshot without actors beyond the sensors' range, and with distances multiplied by the sensors' scale."""
+    own = snapshot.own
+    if not own or (reach == math.inf and scale == 1):
+        return snapshot
+    actors: dict[str, dict[str, Values]] = {}
+    for domain, members in snapshot.actors.items():
+        actors[domain] = {}
+        for name, values in members.items():
+            length, heading = values["getLength"] * (domain == "vehicle"), math.radians(values["getAngle"])
+            front, position = values["getPosition"], own["getPosition"]
+            rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
+            if min(math.dist(position, front), math.dist(position, rear)) <= reach:
+                actors[domain][name] = values if scale == 1 else {**values, **_scaled(own, values, scale)}
+    leader = snapshot.leader if snapshot.leader and snapshot.leader[0] in actors["vehicle"] else None
+    return Snapshot(own, actors, leader and (leader[0], leader[1] * scale))
+
+
+def _scaled(own: Values, values: Values, scale: float) -> Values:
+    """The positions of an actor, with distances from the vehicle itself multiplied by the sensors' scale."""
+    return {
+        name: tuple(here + scale * (there - here) for here, there in zip(own[name], values[name], strict=True))
+        for name in MOTION[:2]
+    }
 
 
 class TraciView:
     """TraCI's functions for one vehicle, with the ids of the traffic file."""
 
-    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic, commands: CommandedSpeed) -> None:
-        self._world, self._copy, self._traffic = world, copy, traffic
-        self._vut = copied_id(copy, VUT)
-        self._subscriptions: dict[tuple[bool, str, str], tuple[str, float, Variables]] = {}
-        self.commands, self.time = commands, 0.0
+    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic, command: Command) -> None:
+        self._api, self._copy, self._vut, self._traffic = world.api, copy, copied_id(copy, VUT), traffic
+        self._step, self._command_vut = world.step_length, command
+        self._subscriptions: dict[tuple[str, str], Variables] = {}
+        self.time = 0.0
         self.last_error: InputError | None = None
         """The last error raised to the controller, even if the controller caught it."""
 
-    @property
-    def on_the_road(self) -> bool:
-        return not self._world.has_left(self._vut)
-
     def speed_of_sumo(self, speed: float) -> float:
         """Speed that SUMO's driver, with the original vehicle's type, would choose next for road and leader [m/s]."""
-        vehicle, vut, snapshot = self._world.api.vehicle, self._vut, self._traffic.snapshot(self._copy)
-        free_speed = min(speed + vehicle.getAccel(vut) * self._world.step_length, vehicle.getAllowedSpeed(vut))
-        if snapshot.leader is None:
-            return float(free_speed)
-        name, gap = snapshot.leader
-        leader, leader_speed = copied_id(self._copy, name), snapshot.actors["vehicle"][name]["getSpeed"]
-        follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)
-        return float(min(free_speed, follow_speed))
+        vehicle, vut, (_, actors, leader) = self._api.vehicle, self._vut, self._traffic.seen[self._copy]
+        sumo_speed = min(speed + vehicle.getAccel(vut) * self._step, vehicle.getAllowedSpeed(vut))
+        if leader is not None:
+            name, gap = leader
+            id_, leader_speed = copied_id(self._copy, name), actors["vehicle"][name]["getSpeed"]
+            follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(id_), id_)
+            sumo_speed = min(sumo_speed, follow_speed)
+        return float(sumo_speed)
 
-    def call(self, domain: str, name: str, arguments: Arguments, named: Named) -> Value:
-        """Call a TraCI function in this copy; `domain` is "" for functions of the module itself.
+    def call(self, domain: str, name: str, arguments: Arguments, named: Mapping[str, Value]) -> Value:
+        """Call a TraCI function in this copy.
 
         Raises
         ------
@@ -203,154 +267,85 @@ class TraciView:
         TraCIException
             If SUMO refuses the call; its message has the traffic file's ids.
         """
-        api = self._world.api
         try:
-            refuse_own_loop(domain, name)
-            if "ubscri" in name and domain in DEFAULT_VARIABLES:
-                return self._subscription(domain, name, all_arguments(domain, name, arguments, named))
-            if domain == "vehicle" and name in (*COMMANDS, *DISPLAY_FUNCTIONS):
-                return self._command(name, all_arguments(domain, name, arguments, named))
-            return self._query(domain, name, *arguments, **named)
+            if name not in CALLS.get(domain, ()):
+                raise refused(domain, name, f"is not for a controller of {VUT!r}: {OWN_LOOP}")
+            bound = _signature(domain, name).bind(*arguments, **named)
+            if name not in COMMANDS and name not in SUBSCRIPTIONS:
+                return self._query(domain, name, *bound.args)
+            bound.apply_defaults()
+            return (self._command if name in COMMANDS else self._subscription)(domain, name, *bound.args)
         except InputError as error:
             self.last_error = error
             raise
-        except (api.TraCIException, api.FatalTraCIError) as error:
+        except (self._api.TraCIException, self._api.FatalTraCIError) as error:
             raise real_traci().exceptions.TraCIException(re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))) from None
 
-    def _command(self, name: str, arguments: Arguments) -> None:
-        if arguments[0] != VUT:
-            raise InputError(
-                f"traci.vehicle.{name}",
-                f"vehID = {arguments[0]!r} is not the vehicle under test",
-                f"{VUT!r}: a controller commands no other vehicle",
-            )
-        if name in DISPLAY_FUNCTIONS:
-            self._sumo_value("vehicle", name, arguments)
-        else:
-            speed = float(self._world.api.vehicle.getSpeed(self._vut))
-            self.commands.command(name, self.time, speed, arguments[1:])
+    def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> None:
+        if vehicle != VUT:
+            raise refused(domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}")
+        self._command_vut(name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values)
 
-    def _query(self, domain: str, name: str, /, *given: Value, **named: Value) -> Value:
-        allowed = QUERIES.get(domain, ())
-        if name not in allowed:
-            legal = (*allowed, *COMMANDS) if domain == "vehicle" else allowed or QUERIES
-            problem = f"is not for a controller of {VUT!r}"
-            raise InputError(full_name(domain, name), problem, ", ".join(filter(None, legal)))
-        arguments = all_arguments(domain, name, given, named) if named else given
+    def _query(self, domain: str, name: str, *arguments: Value) -> Value:
         if name in LISTS:
             ids = self._ids(domain)
             return ids if name == "getIDList" else len(ids)
-        is_own = (domain, *arguments[:1]) == ("vehicle", VUT)
-        if domain in SENSED_FUNCTIONS and name not in CONSTANT_FUNCTIONS and not is_own:
-            return self._sensed_value(domain, name, arguments)
+        if domain in SENSED and name not in CONSTANT and arguments[0] != VUT:
+            return self._sensed_value(domain, name, *arguments)
         if name == "getLeader":
             return self._leader(*arguments[1:])
-        if name in ACTORS_ON_ROAD:
-            return self._actors_on_road(domain, name, arguments[0])
-        if name == "getTime":
-            return self.time
-        if name == "getMinExpectedNumber":
-            return sum(len(self._ids(actors)) for actors in SENSED_FUNCTIONS)
-        return self._sumo_value(domain, name, arguments)
+        return self.time if name == "getTime" else self._sumo_value(domain, name, *arguments)
 
-    def _sensed_value(self, domain: str, name: str, arguments: Arguments) -> Value:
-        """Another actor's value as the sensors report it."""
-        if name not in SENSED_FUNCTIONS[domain]:
-            problem = f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures"
-            legal = (*SENSED_FUNCTIONS[domain], *CONSTANT_FUNCTIONS)
-            raise InputError(full_name(domain, name), problem, ", ".join(legal))
-        actors = self._traffic.snapshot(self._copy).actors[domain]
-        if arguments[0] in actors:
-            return _original_ids(actors[arguments[0]][name])
-        value = self._sumo_value(domain, name, arguments)
+    def _sensed_value(self, domain: str, name: str, actor: str, *others: Value) -> Value:
+        """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO reports one that is
+        not on the road.
+        """
+        if name not in SENSED[domain]:
+            raise refused(domain, name, f"returns a value of {actor!r} that no sensor of the vehicle measures")
+        actors = self._traffic.seen[self._copy].actors[domain]
+        if actor in actors:
+            return _original_ids(actors[actor][name])
+        value = self._sumo_value(domain, name, actor, *others)
         if isinstance(value, tuple):
             return (float(INVALID_NUMBER),) * len(value)
         return "" if isinstance(value, str) else type(value)(INVALID_NUMBER)
 
     def _ids(self, domain: str) -> tuple[str, ...]:
-        if domain in SENSED_FUNCTIONS:
-            return (*((VUT,) if domain == "vehicle" else ()), *self._traffic.snapshot(self._copy).actors[domain])
-        return tuple(dict.fromkeys(map(_original_ids, getattr(self._world.api, domain).getIDList())))
+        if domain in SENSED:
+            return (*((VUT,) if domain == "vehicle" else ()), *self._traffic.seen[self._copy].actors[domain])
+        return tuple(dict.fromkeys(map(_original_ids, getattr(self._api, domain).getIDList())))
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
         """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping distance."""
-        speed = float(self._world.api.vehicle.getSpeed(self._vut))
-        leader = self._traffic.snapshot(self._copy).leader
-        return leader if leader and leader[1] <= (dist or speed**2 / (2 * self.commands.nominal_decel)) else None
+        vehicle, vut = self._api.vehicle, self._vut
+        dist = dist or vehicle.getSpeed(vut) ** 2 / (2 * vehicle.getDecel(vut))
+        leader = self._traffic.seen[self._copy].leader
+        return leader if leader and leader[1] <= dist else None
 
-    def _actors_on_road(self, domain: str, name: str, road: str) -> Value:
-        """Actors on a lane or edge, or their number, as the sensors report them."""
-        snapshot, function = self._traffic.snapshot(self._copy), "getLaneID" if domain == "lane" else "getRoadID"
-        persons, vehicles = snapshot.actors["person"], {VUT: snapshot.own, **snapshot.actors["vehicle"]}
-        actors = persons if name == "getLastStepPersonIDs" else vehicles
-        names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
-        return len(names) if name == "getLastStepVehicleNumber" else names
+    def _sumo_value(self, domain: str, name: str, *arguments: Value) -> Value:
+        copied = [_copied_ids(self._copy, argument) for argument in arguments]
+        return _original_ids(getattr(getattr(self._api, domain), name)(*copied))
 
-    def _sumo_value(self, domain: str, name: str, arguments: Arguments) -> Value:
-        api = self._world.api
-        function = getattr(getattr(api, domain) if domain else api, name)
-        return _original_ids(function(*(_copied_ids(self._copy, argument) for argument in arguments)))
-
-    def _subscription(self, domain: str, name: str, arguments: Arguments) -> Value:
-        """Subscribe, unsubscribe, or return the values of functions subscribed to, as the sensors report them."""
-        is_context = "Context" in name
-        if name.startswith("get"):
-            results = self._results(is_context, domain)
-            return results if name.startswith("getAll") else results.get(arguments[0] if arguments else "", {})
-        actor, *details = ("", *arguments) if domain == "simulation" else arguments
-        if name.startswith("unsubscribe"):
-            self._subscriptions.pop((is_context, domain, actor), None)
-            return None
-        around, dist = details[:2] if is_context else (0, 0.0)
-        domains = {_constant(name): other for name, other in CONTEXT_DOMAINS.items()} if is_context else {0: domain}
-        if name not in ("subscribe", "subscribeContext") or around not in domains:
-            raise InputError(
-                full_name(domain, name),
-                f"is not for a controller of {VUT!r}",
-                f"subscribe, or subscribeContext with {' or '.join(CONTEXT_DOMAINS)}",
-            )
-        variables = _requested_variables(domains[around], details[-4], details[-1])
-        self._subscriptions[is_context, domain, actor] = domains[around], dist, variables
+    def _subscription(self, domain: str, name: str, actor: str = "", *details: Value) -> Value:
+        """Subscribe to variables, or return their values, as the sensors report them."""
+        if name != "subscribe":
+            subscribed = {key[1]: value for key, value in self._subscriptions.items() if key[0] == domain}
+            results = {
+                one: {number: self._query(domain, function, one, *more) for number, (function, more) in values.items()}
+                for one, values in subscribed.items()
+                if one in self._ids(domain)
+            }
+            return results if name == "getAllSubscriptionResults" else results.get(actor, {})
+        requested, *_, parameters = details
+        functions = {_constant(name): function for name, function in VARIABLES.items()}
+        variables: Variables = {}
+        for number in map(_constant, DEFAULT_VARIABLES) if requested is None else requested:
+            if functions.get(number) not in CALLS[domain]:
+                raise refused(domain, name, f"variable {number!r} is none of {', '.join(VARIABLES)}")
+            more = (parameters or {}).get(number, ())
+            variables[number] = functions[number], more[1:] if isinstance(more, tuple) else (more,)
+        self._subscriptions[domain, actor] = variables
         return None
-
-    def _results(self, is_context: bool, domain: str) -> dict[str, Value]:
-        results: dict[str, Value] = {}
-        for (*kind, actor), (other_domain, dist, variables) in self._subscriptions.items():
-            if kind == [is_context, domain] and actor in (("",) if domain == "simulation" else self._ids(domain)):
-                results[actor] = (
-                    self._values(domain, actor, variables)
-                    if not is_context
-                    else {
-                        other: self._values(other_domain, other, variables)
-                        for other in self._ids(other_domain)
-                        if math.dist(
-                            *(
-                                self._query(*of)[:2]
-                                for of in ((domain, "getPosition", actor), (other_domain, "getPosition", other))
-                            )
-                        )
-                        <= dist
-                    }
-                )
-        return results
-
-    def _values(self, domain: str, actor: str, variables: Variables) -> dict[int, Value]:
-        return {
-            variable: self._query(domain, function, *((actor,) if actor else ()), *arguments)
-            for variable, (function, arguments) in variables.items()
-        }
-
-
-def _requested_variables(domain: str, requested: Value, parameters: Value) -> Variables:
-    functions = {_constant(name): function for name, function in VARIABLES.items()}
-    variables = map(_constant, DEFAULT_VARIABLES[domain]) if requested is None else requested
-    result: Variables = {}
-    for variable in variables:
-        if variable not in functions:
-            raise InputError(f"traci.{domain}.subscribe", f"variable {variable!r}", ", ".join(VARIABLES))
-        argument = (parameters or {}).get(variable, ())
-        result[variable] = functions[variable], argument[1:] if isinstance(argument, tuple) else (argument,)
-    return result
 
 
 def _copied_ids(copy: int, value: Value) -> Value:
@@ -364,10 +359,13 @@ def _original_ids(value: Value) -> Value:
     """A result with the ids of the traffic file."""
     if isinstance(value, str):
         return re.sub(r"^([:!]?)\d+\.", r"\1", value)
-    if isinstance(value, dict):
-        return {_original_ids(key): _original_ids(element) for key, element in value.items()}
     return type(value)(map(_original_ids, value)) if type(value) in (list, tuple) else value
 
 
 def _constant(name: str) -> int:
     return int(getattr(real_traci().constants, name))
+
+
+@cache
+def _signature(domain: str, name: str) -> inspect.Signature:
+    return inspect.signature(getattr(getattr(real_traci(), domain), name))

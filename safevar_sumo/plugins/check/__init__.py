@@ -28,7 +28,7 @@ from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import ModelTable, Study, load_study, study_names
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.sumo.traci_module import substitute_traci
+from safevar_sumo.sumo.traci_controller import substitute_traci
 from safevar_sumo.vehicles import CHANGES, VEHICLES, Change
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
