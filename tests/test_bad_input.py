@@ -159,6 +159,7 @@ def test_bad_input_ends_with_code_2_and_changes_no_file(
 ) -> None:
     shutil.copytree(place, tmp_path / "here", symlinks=True)
     monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr("safevar_sumo.campaign.cluster.CONNECT_TIMEOUT", 0.5)
     refused(*typed.split(), message=(told,))
     after = {str(path.relative_to(tmp_path / "here")) for path in (tmp_path / "here").rglob("*")}
     before = {str(path.relative_to(place)) for path in place.rglob("*")}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import click
 import msgspec
@@ -17,34 +16,90 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
-from safevar_sumo.terminal import print_meanings, print_names, print_text
+from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import CHANGES, VEHICLES, CharacteristicSet
 
-SECTIONS = ("studies", "vehicles", "ads", "scenarios", "weathers", "algorithms", "metrics", "objectives")
+NAMES = {"name": "{name}", "description": "{description}"}
+TABLES = {
+    "studies": (
+        "Studies",
+        {
+            "name": "{name}",
+            "title": "{title}",
+            "vehicle, ADS, scenario, weather": "{vehicle}, {ads}, {scenario}, {weather}",
+        },
+    ),
+    "vehicles": (
+        "Vehicle {name}",
+        {"characteristic": "{name}", "unit": "{unit}"}
+        | {key: f"{{{key}:g}}" for key in ("original", "lower", "upper", "threshold")},
+    ),
+    "ads": ("ADSs", NAMES),
+    "scenarios": ("Scenarios", NAMES),
+    "weathers": (
+        "Weathers",
+        {
+            "name": "{name}",
+            "friction": "{road_friction:g}",
+            "visibility": "{visibility:g}",
+            "recognition\ndelay, s": "{recognition_delay:g}",
+            "light": "{light}",
+            "wet road": "{wet}",
+        },
+    ),
+    "algorithms": ("Algorithms", NAMES),
+    "metrics": ("Metrics", NAMES),
+    "objectives": ("Objectives (every metric can also be an objective)", NAMES),
+}
+"""Title of each section's table, and the layout of its cells by the column's head."""
 
 
 @commands.command(name="list")
-@click.argument("section", required=False, type=click.Choice(SECTIONS), metavar="[SECTION]")
+@click.argument("section", required=False, type=click.Choice(list(TABLES)), metavar="[SECTION]")
 @json_option
 def list_command(section: str | None, as_json: bool) -> None:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with SECTION, such as
     weathers, only these.
     """
     studies = [load_study(name) for name in study_names()]
+    characteristics = {study.vehicle.model: CharacteristicSet.of(study) for study in reversed(studies)}
+    catalogue = {key: rows for key, rows in _catalogue(studies, characteristics).items() if section in (None, key)}
     if as_json:
-        catalogue = _catalogue(studies)
-        print_json({section: catalogue[section]} if section else catalogue)
-    else:
-        _print_catalogue(Console(), studies, [section] if section else SECTIONS)
+        print_json(catalogue)
+        return
+    console = Console()
+    for key, rows in catalogue.items():
+        for owner in rows if key == "vehicles" else [{"name": "", "characteristics": rows}]:
+            title, columns = TABLES[key]
+            table = WholeTable(*columns, title=title.format_map(owner))
+            for row in owner["characteristics"]:
+                table.add_row(*(layout.format_map(row) for layout in columns.values()))
+            if table.row_count:
+                console.print(table)
+                print_meanings(console, characteristics.get(owner["name"], ()))
+    for name in (row["name"] for row in catalogue.get("weathers", ()) if equals_clear(WEATHERS[row["name"]])):
+        text = "no effect on road and sensors; an ADS drives as in clear weather unless its parameters differ."
+        print_text(console, f"{name}: {text}")
 
 
-def _catalogue(studies: list[Study]) -> JsonObject:
+def _catalogue(
+    studies: Sequence[Study], characteristics: Mapping[str, CharacteristicSet]
+) -> dict[str, list[JsonObject]]:
+    """All that studies can name, by section; `characteristics` by vehicle."""
     keys = ("name", "unit", "original", "lower", "upper", "threshold", "meaning", "counterpart")
-    characteristics = {
-        name: [{key: getattr(characteristic, key) for key in keys} for characteristic in members]
-        for name, members in _characteristics(studies).items()
+    objectives = {
+        **{name: f"The search drives {metric.name} to unsafe values." for name, metric in METRIC_OF_OBJECTIVE.items()},
+        **{change.name: f"{change.title.capitalize()} [{change.unit}]." for change in CHANGES.values()},
+        RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
     }
-    return {
+    descriptions: dict[str, Mapping[str, object]] = {
+        "ads": ADS,
+        "scenarios": SCENARIOS,
+        "algorithms": ALGORITHMS,
+        "metrics": {name: metric.description for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()},
+        "objectives": objectives,
+    }
+    sections: dict[str, list[JsonObject]] = {
         "studies": [
             {
                 "name": study.name,
@@ -56,87 +111,26 @@ def _catalogue(studies: list[Study]) -> JsonObject:
             }
             for study in studies
         ],
-        "vehicles": [{"name": name, "characteristics": characteristics.get(name, [])} for name in VEHICLES],
-        "ads": _described(ADS),
-        "scenarios": _described(SCENARIOS),
-        "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
-        "algorithms": _described(ALGORITHMS),
-        "metrics": [
-            {"name": name, "description": metric.description}
-            for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
-        ],
-        "objectives": [
-            *(
-                {"name": name, "description": f"The search drives {metric.name} to unsafe values."}
-                for name, metric in METRIC_OF_OBJECTIVE.items()
-            ),
-            *(
-                {"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."}
-                for change in CHANGES.values()
-            ),
+        "vehicles": [
             {
-                "name": RATING_POINTS.name,
-                "description": f"Only in studies that a protocol rates: {RATING_POINTS.description}",
-            },
+                "name": name,
+                "characteristics": [{key: getattr(one, key) for key in keys} for one in characteristics.get(name, ())],
+            }
+            for name in VEHICLES
         ],
+        "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
+        **{
+            key: [
+                {
+                    "name": name,
+                    "description": model if isinstance(model, str) else (model.__doc__ or "").partition("\n")[0],
+                }
+                for name, model in models.items()
+            ]
+            for key, models in descriptions.items()
+        },
     }
-
-
-def _characteristics(studies: list[Study]) -> dict[str, CharacteristicSet]:
-    """The characteristics of each vehicle, in the first study that has it."""
-    return {study.vehicle.model: CharacteristicSet.of(study) for study in reversed(studies)}
-
-
-def _described(models: Mapping[str, Callable[..., Any]]) -> list[dict[str, str]]:
-    """The names of models, and the first lines of their docstrings."""
-    return [
-        {"name": name, "description": (model.__doc__ or "").strip().partition("\n")[0]}
-        for name, model in models.items()
-    ]
-
-
-def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[str]) -> None:
-    catalogue = {key: rows if key in sections else [] for key, rows in _catalogue(studies).items()}
-
-    def show(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> None:
-        if rows:
-            print_names(console, title, rows, heads)
-
-    def numbers_as_text(row: JsonObject, *keys: str) -> tuple[str, ...]:
-        return tuple(f"{row[key]:g}" for key in keys)
-
-    study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]
-    show("Studies", study_rows, "name", "title", "vehicle, ADS, scenario, weather")
-    for vehicle in catalogue["vehicles"]:
-        keys = ("original", "lower", "upper", "threshold")
-        rows = [(row["name"], row["unit"], *numbers_as_text(row, *keys)) for row in vehicle["characteristics"]]
-        show(f"Vehicle {vehicle['name']}", rows, "characteristic", "unit", *keys)
-        print_meanings(console, _characteristics(studies).get(vehicle["name"], ()))
-    weather_rows = [
-        (
-            row["name"],
-            *numbers_as_text(row, "road_friction", "visibility", "recognition_delay"),
-            row["light"],
-            "wet" if row["wet"] else "dry",
-        )
-        for row in catalogue["weathers"]
-    ]
-    show("Weathers", weather_rows, "name", "friction", "visibility", "recognition\ndelay, s", "light", "road")
-    for name, *_ in weather_rows:
-        if equals_clear(WEATHERS[name]):
-            print_text(
-                console,
-                f"{name}: no effect on road and sensors; an ADS drives as in clear weather unless its parameters "
-                "differ.",
-            )
-    for title, key in (
-        ("ADSs", "ads"),
-        ("Scenarios", "scenarios"),
-        ("Algorithms", "algorithms"),
-        ("Metrics", "metrics"),
-        ("Objectives (every metric can also be an objective)", "objectives"),
-    ):
-        show(title, [(row["name"], row["description"]) for row in catalogue[key]], "name", "description")
+    return {key: sections[key] for key in TABLES}
 
 
 @commands.command(name="check")
