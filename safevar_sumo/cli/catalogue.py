@@ -69,7 +69,8 @@ def list_command(section: str | None, as_json: bool) -> None:
         return
     console = Console()
     for key, rows in catalogue.items():
-        for owner in rows if key == "vehicles" else [{"name": "", "characteristics": rows}]:
+        owners: list[JsonObject] = rows if key == "vehicles" else [{"name": "", "characteristics": rows}]
+        for owner in owners:
             title, columns = TABLES[key]
             table = WholeTable(*columns, title=title.format_map(owner))
             for row in owner["characteristics"]:

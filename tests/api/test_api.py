@@ -19,7 +19,6 @@ from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, wo
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-
 ARROW = Path(sys.prefix, "arrow")
 """Where `make .venv/installed-arrow` puts an engine for parquet."""
 
