@@ -115,23 +115,19 @@ def variation_mistakes(
 def _distribution_mistakes(
     source: object, key: str, row: CharacteristicTable, distribution: Distribution
 ) -> Iterator[InputError]:
-    domain_lower, domain_upper, unit = row.lower, row.upper, unit_text(row.unit)
-    for field, value in msgspec.structs.asdict(distribution).items():
-        if field not in ("deviation", "sigma") and value is not None and not domain_lower <= value <= domain_upper:
-            yield InputError(
-                source, f"{key}.{field} = {value:g}", f"a number in [{domain_lower:g}, {domain_upper:g}]{unit}"
-            )
-    if isinstance(distribution, Uniform | Triangular):
-        lower = domain_lower if distribution.lower is None else distribution.lower
-        upper = domain_upper if distribution.upper is None else distribution.upper
-        if lower >= upper:
-            yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
-        elif isinstance(distribution, Triangular) and not (
-            lower <= (mode := row.original if distribution.mode is None else distribution.mode) <= upper
-        ):
-            yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
-    elif isinstance(distribution, Lognormal) and domain_lower <= 0:
-        yield InputError(source, f"{key}: lognormal, with a domain that begins at {domain_lower:g}", "a domain above 0")
+    unit = unit_text(row.unit)
+    stated = {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
+    lower, upper = stated.get("lower", row.lower), stated.get("upper", row.upper)
+    mode = stated.get("mode", row.original)
+    for field, value in stated.items():
+        if field not in ("deviation", "sigma") and not row.lower <= value <= row.upper:
+            yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{row.lower:g}, {row.upper:g}]{unit}")
+    if lower >= upper:
+        yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
+    elif isinstance(distribution, Triangular) and not lower <= mode <= upper:
+        yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
+    elif isinstance(distribution, Lognormal) and row.lower <= 0:
+        yield InputError(source, f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0")
 
 
 def _correlation_mistakes(

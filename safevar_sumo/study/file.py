@@ -7,7 +7,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import tomli_w
@@ -51,6 +51,15 @@ class _RawStudy(NamedTuple):
     origin: Origin = Origin()
 
 
+class _FmuTable(msgspec.Struct):
+    """A vehicle that is an FMU, whose rows of characteristics may be incomplete."""
+
+    model: str
+    kind: Literal["fmu"]
+    characteristics: dict[str, Parameters] = {}
+    parameters: Parameters = {}
+
+
 def load_study(study: StudyLike, **changes: Any) -> Study:
     """Read a study strictly.
 
@@ -91,34 +100,22 @@ def _checked_study(raw: _RawStudy) -> Study:
 
 def _with_fmu(raw: _RawStudy) -> Parameters:
     """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
-    tables = raw.tables
-    vehicle = tables.get("vehicle")
-    if (
-        not isinstance(vehicle, dict)
-        or vehicle.get("kind") != "fmu"
-        or not isinstance(model := vehicle.get("model"), str)
-    ):
-        return tables
-    stated_rows, parameters = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
-    if not (
-        isinstance(stated_rows, dict)
-        and isinstance(parameters, dict)
-        and all(isinstance(row, dict) for row in stated_rows.values())
-    ):
-        return tables
+    try:
+        vehicle = msgspec.convert(raw.tables.get("vehicle"), _FmuTable)
+    except msgspec.ValidationError:
+        return raw.tables  # no FMU, or mistakes that the schema of the study finds
     from safevar_sumo.fmu.description import description_of, file_of  # only a study with an FMU needs FMPy
 
-    is_complete = stated_rows and all(
-        {"unit", "original", "lower", "upper"} <= row.keys() for row in stated_rows.values()
-    )
-    if is_complete and not file_of(model, raw.origin.places):
-        return tables  # so results can be read without their FMU
-    description = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
+    stated = vehicle.characteristics
+    is_complete = stated and all({"unit", "original", "lower", "upper"} <= row.keys() for row in stated.values())
+    if is_complete and not file_of(vehicle.model, raw.origin.places):
+        return raw.tables  # so results can be read without their FMU
+    description = description_of(vehicle.model, raw.origin.places, str(raw.source), "vehicle.model")
     rows = {
-        **description.table_rows(parameters),
-        **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()},
+        **description.table_rows(vehicle.parameters),
+        **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated.items()},
     }
-    return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
+    return {**raw.tables, "vehicle": {**raw.tables["vehicle"], "characteristics": rows}}
 
 
 def _with_parameters(tables: Parameters, name: str, record: type[SearchTable | RepairTable]) -> Parameters:

@@ -70,7 +70,7 @@ def limit_mistakes(
     breaks.
     """
     for name, limit in limits.items():
-        key, sides = f"{table}{name}", ((">=", "at_least", limit.at_least), ("<=", "at_most", limit.at_most))
+        key = f"{table}{name}"
         if name not in rows:
             yield unknown_name(source, f"{key}: there is no such characteristic", name, rows)
             continue
@@ -78,19 +78,15 @@ def limit_mistakes(
         low, high = limit.interval(row)
         if limit.at_least is None and limit.at_most is None:
             yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
-        elif limit.at_least is not None and limit.at_most is not None and low > high:
+        elif low > high and None not in (limit.at_least, limit.at_most):
             yield InputError(source, f"{key}: at least {low:g} and at most {high:g}{unit}", "at_least <= at_most")
-        for sign, side, value in sides:
-            if value is None:
-                continue
-            text = f"{key}.{side} = {value:g}" if table else f"{key} {sign} {value:g}"
-            if not row.lower <= value <= row.upper:
-                yield InputError(
-                    source, f"{text} is outside its domain", f"a number in [{row.lower:g}, {row.upper:g}]{unit}"
+        legal_sides = ((">=", "at_least", row.lower, row.original), ("<=", "at_most", row.original, row.upper))
+        for sign, side, lower, upper in legal_sides:
+            value = getattr(limit, side)
+            if value is not None and not lower <= value <= upper:
+                text = f"{key}.{side} = {value:g}" if table else f"{key} {sign} {value:g}"
+                inside = row.lower <= value <= row.upper
+                why = (
+                    f": the original, {row.original:g}{unit}, does not keep it" if inside else " is outside its domain"
                 )
-            elif row.original < value if side == "at_least" else row.original > value:
-                yield InputError(
-                    source,
-                    f"{text}: the original, {row.original:g}{unit}, does not keep it",
-                    f"a number {'up to' if side == 'at_least' else 'of at least'} {row.original:g}{unit}",
-                )
+                yield InputError(source, f"{text}{why}", f"a number in [{lower:g}, {upper:g}]{unit}")
