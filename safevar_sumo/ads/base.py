@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.plugins import Guard, open_rows, read_only_copy
+from safevar_sumo.plugins import SHARE, TRUTH, Guard, open_rows, read_only_copy
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
@@ -88,7 +88,9 @@ class GuardedAds(Ads):
 
     def warns(self, memory: Memory) -> BoolArray | None:
         warned = self._guard.call("warns", self._ads.warns, memory)
-        return None if warned is None else self._guard.booleans("warns", "warnings", warned, (self._vehicle_count,))
+        return (
+            None if warned is None else self._guard.numbers("warns", "warnings", warned, (self._vehicle_count,), TRUTH)
+        )
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         self._vehicle_count = n
@@ -98,12 +100,8 @@ class GuardedAds(Ads):
         result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
         command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
         throttle, brake = self._guard.elements("drive", command, "(Command(throttle, brake), memory)")
-        return Command(
-            self._checked_pedal("throttle", throttle, seen), self._checked_pedal("brake", brake, seen)
-        ), memory
-
-    def _checked_pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
-        return self._guard.numbers("drive", name, value, seen.speed.shape, lowest=0.0, highest=1.0)
+        pedals = {"throttle": throttle, "brake": brake}.items()
+        return Command(*(self._guard.numbers("drive", *pedal, seen.speed.shape, SHARE) for pedal in pedals)), memory
 
 
 class PerVehicleAds(Ads):
@@ -134,8 +132,8 @@ class PerVehicleAds(Ads):
                 return throttle, brake  # the fast path: this runs for every vehicle in every step
         throttle, brake = self._guard.elements("drive", command, "(throttle, brake), each in [0, 1]")
         return (
-            float(self._guard.numbers("drive", "throttle", throttle, (), lowest=0.0, highest=1.0)),
-            float(self._guard.numbers("drive", "brake", brake, (), lowest=0.0, highest=1.0)),
+            float(self._guard.numbers("drive", "throttle", throttle, (), SHARE)),
+            float(self._guard.numbers("drive", "brake", brake, (), SHARE)),
         )
 
 

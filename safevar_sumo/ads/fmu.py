@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.ads.base import Ads, Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError
 from safevar_sumo.fmu import Description, Fleet, History, Instances, constants_of, ports_of
-from safevar_sumo.plugins import Guard
+from safevar_sumo.plugins import SHARE, Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 from safevar_sumo.study.schema import Parameters
 
@@ -132,7 +132,7 @@ class FmuAds(Ads):
         zeros = np.zeros_like(seen.speed)
         return Command(
             *(
-                self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, lowest=0.0, highest=1.0)
+                self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, SHARE)
                 for name in Command._fields
             )
         ), memory

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.plugins import Guard, read_only_copy
+from safevar_sumo.plugins import Guard, Legal, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable, unit_text
 
@@ -136,7 +136,7 @@ def guard_metric(metric: Any, guard: Guard) -> Metric:
 
     def guarded_function(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
         values = guard.call(facts.name, metric.function, read_only_copy(runs), thresholds)
-        return guard.numbers(facts.name, "values", values, (len(runs.outcome),), undefined=True)
+        return guard.numbers(facts.name, "values", values, (len(runs.outcome),), Legal(undefined=True))
 
     return Metric(**{name: getattr(facts, name) for name in MetricFacts.__struct_fields__}, function=guarded_function)
 

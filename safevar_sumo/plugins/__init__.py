@@ -16,7 +16,13 @@ from safevar_sumo.plugins.files import (
     unload_user_modules as unload_user_modules,
 )
 from safevar_sumo.plugins.guard import (
+    FINITE as FINITE,
+    POSITIVE as POSITIVE,
+    SHARE as SHARE,
+    TRUTH as TRUTH,
     Guard as Guard,
+    Legal as Legal,
+    abstract_methods as abstract_methods,
     accepts as accepts,
     check_open_runs as check_open_runs,
     open_rows as open_rows,

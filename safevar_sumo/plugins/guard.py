@@ -6,7 +6,7 @@ import inspect
 import os
 import traceback
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass, replace
@@ -24,6 +24,8 @@ Result = TypeVar("Result")
 UserValue = Any
 """What user code returns, before it is checked."""
 INFINITY = float("inf")
+ABSTRACT = "__isabstractmethod__"
+"""Attribute of an abstract method."""
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
@@ -35,30 +37,20 @@ def violation(candidate: Any, base: type) -> str:
     there. The class need not derive from the base: see `completed`.
     """
     if not inspect.isclass(candidate):
-        value = f"value of type {type(candidate).__name__}"
-        return (
-            f"is a {'module' if inspect.ismodule(candidate) else 'function' if callable(candidate) else value}, "
-            "not a class"
-        )
+        return f"is a {type(candidate).__name__}, not a class"
     for name, parameters in _methods(base).items():
-        attribute, signature = getattr(candidate, name, getattr(base, name)), ", ".join(parameters)
-        if getattr(attribute, "__isabstractmethod__", False):
-            return f"has no method {name}({signature})"
-        if not callable(attribute):
-            return f"has {name} = {attribute!r} instead of a method {name}({signature})"
+        attribute, method = getattr(candidate, name, getattr(base, name)), f"{name}({', '.join(parameters)})"
+        if hasattr(attribute, ABSTRACT) or not callable(attribute):
+            return f"has no method {method}"
         takes_self = inspect.isfunction(inspect.getattr_static(candidate, name, getattr(base, name)))
         if not accepts(attribute, takes_self + len(parameters)):
-            return f"has a method {name} that does not take ({signature})"
+            return f"has a method {name} that does not take ({', '.join(parameters)})"
     return ""
 
 
 def contract_of(base: type) -> str:
     """What a class of this base must have, in words."""
-    methods = [
-        f"{name}({', '.join(parameters)})"
-        for name, parameters in _methods(base).items()
-        if getattr(getattr(base, name), "__isabstractmethod__", False)
-    ]
+    methods = [f"{name}({', '.join(parameters)})" for name, parameters in abstract_methods(base).items()]
     return f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with {', '.join(methods)}"
 
 
@@ -67,18 +59,17 @@ def completed(candidate: type, base: type) -> type:
     return candidate if issubclass(candidate, base) else types.new_class(candidate.__name__, (candidate, base))
 
 
-def _methods(base: type) -> dict[str, tuple[str, ...]]:
+def abstract_methods(base: type) -> dict[str, list[str]]:
+    """The methods that a class of this base must have, and the names of their parameters without default."""
+    return {name: names for name, names in _methods(base).items() if hasattr(getattr(base, name), ABSTRACT)}
+
+
+def _methods(base: type) -> dict[str, list[str]]:
     """The public methods of a class, and the names of their parameters without default."""
-    functions = {
-        name: value for name, value in vars(base).items() if inspect.isfunction(value) and not name.startswith("_")
-    }
     return {
-        name: tuple(
-            parameter.name
-            for parameter in inspect.signature(function).parameters.values()
-            if parameter.default is parameter.empty
-        )[1:]
-        for name, function in functions.items()
+        name: [each.name for each in inspect.signature(method).parameters.values() if each.default is each.empty][1:]
+        for name, method in vars(base).items()
+        if inspect.isfunction(method) and not name.startswith("_")
     }
 
 
@@ -127,6 +118,30 @@ def open_rows(holds: BoolArray) -> IntArray:
     """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
     are_open = _open_runs.get()
     return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
+
+
+class Legal(NamedTuple):
+    """Legal numbers: from `lowest`, or above it, to `highest`; `infinite` and `undefined` allow infinities and NaN."""
+
+    lowest: float = -INFINITY
+    highest: float = INFINITY
+    above: bool = False
+    infinite: bool = False
+    undefined: bool = False
+    kinds: str = "biuf"  # numpy's letters of the legal types
+
+    def __str__(self) -> str:
+        bounds = f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
+        return "truth values" if self is TRUTH else f"numbers {bounds}{'' if self.infinite else ', finite'}"
+
+    def holds(self, numbers: FloatArray) -> BoolArray:
+        """Which numbers are legal."""
+        is_legal = (numbers > self.lowest) if self.above else (numbers >= self.lowest)
+        is_legal &= (numbers <= self.highest) & (self.infinite | np.isfinite(numbers))
+        return np.asarray(is_legal | (self.undefined & np.isnan(numbers)))
+
+
+FINITE, POSITIVE, SHARE, TRUTH = Legal(), Legal(0.0, above=True), Legal(0.0, 1.0), Legal(kinds="b")
 
 
 class Guard(NamedTuple):
@@ -217,61 +232,44 @@ class Guard(NamedTuple):
         except AttributeError:
             raise self._wrong_result(_short_text(value), method, f"an object with the attribute {name}") from None
 
-    def numbers(
+    def columns(
         self,
         method: str,
-        quantity: str,
         value: UserValue,
         shape: tuple[int, ...],
-        lowest: float = -INFINITY,
-        highest: float = INFINITY,
-        *,
-        above: bool = False,
-        infinite: bool = False,
-        undefined: bool = False,
-    ) -> FloatArray:
-        """A result as a new array of float64; wrong values of runs that have ended become 0.
+        legal: Mapping[str, Legal],
+        scalars: Collection[str] = (),
+    ) -> dict[str, Any]:
+        """The attributes of a result that are named in `legal`, each checked; those in `scalars` are single numbers."""
+        shapes = {name: () if name in scalars else shape for name in legal}
+        columns = {
+            name: self.numbers(method, name, self.field(method, value, name), shapes[name], each)
+            for name, each in legal.items()
+        }
+        return {name: column.item() if name in scalars else column for name, column in columns.items()}
 
-        Parameters
-        ----------
-        shape
-            Expected shape; a single number is accepted as the value of all elements.
-        lowest, highest
-            Bounds; `above` excludes `lowest` itself.
-        infinite, undefined
-            Whether infinities and NaN are legal.
-        """
-        bounds = f"{'above' if above else 'from'} {lowest:g} to {highest:g}"
-        expected = f"numbers {bounds}, {'' if infinite else 'finite, '}shape {shape}"
-        numbers = self._array(method, quantity, value, shape, "biuf", expected).astype(float)
-        is_valid = (numbers > lowest) if above else (numbers >= lowest)
-        is_valid &= numbers <= highest
-        if not infinite:
-            is_valid &= np.isfinite(numbers)
-        if undefined:
-            is_valid |= np.isnan(numbers)
-        if not is_valid.all():
-            for row in open_rows(~is_valid)[:1]:
-                raise self.wrong_value(method, quantity, float(numbers.flat[row]), expected)
-            numbers[~is_valid] = 0.0
-        return numbers
-
-    def booleans(self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...]) -> BoolArray:
-        """A result as a new array of bool."""
-        return self._array(method, quantity, value, shape, "b", f"truth values, shape {shape}").astype(bool)
-
-    def _array(
-        self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...], kinds: str, expected: str
+    def numbers(
+        self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...], legal: Legal = FINITE
     ) -> np.ndarray:
+        """A result as a new array of float64, or of bool; wrong values of runs that have ended become 0.
+
+        A single value is accepted as the value of all elements.
+        """
+        expected = f"{legal}, shape {shape}"
         try:
             array = np.asarray(value)
         except ValueError:
             raise self.wrong_value(method, quantity, value, expected) from None
-        if array.dtype.kind not in kinds:
+        if array.dtype.kind not in legal.kinds:
             raise self.wrong_value(method, quantity, value, expected)
         if array.shape not in (shape, ()):
             raise self._wrong_result(f"{quantity} of shape {array.shape}", method, expected)
-        return np.broadcast_to(array, shape)
+        numbers = np.broadcast_to(array, shape).astype(bool if legal is TRUTH else float)
+        is_legal = legal.holds(numbers)
+        for row in open_rows(~is_legal)[:1]:
+            raise self.wrong_value(method, quantity, float(numbers.flat[row]), expected)
+        numbers[~is_legal] = 0
+        return numbers
 
     def _place(self, error: BaseException) -> str:
         """File and line of the innermost frame in user code; "" if there is none."""

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Guard, read_only_copy
+from safevar_sumo.plugins import FINITE, TRUTH, Guard, Legal, read_only_copy
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
@@ -296,6 +296,14 @@ MAX_TEST_SPEED = 100.0
 """Highest speed of a test [m/s]."""
 
 
+LEGAL_SCENE = {
+    **dict.fromkeys(Scene._fields, FINITE),
+    "gap": Legal(infinite=True),
+    **dict.fromkeys(("over", "visible"), TRUTH),
+}
+LEGAL_ENCOUNTER = {**dict.fromkeys(Encounter._fields, Legal(infinite=True, undefined=True)), "in_conflict": TRUTH}
+
+
 class GuardedScenario(Scenario):
     """Guards a user's scenario: passes read-only copies to it, and checks its results."""
 
@@ -304,42 +312,28 @@ class GuardedScenario(Scenario):
     test_speed: float | None = None
 
     def __init__(self, scenario: Scenario, guard: Guard) -> None:
-        self._scenario = scenario
-        self._guard = guard
-        network = guard.field("__init__", scenario, "network")
-        if not isinstance(network, str):
-            raise guard.wrong_value("__init__", "network", network, "the name or path of a folder with a network")
-        self.network = network
-        duration = guard.numbers(
-            "__init__",
-            "duration",
-            guard.field("__init__", scenario, "duration"),
-            shape=(),
-            lowest=0.0,
-            highest=MAX_DURATION,
-            above=True,
-        )
-        self.duration = float(duration)
-        self.grade = float(
-            guard.numbers("__init__", "grade", scenario.grade, shape=(), lowest=-MAX_GRADE, highest=MAX_GRADE)
-        )
-        if (speed := scenario.test_speed) is not None:
-            self.test_speed = float(
-                guard.numbers("__init__", "test_speed", speed, (), lowest=0.0, highest=MAX_TEST_SPEED, above=True)
-            )
+        self._scenario, self._guard = scenario, guard
+        self.network = guard.field("__init__", scenario, "network")
+        if not isinstance(self.network, str):
+            expected = "the name or path of a folder with a network"
+            raise guard.wrong_value("__init__", "network", self.network, expected)
+        legal = {"duration": Legal(0.0, MAX_DURATION, above=True), "grade": Legal(-MAX_GRADE, MAX_GRADE)}
+        if scenario.test_speed is not None:
+            legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
+        vars(self).update(guard.columns("__init__", scenario, (), legal, scalars=legal))
         self.reactive_actors, self.centre_to_centre = bool(scenario.reactive_actors), bool(scenario.centre_to_centre)
         self.pre_crash = str(scenario.pre_crash)
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        return self._changes("lanes", "the network", self._scenario.lanes, roads)
+        return self._changes("lanes", self._scenario.lanes, roads)
 
     def actors(self, roads: Roads) -> XmlChanges:
-        return self._changes("actors", "the traffic file", self._scenario.actors, roads)
+        return self._changes("actors", self._scenario.actors, roads)
 
-    def _changes(self, method: str, file: str, function: Callable[[Roads], XmlChanges], roads: Roads) -> XmlChanges:
+    def _changes(self, method: str, function: Callable[[Roads], XmlChanges], roads: Roads) -> XmlChanges:
         changes = self._guard.call(method, function, roads)
         if not isinstance(changes, Mapping):
-            raise self._guard.wrong_value(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
+            raise self._guard.wrong_value(method, "changes", changes, "a mapping from XPaths to attributes")
         return {
             str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
             for path, change in changes.items()
@@ -352,37 +346,23 @@ class GuardedScenario(Scenario):
         return self._guard.call("begin", self._scenario.begin, _ReadOnlyWorld(world))
 
     def observe(self, world: World, step: float, memory: ScenarioMemory) -> tuple[Scene, ScenarioMemory]:
-        n = len(world.vehicle_positions("vut"))
         result = self._guard.call("observe", self._scenario.observe, _ReadOnlyWorld(world), step, memory)
         scene, memory = self._guard.elements("observe", result, "(Scene, memory)")
-        values: dict[str, Any] = {}
-        for name in Scene._fields:
-            value = self._guard.field("observe", scene, name)
-            if name in ("over", "visible"):
-                values[name] = self._guard.booleans("observe", name, value, (n,))
-            else:
-                values[name] = self._guard.numbers("observe", name, value, (n,), infinite=(name == "gap"))
-        return Scene(**values), memory
+        return Scene(**self._guard.columns("observe", scene, world.speeds().shape, LEGAL_SCENE)), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        encounter = self._guard.call("encounter", self._scenario.encounter, read_only_copy(trace))
-        shape = trace.speed.shape
-        values = {name: self._guard.field("encounter", encounter, name) for name in Encounter._fields}
-        in_conflict = self._guard.booleans("encounter", "in_conflict", values.pop("in_conflict"), shape)
-        is_counted = in_conflict & trace.active
-        numbers = {
-            name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
-            for name, value in values.items()
-        }
-        for name, array in numbers.items():
-            if np.isnan(array[is_counted]).any():
+        result = self._guard.call("encounter", self._scenario.encounter, read_only_copy(trace))
+        encounter = Encounter(**self._guard.columns("encounter", result, trace.speed.shape, LEGAL_ENCOUNTER))
+        is_counted = encounter.in_conflict & trace.active
+        for name, values in zip(Encounter._fields, encounter, strict=True):
+            if np.isnan(values[is_counted]).any():
                 raise self._guard.wrong_value("encounter", name, float("nan"), "numbers wherever in_conflict is true")
-        least = np.where(is_counted, numbers["separation"], np.inf).min(axis=0)
+        least = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
         if (is_counted.any(axis=0) & (least == np.inf)).any():
             raise self._guard.wrong_value(
                 "encounter", "separation", float("inf"), "a finite number at some time that in_conflict is true"
             )
-        return Encounter(**numbers, in_conflict=in_conflict)
+        return encounter
 
 
 class _ReadOnlyWorld:

@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
-from safevar_sumo.plugins import Guard, read_only_copy
+from safevar_sumo.plugins import Guard, Legal, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
@@ -106,9 +106,8 @@ class GuardedAlgorithm(Algorithm):
             raise self._guard.wrong_value("search", "settings", output, expected)
         settings = self._guard.numbers("search", "settings", output, output.shape)
         for characteristic, values in zip(characteristics, settings.T, strict=True):
-            self._guard.numbers(
-                "search", characteristic.name, values, (len(settings),), characteristic.lower, characteristic.upper
-            )
+            legal = Legal(characteristic.lower, characteristic.upper)
+            self._guard.numbers("search", characteristic.name, values, (len(settings),), legal)
         unfiltered_values = np.argwhere(characteristics.filter(settings) != settings)
         if len(unfiltered_values):
             row, column = unfiltered_values[0]

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.plugins import Guard, open_rows, read_only_copy
+from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Guard, Legal, open_rows, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
@@ -195,9 +195,12 @@ def pedals_on_slope(back: float | FloatArray, drive: FloatArray, brake: FloatArr
 HIGHEST_SPEED = 1000.0
 """Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
 SPEED_ROUNDING = 1e-9  # relative tolerance of speeds
-_LEGAL_RANGES = {"speed": (0.0, HIGHEST_SPEED), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
-_MAY_BE_INFINITE = ("gap", "lateral")
-"""Quantities of an observation that are infinite while no obstacle is detected."""
+LEGAL_STATE = {"speed": Legal(0.0, HIGHEST_SPEED), "throttle": SHARE, "brake": SHARE, "gear": FINITE}
+LEGAL_SENSORS = {"latency": Legal(0.0), "reach": Legal(0.0, infinite=True), "scale": POSITIVE}
+LEGAL_OBSERVATION = {
+    **dict.fromkeys(Observation._fields, FINITE),
+    **dict.fromkeys(("gap", "lateral"), Legal(infinite=True)),  # while no obstacle is detected
+}
 
 
 class _Prepared(NamedTuple):
@@ -225,12 +228,9 @@ class GuardedVehicle(Vehicle):
 
     def __init__(self, vehicle: Any, guard: Guard) -> None:
         self.model, self._guard = vehicle, guard
-        units = guard.field("__init__", vehicle, "UNITS")
-        if not isinstance(units, Mapping) or not all(isinstance(text, str) for item in units.items() for text in item):
-            raise guard.wrong_value(
-                "__init__", "UNITS", units, "a mapping from names of characteristics to their units"
-            )
-        self.UNITS = dict(units)
+        self.UNITS = guard.field("__init__", vehicle, "UNITS")
+        if not isinstance(self.UNITS, Mapping):
+            raise guard.wrong_value("__init__", "UNITS", self.UNITS, "units of the characteristics by name")
 
     def prepare(
         self,
@@ -240,108 +240,64 @@ class GuardedVehicle(Vehicle):
         slope: Slope = LEVEL,
         wet: bool | BoolArray = False,
     ) -> _Prepared:
-        n, road = (
-            len(next(iter(characteristics.values()))),
-            (slope, wet) if np.any(wet) else (slope,) if slope is not LEVEL else (),
-        )
+        n = len(next(iter(characteristics.values())))
+        road = (slope, wet) if np.any(wet) else (slope,) if slope is not LEVEL else ()
         arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)
         constants = self._guard.call("prepare", self.model.prepare, *arguments)
         types = self._guard.call("sumo_type", self.model.sumo_type, constants)
-        return _Prepared(
-            n,
-            constants,
-            SumoType(
-                *(
-                    self._guard.numbers(
-                        "sumo_type", name, self._guard.field("sumo_type", types, name), (n,), lowest=0.0, above=True
-                    )
-                    for name in SumoType._fields
-                )
-            ),
-        )
+        legal = dict.fromkeys(SumoType._fields, POSITIVE)
+        return _Prepared(n, constants, SumoType(**self._guard.columns("sumo_type", types, (n,), legal)))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._checked_state(
-            "at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.constants)
-        )
-        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), lowest=0.0, highest=0.0)
+        state = self._next_state("at_rest", prepared)
+        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), Legal(0.0, 0.0))
         return state
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
-        state = self._guard.call("at_speed", self.model.at_speed, prepared.constants, read_only_copy(speed))
-        return self._checked_state("at_speed", prepared.n, state)
+        return self._next_state("at_speed", prepared, speed)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
-        held = self._guard.call(
-            "hold_gear", self.model.hold_gear, prepared.constants, state.model_state, read_only_copy(holds)
-        )
-        return self._checked_state("hold_gear", prepared.n, held)
+        return self._next_state("hold_gear", prepared, state, holds)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
-        sensors = self._guard.call("sensors", self.model.sensors, prepared.constants)
-        return (
-            sensors
-            if sensors is None
-            else Sensors(
-                *(
-                    self._guard.numbers(
-                        "sensors",
-                        name,
-                        self._guard.field("sensors", sensors, name),
-                        (prepared.n,),
-                        lowest=0.0,
-                        above=name == "scale",
-                        infinite=name == "reach",
-                    )
-                    for name in Sensors._fields
-                )
-            )
-        )
+        sensors = self._result("sensors", prepared)
+        if sensors is None:
+            return None
+        return Sensors(**self._guard.columns("sensors", sensors, (prepared.n,), LEGAL_SENSORS))
 
     def require_sensors(self) -> None:
         """Refuse a model without a method `sensors`: a controller that reads through TraCI bypasses `sense`."""
         if type(self.model).sensors is Vehicle.sensors:
-            problem = (
-                f"{self._guard.name} has no method sensors, and a controller that reads through TraCI bypasses sense"
+            raise UserCodeError(
+                self._guard.source,
+                f"{self._guard.name} has no method sensors, and a controller that reads through TraCI bypasses sense",
+                "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None",
             )
-            expected = (
-                "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None"
-            )
-            raise UserCodeError(self._guard.source, problem, expected)
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        result = self._guard.call(
-            "sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen)
-        )
+        result = self._result("sense", prepared, state, seen)
         sensed, next_state = self._guard.elements("sense", result, "(Observation, state)")
-        values: dict[str, Any] = {}
-        for name, value in seen._asdict().items():
-            shape = (prepared.n,) if hasattr(value, "shape") else ()
-            numbers = self._guard.numbers(
-                "sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _MAY_BE_INFINITE
-            )
-            values[name] = numbers if shape else float(numbers)
-        return Observation(**values), self._checked_state("sense", prepared.n, next_state)
+        scalars = [name for name, value in seen._asdict().items() if not hasattr(value, "shape")]
+        columns = self._guard.columns("sense", sensed, (prepared.n,), LEGAL_OBSERVATION, scalars)
+        return Observation(**columns), self._checked("sense", prepared, next_state)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        result = self._guard.call(
-            "advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command)
-        )
-        state, max_speed = self._checked_state("advance", prepared.n, result), prepared.types.max_speed
+        state, max_speed = self._next_state("advance", prepared, state, command), prepared.types.max_speed
         for i in open_rows(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
-            raise self._guard.wrong_value(
-                "advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type"
-            )
+            expected = f"up to max_speed = {max_speed[i]:g} of its sumo_type"
+            raise self._guard.wrong_value("advance", "speed", float(state.speed[i]), expected)
         return state
 
-    def _checked_state(self, method: str, n: int, model_state: State) -> _State:
-        columns = {
-            name: self._guard.numbers(
-                method, name, self._guard.field(method, model_state, name), (n,), *_LEGAL_RANGES.get(name, ())
-            )
-            for name in _State._fields[:-1]
-        }
-        return _State(**columns, model_state=model_state)
+    def _next_state(self, method: str, prepared: _Prepared, *arguments: object) -> _State:
+        return self._checked(method, prepared, self._result(method, prepared, *arguments))
+
+    def _result(self, method: str, prepared: _Prepared, *arguments: object) -> Any:
+        """What a method of the user's model returns; it gets its own constants and state as it returned them."""
+        own = [each.model_state if isinstance(each, _State) else read_only_copy(each) for each in arguments]
+        return self._guard.call(method, getattr(self.model, method), prepared.constants, *own)
+
+    def _checked(self, method: str, prepared: _Prepared, state: State) -> _State:
+        return _State(**self._guard.columns(method, state, (prepared.n,), LEGAL_STATE), model_state=state)

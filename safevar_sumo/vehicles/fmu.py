@@ -22,11 +22,11 @@ from safevar_sumo.fmu import (
     declared,
     ports_of,
 )
-from safevar_sumo.plugins import Guard, open_rows
+from safevar_sumo.plugins import POSITIVE, Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
 from safevar_sumo.study.schema import Parameters
-from safevar_sumo.vehicles.base import HIGHEST_SPEED, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType, Vehicle
+from safevar_sumo.vehicles.base import LEGAL_STATE, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
@@ -260,9 +260,7 @@ class FmuVehicle(Vehicle):
 
         types = SumoType(
             *(
-                self._guard.numbers(
-                    "sumo_type", name, quantity_values(self._type_entries[name], name), (n,), 0.0, above=True
-                )
+                self._guard.numbers("sumo_type", name, quantity_values(self._type_entries[name], name), (n,), POSITIVE)
                 for name in TYPE_UNITS
             )
         )
@@ -341,9 +339,7 @@ class FmuVehicle(Vehicle):
         n = command.throttle.shape
         speed = np.where(np.abs(outputs["speed"]) < SPEED_ROUNDING, 0.0, outputs["speed"])
         values = {"gear": np.ones(n), **command._asdict(), **outputs, "speed": speed}
-        bounds = {"speed": (0.0, HIGHEST_SPEED), "gear": (-np.inf, np.inf)}
         columns = {
-            name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0)))
-            for name in _State._fields[:4]
+            name: self._guard.numbers("doStep", name, values[name], n, legal) for name, legal in LEGAL_STATE.items()
         }
         return _State(**columns, seen=seen, history=history)
