@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.errors import unknown_name
-from safevar_sumo.scenarios.ahead import Along
+from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION,
     SPEED_DIMENSION,
@@ -21,7 +21,6 @@ from safevar_sumo.scenarios.base import (
     Scene,
     World,
 )
-from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.study import Weather

@@ -1,32 +1,33 @@
-"""A target ahead in the vehicle's lane: what `car_to_car` and `along` share, and Euro NCAP's tests with a pedestrian
-(CPLA) or a cyclist (CBLA) who moves along the lane.
+"""Targets ahead in the vehicle's lane: Euro NCAP's tests with a pedestrian (CPLA) or a cyclist (CBLA) who moves along
+the lane, and its rear-end tests: a car stands (CCRs), is slower (CCRm), brakes (CCRb); a motorcyclist stands (CMRs),
+brakes (CMRb).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Coordinates, Frame, Grade, PreCrash, Roads, World, XmlChanges
+from safevar_sumo.scenarios.base import Coordinates, Frame, PreCrash, Roads, World, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import (
     BODIES,
     EXIT_LANE,
+    JUNCTION,
     JUNCTION_LANE,
     KMH,
     SAME_DIRECTION,
     VUT_LANE,
-    VUT_LENGTH,
-    VUT_WIDTH,
     BodySize,
     Direction,
-    ImpactLocation,
-    ProtocolRange,
+    Heading,
     SpeedProfile,
     change_target_lanes,
     lateral_offset,
@@ -49,115 +50,117 @@ FRONT_POSITION = 0.5
 """Position of a rotated target's front on the lane beyond the junction [m]; SUMO cannot insert a vehicle on the
 junction itself.
 """
+REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
+"""Targets without a type in the traffic file, each with the type that it replaces."""
+FINAL_SPEED = 2.0
+"""Speed at which the braking target stops braking [km/h]."""
+STEADY_SPEED_LIMIT = 80.0
+"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower.
+"""
 
 
-class TargetAhead(NamedTuple):
-    """A target `gap` metres ahead of the vehicle under test; the function `speed_at` maps a time [s] to the target's
-    speed [m/s].
+class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see `TargetTest`.
 
-    The middle of the target's rear is `offset` metres right of the lane's middle. A standing target may be rotated
-    around that point.
+    The middle of the target's rear is at the impact location. A standing target may be rotated around that point.
     """
 
-    target: str
-    vut: BodySize
-    gap: float
-    offset: float
-    speed_at: Callable[[float], float]
-    direction: Direction = SAME_DIRECTION
+    @property
+    def gap(self) -> float:
+        """Gap to the target at the start [m]."""
+        raise NotImplementedError
+
+    @property
+    def target_speed_at(self) -> Callable[[float], float]:
+        """The target's speed [m/s] as a function of the time [s]."""
+        raise NotImplementedError
+
+    @property
+    def offset(self) -> float:
+        """Distance of the target's rear to the right of the lane's middle [m]."""
+        return lateral_offset(self.impact_location, self.vut_width)
+
+    @property
+    def direction(self) -> Direction:
+        """Direction of the target."""
+        return SAME_DIRECTION
+
+    @property
+    def _body(self) -> BodySize:
+        return BODIES[self.parameter("target")]
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes that turn the lanes into a rotated target's direction; its rear is on the junction, and its front on
         the exit lane.
         """
-        if not self._is_rotated:
+        direction = self.direction
+        if direction == SAME_DIRECTION:
             return {}
-        frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), self.direction, self._body.length
+        frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), direction, self._body.length
         rear = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
         entry, exit_ = (
             (rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION)
         )
-        return change_target_lanes(frame, entry, exit_, self.direction)
+        return change_target_lanes(frame, entry, exit_, direction)
 
-    def actors(self, vut_speed: float, roads: Roads) -> XmlChanges:
-        """The vehicle at `vut_speed` [m/s], and the target ahead of it."""
+    def actors(self, roads: Roads) -> XmlChanges:
+        """The vehicle at its speed, and the target ahead of it: in line with the lane, or rotated on the junction."""
+        name, direction = self.parameter("target"), self.direction
         if self.gap <= 0:
             raise InputError(
                 "scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead"
             )
-        start, target = self._place_at_junction(roads) if self._is_rotated else self._place_in_lane()
-        return {
-            "vType[@id='vut']": {"length": repr(self.vut.length), "width": repr(self.vut.width)},
-            "vehicle[@id='vut']": {"departPos": repr(start), "departSpeed": repr(vut_speed)},
-            **target,
-        }
-
-    def _place_in_lane(self) -> tuple[float, XmlChanges]:
-        """The vehicle's start on the straight road [m], and a target in line with the lane."""
-        old_type = REPLACED_TYPES.get(self.target, self.target)
-        new_type = {f"vType[@id='{old_type}']": target_type(self.target)} if old_type != self.target else {}
-        return START_POSITION, {
-            **new_type,
-            "vehicle[@id='target']": {
-                "type": self.target,
-                "departPos": repr(START_POSITION + self.gap + self._body.length),
-                "departPosLat": repr(-self.offset),
-                "departSpeed": repr(self.speed_at(0.0)),
-            },
-        }
-
-    def _place_at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
-        """The vehicle's start before the junction [m], and a rotated target on it."""
+        if direction == SAME_DIRECTION:
+            old = REPLACED_TYPES.get(name, name)
+            return {
+                **self._vehicle_at(START_POSITION),
+                **({f"vType[@id='{old}']": target_type(name)} if old != name else {}),
+                "vehicle[@id='target']": {
+                    "type": name,
+                    "departPos": repr(START_POSITION + self.gap + self._body.length),
+                    "departPosLat": repr(-self.offset),
+                    "departSpeed": repr(self.target_speed_at(0.0)),
+                },
+            }
         along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
-        start = along + FRONT_POSITION * self.direction.along - self._depth - self.gap
-        if start - self.vut.length < 0:
-            raise InputError("scenario.parameters", f"a gap of {self.gap:.0f} m is longer than the road")
-        parked = {f"vehicle[@id='parked_{size}']": None for size in ("small", "large")}
-        return start, {
-            **parked,
-            "vType[@id='target']": target_type(self.target),
-            "vehicle[@id='target']": {
-                "type": self.target,
-                "route": "beyond",
-                "departPos": repr(FRONT_POSITION),
-                "departPosLat": "0",
-                "departSpeed": "0",
-            },
+        rotated = {"type": name, "route": "beyond", "departPos": repr(FRONT_POSITION)}
+        return {
+            **self._vehicle_at(along + FRONT_POSITION * direction.along - self._depth - self.gap),
+            **{f"vehicle[@id='parked_{size}']": None for size in ("small", "large")},
+            "vType[@id='target']": target_type(name),
+            "vehicle[@id='target']": {**rotated, "departPosLat": "0", "departSpeed": "0"},
         }
 
-    def motion(self, world: World) -> TargetMotion:
-        """The motion of the target in a run."""
-        frame, depth = Frame.of(world.lane(VUT_LANE if self._is_rotated else ROAD_LANE)), self._depth
+    def _motion(self, world: World) -> TargetMotion:
+        direction, depth, offset, speed_at = self.direction, self._depth, self.offset, self.target_speed_at
+        frame = Frame.of(world.lane(ROAD_LANE if direction == SAME_DIRECTION else VUT_LANE))
 
         def target(positions: FloatArray, times: Times) -> Target:
             along = frame.along(positions)
-            return Target(along - depth, np.full_like(along, self.offset), speed=value_at(times, self.speed_at))
+            return Target(along - depth, np.full_like(along, offset), speed=value_at(times, speed_at))
 
-        mover = VehicleMover(self.target, self.direction, self.speed_at)
+        mover = VehicleMover(self.parameter("target"), direction, speed_at)
         return TargetMotion(frame, EncounterConstants(follows=True), mover, target)
-
-    @property
-    def _is_rotated(self) -> bool:
-        return self.direction != SAME_DIRECTION
-
-    @property
-    def _body(self) -> BodySize:
-        return BODIES[self.target]
 
     @property
     def _depth(self) -> float:
         """Distance along the lane from the first point of contact to the middle of the target's front [m]."""
-        if not self._is_rotated:
-            return self._body.length
-        (along, left), half = self.direction, self._body.width / 2
-        front = self._body.length * along, self._body.length * left - self.offset
-        rear = 0.0, -self.offset
-        corners = [(x - sign * left * half, y + sign * along * half) for x, y in (rear, front) for sign in (1, -1)]
-        return front[0] - _first_contact_position([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
+        (along, left), (length, width) = self.direction, self._body
+        if self.direction == SAME_DIRECTION:
+            return length
+        front, rear = (length * along, length * left - self.offset), (0.0, -self.offset)
+        ends = ((rear, 1), (rear, -1), (front, -1), (front, 1))
+        corners = [(x - sign * left * (width / 2), y + sign * along * (width / 2)) for (x, y), sign in ends]
+        return front[0] - _first_contact_position(corners, self.vut_width / 2)
 
-
-REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
-"""Targets without a type in the traffic file, each with the type that it replaces."""
+    def encounter(self, trace: Trace) -> Encounter:
+        """Distance from the front bumper to the target's body; TTC is this distance over the difference of speeds."""
+        return Encounter(
+            separation=trace.gap,
+            distance=trace.gap,
+            closing_speed=trace.speed - trace.obstacle_speed,
+            in_conflict=trace.gap > 0,
+        )
 
 
 def _first_contact_position(corners: list[Coordinates], half_width: float) -> float:
@@ -175,88 +178,7 @@ def _first_contact_position(corners: list[Coordinates], half_width: float) -> fl
     return min(positions or [x for x, _ in corners])
 
 
-class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario with a target ahead in the lane.
-
-    Parameters
-    ----------
-    speed
-        Speed of the vehicle under test at the start [km/h].
-    impact_location
-        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the
-        width].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
-    """
-
-    speed: Annotated[float, Meta(gt=0, le=250)]
-    impact_location: ImpactLocation = 50.0
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
-
-    def lanes(self, roads: Roads) -> XmlChanges:
-        """Changes to the lanes for a rotated target."""
-        return self._target_ahead.lanes(roads)
-
-    def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle at its speed, and the target."""
-        return self._target_ahead.actors(self.test_speed, roads)
-
-    def _motion(self, world: World) -> TargetMotion:
-        return self._target_ahead.motion(world)
-
-    def encounter(self, trace: Trace) -> Encounter:
-        """Distance from the front bumper to the target's body; TTC is this distance over the difference of speeds."""
-        return Encounter(
-            separation=trace.gap,
-            distance=trace.gap,
-            closing_speed=trace.speed - trace.obstacle_speed,
-            in_conflict=trace.gap > 0,
-        )
-
-    @property
-    def test_speed(self) -> float:
-        """Speed that the vehicle holds until it brakes [m/s]."""
-        return self.speed * KMH
-
-    def _target_at_impact_location(
-        self, target: str, gap: float, speed_at: Callable[[float], float], direction: Direction = SAME_DIRECTION
-    ) -> TargetAhead:
-        """The target with the middle of its rear at the impact location."""
-        vut = BodySize(self.vut_length, self.vut_width)
-        return TargetAhead(target, vut, gap, lateral_offset(self.impact_location, self.vut_width), speed_at, direction)
-
-    @property
-    def _target_ahead(self) -> TargetAhead:
-        raise NotImplementedError
-
-
-IMPACT_LOCATIONS = (50.0, 10.0, 25.0, 75.0, 90.0)
-"""Impact locations [% of the width]."""
-
-
-class _TestRow(NamedTuple):
-    """A row of the protocol's table: target, its speed [km/h] and acceleration distance [m], tested range, pre-crash
-    type.
-    """
-
-    target: str
-    target_speed: float
-    acceleration_distance: float
-    protocol_range: ProtocolRange
-    pre_crash: PreCrash
-
-
-TESTS = {  # target, its speed, acceleration distance, range (slowest, fastest, impact locations), pre-crash type
-    "CPLA": _TestRow("adult", 5.0, 1.0, ProtocolRange(10, 80, IMPACT_LOCATIONS), PreCrash.PEDESTRIAN),
-    "CBLA": _TestRow("cyclist", 15.0, 0.0, ProtocolRange(20, 80, IMPACT_LOCATIONS), PreCrash.CYCLIST),
-}
-
-
-class Along(TargetAheadTest, frozen=True, kw_only=True):
+class Along(TargetAhead, frozen=True, kw_only=True):
     """A pedestrian or cyclist moves ahead in the vehicle's lane in its direction, and does not react to it.
 
     Parameters
@@ -284,18 +206,11 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
     """
 
     test: Literal["CPLA", "CBLA"] = "CPLA"
-    speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
     target: Literal["adult", "child", "cyclist"] | None = None
     target_speed: Annotated[float, Meta(gt=0, le=60)] | None = None
     acceleration_distance: Annotated[float, Meta(ge=0, le=100)] | None = None
     time_to_impact: Annotated[float, Meta(gt=0, le=60)] = 6.0
-    time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
     network: str = "along"
-
-    @property
-    def pre_crash(self) -> PreCrash:
-        """NHTSA's pre-crash type."""
-        return TESTS[self.test].pre_crash
 
     def obstacle(self) -> str:
         """The target, which moves in the vehicle's direction."""
@@ -306,19 +221,124 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
         """Length of a run [s]."""
         return self.time_to_impact + self.time_after
 
-    def remarks(self) -> list[str]:
-        """Remarks on parameters outside the protocol."""
-        return TESTS[self.test].protocol_range.remarks(self.test, self.speed, self.impact_location, self.grade)
+    @property
+    def gap(self) -> float:
+        """Gap that has closed at the time to impact [m]."""
+        return self.test_speed * self.time_to_impact - self._profile.travelled(self.time_to_impact)
 
     @property
-    def _target_ahead(self) -> TargetAhead:
-        profile = SpeedProfile(
-            begin=0.0, speed=self._parameter("target_speed") * KMH, run_up=self._parameter("acceleration_distance")
-        )
-        gap = self.speed * KMH * self.time_to_impact - profile.travelled(self.time_to_impact)
-        return self._target_at_impact_location(self._parameter("target"), gap, profile.speed_at)
+    def target_speed_at(self) -> Callable[[float], float]:
+        """The target's speed [m/s] as a function of the time [s]."""
+        return self._profile.speed_at
 
-    def _parameter(self, name: str) -> Any:
-        """A parameter as the study sets it, by default as the protocol does."""
-        value = getattr(self, name)
-        return getattr(TESTS[self.test], name) if value is None else value
+    @property
+    def _profile(self) -> SpeedProfile:
+        return SpeedProfile(0.0, self.parameter("target_speed") * KMH, self.parameter("acceleration_distance"))
+
+
+class CarToCar(TargetAhead, frozen=True, kw_only=True):
+    """A car or a motorcyclist ahead in the lane stands, drives more slowly, or brakes.
+
+    Parameters
+    ----------
+    test
+        CCRs, CCRm, CCRb, CMRs or CMRb: determines the target, and its speed and headway unless they are set here.
+    speed, target_speed
+        Speeds of the vehicle under test and of the target at the start [km/h].
+    impact_location
+        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the
+        width].
+    headway
+        Gap at the start divided by the vehicle's speed [s].
+    brakes_at, target_deceleration
+        Time at which the target of CCRb and CMRb begins to brake, and its deceleration, down to 2 km/h [s, m/s^2].
+    heading
+        Rotation of a standing target around the middle of its rear, counterclockwise seen from above [degrees].
+    time_after
+        Time from the impact, if nobody brakes, to the end of the run [s].
+    vut_length, vut_width
+        Size of the vehicle under test [m].
+    grade
+        Rise of the road over its length, negative downhill [%].
+    network
+        By default `car_to_car`, or `junction` for a rotated target.
+
+    Notes
+    -----
+    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2 m/s^2" is an
+    acceleration, hence a `target_deceleration` of 6; "+0.5s time headway" is a `headway` of 1.5 s; a rotation around
+    the impact point is a `heading`.
+    """
+
+    test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
+    speed: Annotated[float, Meta(gt=0, le=250)] = 50.0
+    target_speed: Annotated[float, Meta(ge=0, le=250)] | None = None
+    headway: Annotated[float, Meta(gt=0, le=60)] | None = None
+    brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
+    target_deceleration: Annotated[float, Meta(gt=0, le=12)] = 4.0
+    heading: Heading = 0.0
+    time_after: Annotated[float, Meta(gt=0, le=60)] = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.network:
+            force_setattr(self, "network", JUNCTION if self.heading else "car_to_car")
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return self._time_to_impact() + self.time_after
+
+    @property
+    def gap(self) -> float:
+        """Gap to the target at the start [m]."""
+        return self.parameter("headway") * self.speed * KMH
+
+    @property
+    def direction(self) -> Direction:
+        """Direction of the target."""
+        if self.heading and self._target_speed:
+            problem = f"heading = {self.heading:g} with a moving target"
+            raise InputError("scenario.parameters", problem, "a heading for a standing target")
+        return SAME_DIRECTION.turned(self.heading)
+
+    @property
+    def _target_brakes(self) -> bool:
+        return self.pre_crash == PreCrash.LEAD_DECELERATING
+
+    @property
+    def _target_speed(self) -> float:
+        """Speed of the target at the start [m/s]."""
+        slower_speed = 20.0 + max(self.speed - STEADY_SPEED_LIMIT, 0.0)
+        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(self.pre_crash, self.speed)
+        return (default if self.target_speed is None else self.target_speed) * KMH
+
+    @property
+    def target_speed_at(self) -> Callable[[float], float]:
+        """The target's speed [m/s] as a function of the time [s]."""
+        first_speed, brakes_at, deceleration = self._target_speed, self.brakes_at, self.target_deceleration
+        if not self._target_brakes:
+            return lambda time: first_speed
+        last_speed = min(first_speed, FINAL_SPEED * KMH)
+        return lambda time: max(first_speed - deceleration * max(time - brakes_at, 0.0), last_speed)
+
+    def _time_to_impact(self) -> float:
+        """Time to the impact if the vehicle does not brake [s].
+
+        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until
+        it stops braking.
+        """
+        closing_speed, gap = self.test_speed - self._target_speed, self.gap
+        if not self._target_brakes:
+            if closing_speed <= 0:
+                raise InputError(
+                    "scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target"
+                )
+            return gap / closing_speed
+        remaining_gap = gap - closing_speed * self.brakes_at
+        if remaining_gap <= 0:
+            return gap / closing_speed
+        b, speed_lost = self.target_deceleration, self._target_speed - self.target_speed_at(math.inf)
+        gap_closed = (closing_speed + speed_lost / 2) * speed_lost / b
+        if remaining_gap > gap_closed:
+            return self.brakes_at + speed_lost / b + (remaining_gap - gap_closed) / (closing_speed + speed_lost)
+        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * remaining_gap) - closing_speed) / b

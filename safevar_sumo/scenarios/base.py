@@ -31,37 +31,28 @@ the element.
 
 
 class Lane(NamedTuple):
-    """First and last point of a lane's centre line [m]."""
+    """First and last point of a lane's centre line [m]; `flaw` says why the lane is not straight, "" if it is."""
 
     start: Coordinates
     end: Coordinates
-
-
-class BentLane(Lane):
-    """A lane that is not straight, made only by `lane_through`; `bend` is the largest distance between its centre line
-    and the line between its ends [m].
-    """
-
-    name: str
-    bend: float
+    flaw: str = ""
 
 
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
-    """The lane `name`, whose centre line goes through these points [m]; a `BentLane` if they are not on one line."""
+    """The lane `name`, whose centre line goes through these points [m]."""
     (x, y), (to_x, to_y) = points[0], points[-1]
     length = math.hypot(to_x - x, to_y - y)
-    deviations = [
+    bend = max(
         abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
         for at_x, at_y in points
-    ]
-    if max(deviations) <= MAX_BEND:
-        return Lane(points[0], points[-1])
-    bent = BentLane(points[0], points[-1])
-    bent.name = name
-    bent.bend = max(deviations)
-    return bent
+    )
+    flaw = f"lane {name!r} deviates {bend:.2f} m from a straight line" if bend > MAX_BEND else ""
+    return Lane(points[0], points[-1], flaw)
 
 
+NETWORK_KEY = "scenario.parameters.network"
+PEDESTRIAN, CROSSING_LANE = "pedestrian", ":crossing_c0_0"
+"""Id of a person who walks across the road, and of the lane that he walks on, in every network with one."""
 MAX_SKEW = 0.05
 """Largest offset along the road between the two ends of a crossing at which it still counts as at right angles [m]."""
 
@@ -81,13 +72,9 @@ class Frame(NamedTuple):
         InputError
             If the lane is not straight.
         """
+        if lane.flaw:
+            raise InputError(NETWORK_KEY, lane.flaw, "a straight lane")
         (x, y), (to_x, to_y) = lane.start, lane.end
-        if isinstance(lane, BentLane):
-            raise InputError(
-                "scenario.parameters.network",
-                f"lane {lane.name!r} deviates {lane.bend:.2f} m from a straight line",
-                "a straight lane",
-            )
         length = math.sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y))
         return cls(lane.start, ((to_x - x) / length, (to_y - y) / length))
 
@@ -110,9 +97,22 @@ class Frame(NamedTuple):
 
     def lane_coordinates(self, point: Coordinates) -> tuple[float, float]:
         """Distances of one point along the lane and to its left [m]."""
-        (x, y), (dir_x, dir_y) = self.origin, self.direction
-        delta_x, delta_y = point[0] - x, point[1] - y
-        return delta_x * dir_x + delta_y * dir_y, delta_y * dir_x - delta_x * dir_y
+        positions = np.array([point])
+        return self.along(positions).item(), self.left(positions).item()
+
+    def crossing_position(self, roads: Roads | World, lane: str) -> float:
+        """Position along this lane of another lane, which crosses it [m].
+
+        Raises
+        ------
+        InputError
+            If the other lane does not cross it at right angles.
+        """
+        start, end = (self.lane_coordinates(point)[0] for point in roads.lane(lane)[:2])
+        if abs(end - start) > MAX_SKEW:
+            problem = f"lane {lane!r} leads {abs(end - start):.2f} m along the road"
+            raise InputError(NETWORK_KEY, problem, "a crossing at right angles")
+        return start
 
     def point(self, along: float, left: float) -> Coordinates:
         """The point at these distances along the lane and to its left [m]."""

@@ -5,17 +5,16 @@ The pedestrian stops short of the vehicle's path, leaves it in time, or walks be
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import product
 
 from msgspec.structs import asdict, replace
 
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios.ahead import Along, TargetAhead
+from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import Point, Scenario
-from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.euro_ncap import BODIES, SAME_DIRECTION, Direction
+from safevar_sumo.scenarios.euro_ncap import BODIES
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 
 SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
@@ -62,11 +61,10 @@ class LeavesInTime(Crossing, frozen=True, kw_only=True):
 class NextLane(CarToCar, frozen=True, kw_only=True):
     """The car stands, or drives more slowly, in the next lane."""
 
-    def _target_at_impact_location(
-        self, target: str, gap: float, speed_at: Callable[[float], float], direction: Direction = SAME_DIRECTION
-    ) -> TargetAhead:
-        ahead = CarToCar._target_at_impact_location(self, target, gap, speed_at, direction)
-        return ahead._replace(offset=LANE_WIDTH)
+    @property
+    def offset(self) -> float:
+        """Distance of the car's rear to the right of the lane's middle [m]."""
+        return LANE_WIDTH
 
 
 def benign_points(points: Iterable[Point]) -> list[Point]:

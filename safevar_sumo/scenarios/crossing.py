@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -11,26 +11,22 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Frame, Grade, PreCrash, Roads, World, XmlChanges
+from safevar_sumo.scenarios.base import Frame, PreCrash, Roads, World, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import (
     BODIES,
     FROM_LEFT,
     FROM_RIGHT,
     JUNCTION,
     KMH,
+    TESTS,
     VUT_LANE,
-    VUT_LENGTH,
-    VUT_WIDTH,
     BodySize,
     Direction,
     Heading,
-    ImpactLocation,
-    ProtocolRange,
     SpeedProfile,
     lateral_offset,
 )
 from safevar_sumo.scenarios.target import (
-    FOOTPATH_NETWORK,
     PARKED_GAP,
     STOP_DISTANCE,
     EncounterConstants,
@@ -43,6 +39,7 @@ from safevar_sumo.scenarios.target import (
     value_at,
 )
 
+FOOTPATH_NETWORK = "crossing"
 KERB_LANE = "kerb_0"
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 """Lengths of the parked cars [m]: the middle of the protocol's ranges, 4.1 to 4.4 and 4.3 to 4.7 m."""
@@ -52,40 +49,8 @@ TIME_TO_IMPACT = 6.0
 ROUNDING_STEP = 0.5
 """A time to impact above `TIME_TO_IMPACT` is rounded up to a multiple of this step [s]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
-IMPACT_LOCATIONS = (50.0, 25.0, 75.0, 10.0, 90.0)
-"""Impact locations [% of the width]."""
-
-
-class _TestRow(NamedTuple):
-    """A row of the protocol's table [km/h, m]; without a `lateral_start` the target starts at its full speed."""
-
-    side: str
-    target: str
-    target_speed: float
-    lateral_start: float | None
-    acceleration_distance: float
-    hidden: bool
-    protocol_range: ProtocolRange
-
-
-# side, target, its speed, lateral start, acceleration distance, hidden, range (slowest, fastest, impact locations)
-TESTS = {
-    "CPFA": _TestRow("far", "adult", 8.0, 6.0, 1.5, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
-    "CPNA": _TestRow("near", "adult", 5.0, 4.0, 1.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
-    "CPNCO": _TestRow("near", "child", 5.0, 4.0, 1.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
-    "CBNA": _TestRow("near", "cyclist", 15.0, None, 0.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
-    "CBFA": _TestRow("far", "cyclist", 20.0, None, 0.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
-    "CBNAO": _TestRow("near", "cyclist", 10.0, None, 0.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
-    "CCCscp": _TestRow("near", "car", 40.0, None, 0.0, False, ProtocolRange(20, 80, (50.0,))),
-    "CMCscp": _TestRow("near", "motorcyclist", 40.0, None, 0.0, False, ProtocolRange(20, 80, (50.0,))),
-}
-PRE_CRASH = {
-    "adult": PreCrash.PEDESTRIAN,
-    "child": PreCrash.PEDESTRIAN,
-    "cyclist": PreCrash.CYCLIST,
-    "motorcyclist": PreCrash.STRAIGHT_PATHS,
-    "car": PreCrash.STRAIGHT_PATHS,
-}
+PRE_CRASH = {TESTS[test].target: TESTS[test].pre_crash for test in ("CPFA", "CPNCO", "CBNA", "CCCscp", "CMCscp")}
+"""Pre-crash types by target."""
 
 
 class _Start(NamedTuple):
@@ -121,14 +86,14 @@ class _Start(NamedTuple):
         InputError
             If the target cannot reach the impact location in time.
         """
-        target, lateral_start, is_near = (
+        target, lateral_start, speed = (
             test.parameter("target"),
             test.parameter("lateral_start"),
-            test.parameter("side") == "near",
+            test.parameter("target_speed") * KMH,
         )
-        speed, sign = test.parameter("target_speed") * KMH, 1.0 if is_near else -1.0
+        sign = 1.0 if test.parameter("side") == "near" else -1.0
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
-        direction = (FROM_RIGHT if is_near else FROM_LEFT).turned(test.heading)
+        direction = (FROM_RIGHT if sign > 0 else FROM_LEFT).turned(test.heading)
         if lateral_start is None:
             if test.acceleration_distance is not None:
                 raise InputError(
@@ -211,8 +176,6 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     """
 
     test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
-    speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
-    impact_location: ImpactLocation = 50.0
     target: Literal["adult", "child", "cyclist", "motorcyclist", "car"] | None = None
     target_speed: Annotated[float, Meta(gt=0, le=150)] | None = None
     side: Literal["near", "far"] | None = None
@@ -223,11 +186,6 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     hidden: bool | None = None
     sensor_setback: Metres = 0.0
     time_to_impact: Annotated[float, Meta(gt=0, le=60)] | None = None
-    time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
-    network: str = ""
 
     def __post_init__(self) -> None:
         if not self.network:
@@ -255,18 +213,9 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return f"{'an' if target == 'adult' else 'a'} {target} from {start}"
 
     @property
-    def test_speed(self) -> float:
-        """Speed that the vehicle holds until it brakes [m/s]."""
-        return self.speed * KMH
-
-    @property
     def duration(self) -> float:
         """Length of a run [s]."""
         return _Start.of(self).time_to_impact + self.time_after
-
-    def remarks(self) -> list[str]:
-        """Remarks on parameters outside the protocol."""
-        return TESTS[self.test].protocol_range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the target's lanes: their direction."""
@@ -276,14 +225,9 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         """The vehicle before the target's path, the target beside the vehicle's lane, and the parked cars, if any."""
         frame, start = Frame.of(roads.lane(VUT_LANE)), _Start.of(self)
         impact_position = start.mover.impact_position(frame, roads, start.impact_left)
-        front = impact_position - start.extent.length / 2 - self.speed * KMH * start.time_to_impact
-        if front - self.vut_length < 0:
-            raise InputError(
-                "scenario.parameters", f"{self.speed:g} km/h for {start.time_to_impact:g} s is longer than the road"
-            )
+        front = impact_position - start.extent.length / 2 - self.test_speed * start.time_to_impact
         return {
-            "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
-            "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
+            **self._vehicle_at(front),
             **start.mover.actors(frame, roads, start.impact_left, start.distance_to_impact),
             **self._parked_cars(frame, impact_position, roads),
         }
@@ -360,8 +304,3 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     def _parked_edge(self) -> float:
         """Lateral position of the parked cars' sides that face the lane, to the left of its middle [m]."""
         return -self.vut_width / 2 - PARKED_GAP
-
-    def parameter(self, name: str) -> Any:
-        """A parameter as the study sets it, by default as the protocol does."""
-        value = getattr(self, name)
-        return getattr(TESTS[self.test], name) if value is None else value

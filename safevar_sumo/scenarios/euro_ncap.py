@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios.base import Coordinates, Frame, XmlChanges
+from safevar_sumo.scenarios.base import Coordinates, Frame, PreCrash, XmlChanges
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
@@ -121,26 +121,56 @@ def target_type(target: str) -> dict[str, str]:
     }
 
 
-class ProtocolRange(NamedTuple):
-    """What the protocol tests in a row: lowest and highest speed [km/h], impact locations [% of the width]."""
+class TestRow(NamedTuple):
+    """A row of the protocol's table.
 
+    Attributes
+    ----------
+    target, pre_crash
+        The target, and the pre-crash type of the encounter.
+    slowest, fastest, locations
+        Tested speeds of the vehicle [km/h] and impact locations [% of the width].
+    target_speed, acceleration_distance
+        Speed of the target [km/h] and distance within which it reaches that speed [m].
+    side, lateral_start, hidden
+        Of a crossing target: where it starts [m], at its full speed without a `lateral_start`; and whether parked cars
+        hide it.
+    headway
+        Of a car or motorcyclist ahead: time headway at the start [s].
+    """
+
+    target: str
+    pre_crash: PreCrash
     slowest: float
     fastest: float
     locations: tuple[float, ...]
+    target_speed: float = 0.0
+    acceleration_distance: float = 0.0
+    side: str = "near"
+    lateral_start: float | None = None
+    hidden: bool = False
+    headway: float = 5.0
 
-    def remarks(self, test: str, speed: float, location: float, grade: float) -> list[str]:
-        """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
-        remarks = []
-        if not self.slowest <= speed <= self.fastest:
-            remarks.append(
-                f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h"
-            )
-        if location not in self.locations:
-            legal = ", ".join(f"{protocol_location:g}" for protocol_location in self.locations)
-            remarks.append(f"{test}: impact_location = {location:g} % is none of the protocol's {legal} %")
-        if grade:
-            remarks.append(f"{test}: grade = {grade:g} %, and the protocol's road is level")
-        return remarks
+
+_NARROW, _WIDE = (50.0, 10.0, 25.0, 75.0, 90.0), (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0)
+TESTS = {
+    "CPFA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 8.0, 1.5, "far", 6.0),
+    "CPNA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 5.0, 1.0, "near", 4.0),
+    "CPNCO": TestRow("child", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 5.0, 1.0, "near", 4.0, hidden=True),
+    "CBNA": TestRow("cyclist", PreCrash.CYCLIST, 10, 60, _NARROW, 15.0),
+    "CBFA": TestRow("cyclist", PreCrash.CYCLIST, 10, 60, _NARROW, 20.0, side="far"),
+    "CBNAO": TestRow("cyclist", PreCrash.CYCLIST, 10, 60, _NARROW, 10.0, hidden=True),
+    "CCCscp": TestRow("car", PreCrash.STRAIGHT_PATHS, 20, 80, (50.0,), 40.0),
+    "CMCscp": TestRow("motorcyclist", PreCrash.STRAIGHT_PATHS, 20, 80, (50.0,), 40.0),
+    "CPLA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 80, _NARROW, 5.0, 1.0),
+    "CBLA": TestRow("cyclist", PreCrash.CYCLIST, 20, 80, _NARROW, 15.0),
+    "CCRs": TestRow("car", PreCrash.LEAD_STOPPED, 10, 80, _WIDE),
+    "CCRm": TestRow("car", PreCrash.LEAD_SLOWER, 30, 130, _WIDE),
+    "CCRb": TestRow("car", PreCrash.LEAD_DECELERATING, 30, 130, _WIDE, headway=1.0),
+    "CMRs": TestRow("motorcyclist", PreCrash.LEAD_STOPPED, 10, 80, _NARROW),
+    "CMRb": TestRow("motorcyclist", PreCrash.LEAD_DECELERATING, 30, 130, _NARROW, headway=1.0),
+}
+"""The rows of the protocol's table."""
 
 
 class SpeedProfile(NamedTuple):

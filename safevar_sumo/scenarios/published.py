@@ -11,11 +11,20 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import MAX_SKEW, VUT, Frame, Grade, PreCrash, Scenario, Scene, World
+from safevar_sumo.scenarios.base import (
+    CROSSING_LANE,
+    NETWORK_KEY,
+    PEDESTRIAN,
+    VUT,
+    Frame,
+    Grade,
+    PreCrash,
+    Scenario,
+    Scene,
+    World,
+)
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
-PEDESTRIAN = "pedestrian"
-CROSSING_LANE = ":crossing_c0_0"
 
 
 class _Memory(NamedTuple):
@@ -58,25 +67,18 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
     pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
 
     def begin(self, world: World) -> _Memory:
-        frame, crossing = Frame.through_origin(world.lane_of(VUT)), world.lane(CROSSING_LANE)
-        (path_start, _), (path_end, _) = frame.lane_coordinates(crossing.start), frame.lane_coordinates(crossing.end)
-        skew = abs(path_end - path_start)
-        if skew > MAX_SKEW:
-            raise InputError(
-                "scenario.parameters.network",
-                f"lane {CROSSING_LANE!r} leads {skew:.2f} m along the road",
-                "a crossing at right angles",
-            )
+        frame = Frame.through_origin(world.lane_of(VUT))
+        path = frame.crossing_position(world, CROSSING_LANE)
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
         if self.turns_after is not None and lateral[0] > self.turns_after:
             raise InputError(
-                "scenario.parameters.network",
+                NETWORK_KEY,
                 f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
                 "to the right of it, or turns_after = None",
             )
         half_width = world.person_width(PEDESTRIAN) / 2
-        clear_point = path_start + half_width + world.vehicle_length(VUT)
-        return _Memory(frame, path_start - half_width, clear_point, lateral, has_turned=False)
+        clear_point = path + half_width + world.vehicle_length(VUT)
+        return _Memory(frame, path - half_width, clear_point, lateral, has_turned=False)
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle_positions = world.vehicle_positions(VUT)

@@ -7,21 +7,38 @@ thousands of vehicles.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import ALL_TRUE, BoolArray, FloatArray
-from safevar_sumo.scenarios.base import MAX_SKEW, VUT, Frame, Roads, Scenario, Scene, World, XmlChanges
+from safevar_sumo.scenarios.base import (
+    CROSSING_LANE,
+    PEDESTRIAN,
+    VUT,
+    Frame,
+    Grade,
+    PreCrash,
+    Roads,
+    Scenario,
+    Scene,
+    World,
+    XmlChanges,
+)
 from safevar_sumo.scenarios.euro_ncap import (
     BODIES,
     ENTRY_LANE,
     FROM_RIGHT,
     JUNCTION_LANE,
+    KMH,
     TARGET,
+    TESTS,
+    VUT_LENGTH,
+    VUT_WIDTH,
     Direction,
+    ImpactLocation,
     SpeedProfile,
     change_target_lanes,
     target_type,
@@ -111,17 +128,76 @@ class Memory(NamedTuple):
 
 
 class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario whose target does not react."""
+    """Base of a scenario of the protocol, whose target does not react; its parameters are those that all of them have.
 
+    Parameters
+    ----------
+    test
+        Row of the protocol, the source of parameters that are not set.
+    speed
+        Speed of the vehicle under test at the start [km/h].
+    impact_location
+        Point of the vehicle's front that would hit the target [% of the width].
+    time_after
+        Time from the impact, if nobody brakes, to the end of the run [s].
+    vut_length, vut_width
+        Size of the vehicle under test [m].
+    grade
+        Rise of the road over its length, negative downhill [%].
+    """
+
+    test: str
+    speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
+    impact_location: ImpactLocation = 50.0
+    time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
+    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
+    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
+    network: str = ""
     reactive_actors = False
+
+    @property
+    def pre_crash(self) -> PreCrash:
+        """NHTSA's pre-crash type."""
+        return TESTS[self.test].pre_crash
+
+    @property
+    def test_speed(self) -> float:
+        """Speed that the vehicle holds until it brakes [m/s]."""
+        return self.speed * KMH
+
+    def parameter(self, name: str) -> Any:
+        """A parameter as the study sets it, by default as the protocol does."""
+        value = getattr(self, name, None)
+        return getattr(TESTS[self.test], name) if value is None else value
+
+    def remarks(self) -> list[str]:
+        """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
+        row, location = TESTS[self.test], self.impact_location
+        tested, legal = f"{row.slowest:g} to {row.fastest:g} km/h", ", ".join(f"{each:g}" for each in row.locations)
+        remarks = {
+            f"speed = {self.speed:g} km/h is outside the protocol's {tested}": not row.slowest
+            <= self.speed
+            <= row.fastest,
+            f"impact_location = {location:g} % is none of the protocol's {legal} %": location not in row.locations,
+            f"grade = {self.grade:g} %, and the protocol's road is level": self.grade,
+        }
+        return [f"{self.test}: {remark}" for remark, applies in remarks.items() if applies]
+
+    def _vehicle_at(self, front: float) -> XmlChanges:
+        """The vehicle under test with its front at a position on its lane [m], at its speed."""
+        if front - self.vut_length < 0:
+            raise InputError("scenario.parameters", "the way to the target is longer than the road", "a shorter time")
+        return {
+            "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
+            "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.test_speed)},
+        }
 
     def begin(self, world: World) -> Memory:
         motion = self._motion(world)
-        initial_speed = motion.mover.begin(world)
+        motion.mover.set_speed(world, motion.mover.initial_speed)
         lateral = motion.target(motion.mover.positions(world), 0.0).lateral
-        return Memory(
-            motion, lateral, sample=0, last_speed=initial_speed, approached=np.zeros(len(lateral), dtype=bool)
-        )
+        return Memory(motion, lateral, 0, motion.mover.initial_speed, np.zeros(len(lateral), dtype=bool))
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
         motion = memory.motion
@@ -185,9 +261,6 @@ def value_at(times: Times, function: Callable[[float], float]) -> Quantity:
     return np.array([function(time) for time in times]) if isinstance(times, Sequence) else function(times)
 
 
-FOOTPATH_NETWORK = "crossing"
-PEDESTRIAN = "pedestrian"
-CROSSING_LANE = ":crossing_c0_0"
 WALK_EDGES = {1.0: ("footpath", "footpath_on"), -1.0: ("footpath_on", "footpath")}
 """Edges that a pedestrian walks on, in this order; the key is 1.0 for a walk to the left of the vehicle, -1.0 to the
 right.
@@ -221,15 +294,10 @@ class PersonMover(NamedTuple):
         """The pedestrian beside the lane, `distance` metres before the impact."""
         edges = WALK_EDGES[self.sign]
         for lane in (CROSSING_LANE, *(f"{edge}_0" for edge in edges)):
-            first, last = (frame.lane_coordinates(point)[0] for point in roads.lane(lane))
-            if abs(last - first) > MAX_SKEW:
-                raise InputError(
-                    "scenario.parameters.network",
-                    f"lane {lane!r} leads {abs(last - first):.2f} m along the road",
-                    "a crossing at right angles",
-                )
+            frame.crossing_position(roads, lane)
         half_length = BODIES[self.target].length / 2
-        edge_start, edge_end = (self.sign * frame.lane_coordinates(point)[1] for point in roads.lane(f"{edges[0]}_0"))
+        path = roads.lane(f"{edges[0]}_0")
+        edge_start, edge_end = (self.sign * frame.lane_coordinates(point)[1] for point in (path.start, path.end))
         start_position = half_length + self.start
         if not min(edge_start, edge_end) <= start_position <= max(edge_start, edge_end):
             nearest, farthest = half_length - max(edge_start, edge_end), half_length - min(edge_start, edge_end)
@@ -246,9 +314,9 @@ class PersonMover(NamedTuple):
         }
         return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
 
-    def begin(self, world: World) -> float:
-        """Make the pedestrian stand; returns 0, the initial speed [m/s]."""
-        world.walk(PEDESTRIAN, 0.0)
+    @property
+    def initial_speed(self) -> float:
+        """0: the pedestrian stands at first [m/s]."""
         return 0.0
 
     def positions(self, world: World) -> FloatArray:
@@ -284,7 +352,8 @@ class VehicleMover(NamedTuple):
         """
         if self.direction == FROM_RIGHT:
             return {}
-        (along, entry), (_, exit_) = (frame.lane_coordinates(point) for point in roads.lane(JUNCTION_LANE))
+        lane = roads.lane(JUNCTION_LANE)
+        (along, entry), (_, exit_) = frame.lane_coordinates(lane.start), frame.lane_coordinates(lane.end)
         (forward, left), half = self.direction, (exit_ - entry) / 2
         return change_target_lanes(
             frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction
@@ -315,7 +384,7 @@ class VehicleMover(NamedTuple):
             "vehicle[@id='target']": {
                 "type": self.target,
                 "departPos": repr(front),
-                "departSpeed": repr(self.speed_at(0.0)),
+                "departSpeed": repr(self.initial_speed),
             },
         }
 
@@ -324,9 +393,9 @@ class VehicleMover(NamedTuple):
         along, left = frame.lane_coordinates(point)
         return along * self.direction.along + left * self.direction.left
 
-    def begin(self, world: World) -> float:
-        """Set the target's initial speed; returns this speed [m/s]."""
-        world.drive(TARGET, self.speed_at(0.0))
+    @property
+    def initial_speed(self) -> float:
+        """Speed at the start [m/s]."""
         return self.speed_at(0.0)
 
     def positions(self, world: World) -> FloatArray:

@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.scenarios import Crossing, Point, Scenario
-from safevar_sumo.scenarios.car_to_car import CarToCar
+from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
