@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.ads.base import Ads, Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError
-from safevar_sumo.fmu import Description, Fleet, History, Instances, constants_of, ports_of
+from safevar_sumo.fmu import Description, Fleet, History, Instances
 from safevar_sumo.plugins import SHARE, Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 from safevar_sumo.study.schema import Parameters
@@ -84,16 +84,9 @@ class FmuAds(Ads):
     ) -> None:
         source = guard.source
         self._guard, self._communication_step = guard, description.communication_step(step, source, "ads")
-        input_ports = ports_of(
-            description,
-            inputs,
-            {**OBSERVATION_UNITS, **CONSTANT_UNITS},
-            ("input",),
-            source,
-            "ads.inputs",
-            constants=CONSTANT_UNITS,
-        )
-        output_ports = ports_of(description, outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
+        quantities = {**OBSERVATION_UNITS, **CONSTANT_UNITS}
+        input_ports = description.ports(inputs, quantities, ("input",), source, "ads.inputs", CONSTANT_UNITS)
+        output_ports = description.ports(outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
         if ("acceleration" in output_ports) == bool({"throttle", "brake"} & output_ports.keys()):
             raise InputError(
                 source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; alternatively acceleration"
@@ -101,7 +94,7 @@ class FmuAds(Ads):
         if not input_ports.keys() & OBSERVATION_UNITS.keys():
             raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATION_UNITS)}")
         self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
-        constants = constants_of(description, parameters, [*input_ports.values()], source, "ads.parameters")
+        constants = description.constants(parameters, [*input_ports.values()], source, "ads.parameters")
         self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
 

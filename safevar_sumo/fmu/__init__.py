@@ -1,20 +1,9 @@
 """Functional Mock-up Units (FMI 2.0 and 3.0, co-simulation): model descriptions, units, and instances, by FMPy."""
 
 from safevar_sumo.fmu.description import (
-    COMMON_UNITS as COMMON_UNITS,
     REAL_TYPES as REAL_TYPES,
-    SI as SI,
     Description as Description,
-    Unit as Unit,
-    declared as declared,
     description_of as description_of,
     file_of as file_of,
 )
-from safevar_sumo.fmu.instances import (
-    Fleet as Fleet,
-    History as History,
-    Instances as Instances,
-    Port as Port,
-    constants_of as constants_of,
-    ports_of as ports_of,
-)
+from safevar_sumo.fmu.instances import Fleet as Fleet, History as History, Instances as Instances

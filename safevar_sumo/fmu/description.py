@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import os
+import tempfile
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import platformdirs
 
 from safevar_sumo.errors import InputError, describe_error, unknown_name
 from safevar_sumo.output import file_beside
@@ -21,8 +25,10 @@ if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ModelVariable
 
 Values = TypeVar("Values", float, npt.NDArray[np.float64])
-BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-"""FMI's base units (FMI 2.0.4, section 2.2.2)."""
+Constant = str | bool | float
+"""A value of a parameter."""
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd")
+"""FMI's base units (FMI 2.0.4, section 2.2.2), without radians, which are plain numbers."""
 
 
 class Unit(NamedTuple):
@@ -32,10 +38,6 @@ class Unit(NamedTuple):
     factor: float = 1.0
     offset: float = 0.0
 
-    def fits(self, other: Unit) -> bool:
-        """Whether both measure the same kind of quantity; radians count as plain numbers."""
-        return self.exponents[:-1] == other.exponents[:-1]
-
     def to(self, other: Unit, value: Values) -> Values:
         """A value or an array converted to another unit of the same kind; unchanged where both units are equal."""
         if (self.factor, self.offset) == (other.factor, other.offset):
@@ -43,82 +45,45 @@ class Unit(NamedTuple):
         return (self.factor * value + (self.offset - other.offset)) / other.factor
 
 
-def _unit(factor: float = 1.0, offset: float = 0.0, **exponents: int) -> Unit:
-    return Unit(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor, offset)
+def _unit(factor: float = 1.0, **exponents: int) -> Unit:
+    return Unit(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor)
 
 
-SI: Mapping[str, Unit] = {
-    "-": _unit(),
-    "s": _unit(s=1),
-    "m": _unit(m=1),
-    "m/s": _unit(m=1, s=-1),
-    "m/s^2": _unit(m=1, s=-2),
-    "kg": _unit(kg=1),
-}
-"""Units of the quantities that vehicles and driving systems exchange."""
-_FORCE, _TORQUE = {"kg": 1, "m": 1, "s": -2}, {"kg": 1, "m": 2, "s": -2}
-_POWER, _PRESSURE = {"kg": 1, "m": 2, "s": -3}, {"kg": 1, "m": -1, "s": -2}
 COMMON_UNITS: Mapping[str, Unit] = {
-    **SI,
-    "": _unit(),
-    "1": _unit(),
-    "%": _unit(0.01),
-    "rad": _unit(rad=1),
-    "deg": _unit(math.pi / 180, rad=1),
-    "ms": _unit(1e-3, s=1),
-    "min": _unit(60.0, s=1),
-    "h": _unit(3600.0, s=1),
-    "1/s": _unit(s=-1),
-    "Hz": _unit(s=-1),
-    "mm": _unit(1e-3, m=1),
-    "cm": _unit(1e-2, m=1),
-    "km": _unit(1e3, m=1),
-    "m2": _unit(m=2),
-    "m^2": _unit(m=2),
-    "m.s-1": _unit(m=1, s=-1),
-    "km/h": _unit(1 / 3.6, m=1, s=-1),
-    "kph": _unit(1 / 3.6, m=1, s=-1),
-    "mph": _unit(0.44704, m=1, s=-1),
-    "m/s2": _unit(m=1, s=-2),
-    "m/s**2": _unit(m=1, s=-2),
-    "m.s-2": _unit(m=1, s=-2),
-    "g": _unit(1e-3, kg=1),
-    "t": _unit(1e3, kg=1),
-    "rad/s": _unit(rad=1, s=-1),
-    "rpm": _unit(math.pi / 30, rad=1, s=-1),
-    "r/min": _unit(math.pi / 30, rad=1, s=-1),
-    "N": _unit(**_FORCE),
-    "kN": _unit(1e3, **_FORCE),
-    "N.m": _unit(**_TORQUE),
-    "Nm": _unit(**_TORQUE),
-    "J": _unit(**_TORQUE),
-    "W": _unit(**_POWER),
-    "kW": _unit(1e3, **_POWER),
-    "Pa": _unit(**_PRESSURE),
-    "kPa": _unit(1e3, **_PRESSURE),
-    "bar": _unit(1e5, **_PRESSURE),
-    "K": _unit(K=1),
-    "degC": _unit(1.0, 273.15, K=1),
+    name: unit
+    for names, unit in {
+        "- 1 rad": _unit(),
+        "%": _unit(0.01),
+        "deg": _unit(math.pi / 180),
+        "s": _unit(s=1),
+        "ms": _unit(1e-3, s=1),
+        "1/s Hz rad/s": _unit(s=-1),
+        "rpm r/min": _unit(math.pi / 30, s=-1),
+        "m": _unit(m=1),
+        "mm": _unit(1e-3, m=1),
+        "cm": _unit(1e-2, m=1),
+        "km": _unit(1e3, m=1),
+        "m2 m^2": _unit(m=2),
+        "m/s m.s-1": _unit(m=1, s=-1),
+        "km/h kph": _unit(1 / 3.6, m=1, s=-1),
+        "mph": _unit(0.44704, m=1, s=-1),
+        "m/s^2 m/s2 m/s**2 m.s-2": _unit(m=1, s=-2),
+        "kg": _unit(kg=1),
+        "t": _unit(1e3, kg=1),
+        "N": _unit(kg=1, m=1, s=-2),
+        "kN": _unit(1e3, kg=1, m=1, s=-2),
+        "N.m Nm": _unit(kg=1, m=2, s=-2),
+        "kW": _unit(1e3, kg=1, m=2, s=-3),
+        "Pa": _unit(kg=1, m=-1, s=-2),
+        "bar": _unit(1e5, kg=1, m=-1, s=-2),
+    }.items()
+    for name in names.split()
 }
 """Units by their common names, for models whose description does not define them."""
-
-
 REAL_TYPES = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
-NUMBER_TYPES = (
-    *REAL_TYPES,
-    "Integer",
-    "Boolean",
-    "Int8",
-    "UInt8",
-    "Int16",
-    "UInt16",
-    "Int32",
-    "UInt32",
-    "Int64",
-    "UInt64",
-    "Enumeration",
-)
+INTEGER_TYPES = ("Integer", "Enumeration", *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)))
+NUMBER_TYPES = (*REAL_TYPES, "Boolean", *INTEGER_TYPES)
 """Types of variables that hold numbers."""
 SUPPORTED_FMU = "an FMU of FMI 2.0 or 3.0 for co-simulation"
 MAX_MEANING = 200
@@ -129,14 +94,35 @@ MIN_STEP, MAX_STEP = 1e-6, 10.0
 """Shortest and longest communication step [s]."""
 
 
+class Port(NamedTuple):
+    """A variable of an FMU, its unit, the unit of its values outside the FMU, and the bounds to which these are clipped
+    (FMU's unit).
+    """
+
+    variable: ModelVariable
+    fmu_unit: Unit
+    outer_unit: Unit
+    lower: float = -np.inf
+    upper: float = np.inf
+
+    @property
+    def is_input(self) -> bool:
+        return causality_of(self.variable) == "input"
+
+    def to_fmu(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Values in the FMU's unit; those of an input, such as an infinite gap, are clipped to its declared bounds."""
+        return np.clip(self.outer_unit.to(self.fmu_unit, values), self.lower, self.upper)
+
+
 @dataclass(frozen=True)
 class Description:
-    """An FMU: its file, the digest of the file, FMPy's model description, the units that it defines, and its scalar
-    variables by name.
+    """An FMU: its file, the digest of the file, the folder with its content, FMPy's model description, the units that
+    it defines, and its scalar variables by name.
     """
 
     path: str
     digest: str
+    folder: str
     model: ModelDescription = field(compare=False, repr=False)
     units: Mapping[str, Unit] = field(compare=False, repr=False)
     variables: Mapping[str, ModelVariable] = field(compare=False, repr=False)
@@ -152,16 +138,12 @@ class Description:
         An FMU requires its internal step, or its default step if its step cannot change.
         """
         simulation, default = self.model.coSimulation, getattr(self.model.defaultExperiment, "stepSize", None)
-        required = simulation.fixedInternalStepSize or (
-            None if simulation.canHandleVariableCommunicationStepSize else default
-        )
-        step = stated or float(required or 0.0)
+        takes_any = simulation.canHandleVariableCommunicationStepSize
+        step = stated or float(simulation.fixedInternalStepSize or (not takes_any and default) or 0.0)
         if step and not MIN_STEP <= step <= MAX_STEP:
-            raise InputError(
-                source,
-                f"{Path(self.path).name} requires a step of {step:g} s",
-                f"a step from {MIN_STEP:g} to {MAX_STEP:g} s; {key}.step sets another",
-            )
+            problem = f"{Path(self.path).name} requires a step of {step:g} s"
+            expected = f"a step from {MIN_STEP:g} to {MAX_STEP:g} s; {key}.step sets another"
+            raise InputError(source, problem, expected)
         return step or None
 
     def variable(
@@ -174,41 +156,102 @@ class Description:
         InputError
             If the variable does not exist, or has another causality or type.
         """
-        variable = self.variables.get(name)
-        if variable is not None and causality_of(variable) in causalities and variable.type in types:
-            return variable
-        others = self.variables.values()
-        names = [other.name for other in others if causality_of(other) in causalities and other.type in types]
-        problem = f"is no {' or '.join(causalities)} of {Path(self.path).name} that holds a number"
-        raise unknown_name(source, f"{key} = {name!r} {problem}", name, names[:MAX_LISTED])
+        legal = {
+            variable.name: variable
+            for variable in self.variables.values()
+            if causality_of(variable) in causalities and variable.type in types
+        }
+        if name not in legal:
+            problem = f"is no {' or '.join(causalities)} of {Path(self.path).name} that holds a number"
+            raise unknown_name(source, f"{key} = {name!r} {problem}", name, list(legal)[:MAX_LISTED])
+        return legal[name]
 
-    def unit_of(self, variable: ModelVariable) -> Unit | None:
-        """The unit of a variable; None if it declares none, or one that is not defined."""
-        name = declared(variable, "unit")
-        unit = self.units.get(name) or COMMON_UNITS.get(name)
-        return unit._replace(offset=0.0) if unit is not None and declared(variable, "relativeQuantity") else unit
+    def unit(self, name: str) -> Unit | None:
+        """A unit by its name; None if neither the FMU nor this module defines it."""
+        return self.units.get(name) or COMMON_UNITS.get(name)
 
-    def unit_for(self, variable: ModelVariable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
-        """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable declares no
-        unit.
+    def units_between(self, variable: ModelVariable, unit: str) -> tuple[Unit, Unit] | None:
+        """The unit of a variable and the unit in which its values are given: equal if it declares none; None if they
+        are not of one kind, or not defined.
+        """
+        name = declared(variable, "unit") if variable.type in REAL_TYPES else ""
+        own, given = self.unit(name), self.unit(unit)
+        if name in ("", unit):
+            return COMMON_UNITS["-"], COMMON_UNITS["-"]
+        if own is None or given is None or own.exponents != given.exponents:
+            return None
+        return own._replace(offset=0.0) if declared(variable, "relativeQuantity") else own, given
+
+    def ports(
+        self,
+        names: Mapping[str, str],
+        units: Mapping[str, str],
+        causalities: Collection[str],
+        source: str,
+        key: str,
+        constants: Collection[str] = (),
+        types: Collection[str] = NUMBER_TYPES,
+    ) -> dict[str, Port]:
+        """The ports that a table of a study names, by quantity.
+
+        Parameters
+        ----------
+        names
+            Names of variables by quantity, from the study.
+        units
+            Unit of every legal quantity.
+        key
+            The table's key in the study.
+        constants
+            Quantities that are constant during a run: parameters may take them, too.
 
         Raises
         ------
         InputError
-            If the unit of the variable measures another kind of quantity or is not defined.
+            If a quantity or variable does not exist, or the variable cannot hold the quantity.
         """
-        name, variable_unit = declared(variable, "unit"), self.unit_of(variable)
-        if variable.type not in REAL_TYPES or not name:
-            return unit
-        if variable_unit is None:
-            raise InputError(
-                source,
-                f"{key} = {variable.name!r}: its unit {name!r} has no BaseUnit in the UnitDefinitions",
-                f"a unit with a BaseUnit of the same kind as {unit_name}",
+        ports: dict[str, Port] = {}
+        for quantity, name in names.items():
+            where = f"{key}.{quantity}"
+            if quantity not in units:
+                raise unknown_name(source, f"{where}: there is no such quantity", quantity, units)
+            legal_causalities = (*causalities, "parameter") if quantity in constants else causalities
+            variable = self.variable(name, legal_causalities, source, where, types)
+            both_units = self.units_between(variable, units[quantity])
+            if both_units is None:
+                problem = f"{where} = {name!r}: its unit is {declared(variable, 'unit')!r}"
+                expected = f"a unit of the same kind as {units[quantity]}, with a BaseUnit in the UnitDefinitions"
+                raise InputError(source, problem, expected)
+            port = Port(variable, *both_units)
+            lower, upper = (number_of(variable, end) if port.is_input else None for end in ("min", "max"))
+            ports[quantity] = port._replace(
+                lower=-np.inf if lower is None else lower, upper=np.inf if upper is None else upper
             )
-        if not variable_unit.fits(unit):
-            raise InputError(source, f"{key} = {variable.name!r}: its unit is {name!r}", f"a unit of {unit_name}")
-        return variable_unit
+        return ports
+
+    def constants(
+        self, values: Mapping[str, Constant], ports: Collection[Port], source: str, key: str
+    ) -> list[tuple[ModelVariable, Constant]]:
+        """Parameters that a study sets besides the `ports` that it writes, with their values in the FMU's units.
+
+        Raises
+        ------
+        InputError
+            As `ports`; also if two parameters or ports have the same value reference, hence the same value.
+        """
+        constants = []
+        for name, value in values.items():
+            variable = self.variable(name, ("parameter", "structuralParameter"), source, key, (*NUMBER_TYPES, "String"))
+            if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
+                raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
+            constants.append((variable, value))
+        for one, other in combinations([port.variable for port in ports] + [variable for variable, _ in constants], 2):
+            if (one.type, one.valueReference) == (other.type, other.valueReference):
+                problem = (
+                    f"{key.partition('.')[0]}: {one.name!r} and {other.name!r} have one value, and two keys set it"
+                )
+                raise InputError(source, problem, "one key for each value reference of the FMU")
+        return constants
 
     def table_rows(self, fixed_names: Collection[str]) -> dict[str, dict[str, str | float]]:
         """Rows of the characteristics' table for all real parameters with start, min and max, except those of
@@ -227,27 +270,30 @@ class Description:
 
     def table_row(self, name: str, unit: str = "") -> dict[str, str | float]:
         """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no
-        parameter.
+        parameter or has another kind of unit, which the vehicle model refuses.
         """
         variable = self.variables.get(name)
         if variable is None or causality_of(variable) != "parameter":
             return {}
-        declared_name, meaning = declared(variable, "unit"), " ".join((variable.description or "").split())
-        numbers = {
-            key: number
-            for key, attribute in (("original", "start"), ("lower", "min"), ("upper", "max"))
-            if (number := number_of(variable, attribute)) is not None
-        }
-        row_unit, declared_unit = self.units.get(unit) or COMMON_UNITS.get(unit), self.unit_of(variable)
-        if unit and declared_name not in ("", unit):
-            if declared_unit is None or row_unit is None or not declared_unit.fits(row_unit):
-                return {}  # the vehicle model refuses the unit later
-            numbers = {key: declared_unit.to(row_unit, number) for key, number in numbers.items()}
+        own_name, meaning = declared(variable, "unit"), " ".join((variable.description or "").split())
+        units = self.units_between(variable, unit or own_name)
+        if units is None:
+            return {}
+        ends = {"original": "start", "lower": "min", "upper": "max"}
+        numbers = {key: number_of(variable, attribute) for key, attribute in ends.items()}
         return {
-            "unit": declared_name or "-",
-            **numbers,
+            "unit": own_name or "-",
+            **{key: units[0].to(units[1], number) for key, number in numbers.items() if number is not None},
             **({"meaning": meaning} if 0 < len(meaning) <= MAX_MEANING else {}),
         }
+
+
+PYTHON_TYPES: Mapping[str, tuple[type, ...]] = {
+    "String": (str,),
+    "Boolean": (bool,),
+    **dict.fromkeys(REAL_TYPES, (int, float)),
+}
+"""Python types that a study may give parameters of an FMI type; other FMI types take whole numbers."""
 
 
 def causality_of(variable: ModelVariable) -> str:
@@ -287,44 +333,45 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
     """
     path = file_of(model, folders)
     if not path:
-        raise InputError(
-            source,
-            f"{key} = {model!r}: there is no such file in {folders[0] if folders else os.getcwd()}",
-            SUPPORTED_FMU,
-        )
+        place = folders[0] if folders else os.getcwd()
+        raise InputError(source, f"{key} = {model!r}: there is no such file in {place}", SUPPORTED_FMU)
     return _read_description(path, sha256(Path(path).read_bytes()).hexdigest(), source, f"{key} = {model!r}")
 
 
 @lru_cache(maxsize=32)
 def _read_description(path: str, digest: str, source: str, name: str) -> Description:
+    """Read an FMU, which is unpacked in the user's cache folder by the digest of its file."""
     try:
-        from fmpy import platform, platform_tuple, supported_platforms
+        from fmpy import extract, platform, platform_tuple, supported_platforms
         from fmpy.model_description import read_model_description
     except ImportError:
         raise InputError(
             source, f"{name} needs FMPy, which is not installed", "in the checkout: pip install '.[fmu]'"
         ) from None
+    folder = platformdirs.user_cache_path("safevar_sumo") / "fmus" / digest
     try:
-        model = read_model_description(path, validate=False)
-        platforms = {*supported_platforms(path)}
+        if not folder.is_dir():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as new:
+                extract(path, new)
+                with suppress(OSError):  # another process was faster
+                    os.rename(new, folder)
+        model = read_model_description(folder, validate=False)
+        platforms = {*supported_platforms(folder)}
     except Exception as error:  # any error of FMPy about a user's file
         raise InputError(source, f"{name} cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
     if not model.fmiVersion.startswith(("2.", "3.")) or model.coSimulation is None:
-        kind = "" if model.coSimulation is None else "for co-simulation"
-        raise InputError(
-            source, f"{name} is of FMI {model.fmiVersion}, {kind or 'not for co-simulation'}", SUPPORTED_FMU
+        problem = (
+            f"{name} is of FMI {model.fmiVersion}{', not for co-simulation' if model.coSimulation is None else ''}"
         )
+        raise InputError(source, problem, SUPPORTED_FMU)
     if not {platform, platform_tuple} & platforms:
         problem = f"{name} has no binary for this machine, only for {', '.join(sorted(platforms)) or 'none'}"
         raise InputError(source, problem, f"binaries/{platform}")
     units = {
-        unit.name: Unit(
-            tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS),
-            float(unit.baseUnit.factor),
-            float(unit.baseUnit.offset),
-        )
+        unit.name: Unit(tuple(getattr(base, each) for each in BASE_UNITS), base.factor, base.offset)
         for unit in model.unitDefinitions
-        if unit.baseUnit is not None
+        if (base := unit.baseUnit) is not None
     }
     variables = {variable.name: variable for variable in model.modelVariables if not variable.dimensions}
-    return Description(path, digest, model, units, variables)
+    return Description(path, digest, str(folder), model, units, variables)

@@ -8,23 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
-from safevar_sumo.fmu import (
-    COMMON_UNITS,
-    REAL_TYPES,
-    SI,
-    Description,
-    Fleet,
-    History,
-    Instances,
-    Port,
-    Unit,
-    constants_of,
-    declared,
-    ports_of,
-)
+from safevar_sumo.fmu import REAL_TYPES, Description, Fleet, History, Instances
+from safevar_sumo.fmu.description import COMMON_UNITS, Unit
 from safevar_sumo.plugins import POSITIVE, Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.study import CharacteristicTable
 from safevar_sumo.study.schema import Parameters
 from safevar_sumo.vehicles.base import LEGAL_STATE, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
@@ -40,11 +27,12 @@ DEFAULT_LAG = 0.1
 """Actuator lag that a driving system assumes if the study gives no `tau` [s]."""
 SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
 SENSOR_FIELDS = {"latency": "latency", "range": "reach"}  # fields of `Sensors` by the study's names
-LEGAL_ENTRIES = {
-    "inputs": "the input for that pedal",
-    "outputs": "the output that holds the speed",
-    "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU",
+REQUIRED = {
+    "inputs": (PEDALS, "the input for that pedal"),
+    "outputs": (("speed",), "the output that holds the speed"),
+    "sumo_type": (TYPE_UNITS, "a number in SI units; or a characteristic, or an output or parameter of the FMU"),
 }
+"""Required quantities in tables of the study, and what they may be."""
 READABLE_CAUSALITIES = ("output", "calculatedParameter", "parameter", "local")
 
 
@@ -93,127 +81,72 @@ class FmuVehicle(Vehicle):
     UNITS: Mapping[str, str]
 
     def __init__(self, description: Description, units: Mapping[str, str], table: Parameters, guard: Guard) -> None:
-        source, self._guard = guard.source, guard
+        source, self._guard, self.UNITS = guard.source, guard, dict(units)
         self._communication_step = description.communication_step(table["step"], source, "vehicle")
-        self.UNITS = dict(units)
-        self._sensor_entries, self._type_entries = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
-        self._check_entries("sensors", self._sensor_entries, SENSOR_UNITS, table["characteristics"])
-        self._check_entries("sumo_type", self._type_entries, TYPE_UNITS, table["characteristics"])
-        input_ports = ports_of(
-            description,
-            table["inputs"],
-            {**PEDALS, **CONSTANTS},
-            ("input",),
-            source,
-            "vehicle.inputs",
-            constants=CONSTANTS,
-        )
-        output_ports = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
-        for key, entries, required in (
-            ("inputs", input_ports, PEDALS),
-            ("outputs", output_ports, ("speed",)),
-            ("sumo_type", self._type_entries, TYPE_UNITS),
-        ):
-            for name in required:
+        self._sensor_entries, self._type_entries = table["sensors"], {"tau": DEFAULT_LAG, **table["sumo_type"]}
+        for key, entries in {**table, "sumo_type": self._type_entries}.items():
+            names, expected = REQUIRED.get(key, ((), ""))
+            for name in names:
                 if name not in entries:
-                    raise InputError(source, f"vehicle.{key}.{name} is missing", LEGAL_ENTRIES[key])
-        self._characteristic_units = {
-            **self._characteristic_units_of(description, "sensors", self._sensor_entries, SENSOR_UNITS),
-            **self._characteristic_units_of(description, "sumo_type", self._type_entries, TYPE_UNITS),
+                    raise InputError(source, f"vehicle.{key}.{name} is missing", expected)
+        self._units: dict[str, tuple[Unit, Unit]] = {}
+        self._read_entries("sensors", self._sensor_entries, SENSOR_UNITS, description, table)
+        variables = self._read_entries("sumo_type", self._type_entries, TYPE_UNITS, description, table)
+        quantities = {**PEDALS, **CONSTANTS}
+        inputs = description.ports(table["inputs"], quantities, ("input",), source, "vehicle.inputs", CONSTANTS)
+        outputs = description.ports(table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
+        types = description.ports(variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
+        names = {
+            each: each for each in units if each in description.variables or each not in self._sensor_entries.values()
         }
-        characteristic_ports = {
-            name: self._characteristic_port(description, name, unit)
-            for name, unit in units.items()
-            if name in description.variables or name not in self._sensor_entries.values()
-        }
-        type_variables = {
-            name: entry for name, entry in self._type_entries.items() if isinstance(entry, str) and entry not in units
-        }
-        type_ports = ports_of(
-            description, type_variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type"
-        )
-        self._inputs, self._characteristics = tuple(input_ports), tuple(characteristic_ports)
-        self._outputs, self._reads_type = (*output_ports, *type_ports), bool(type_ports)
-        ports = [*input_ports.values(), *characteristic_ports.values()]
-        constants = constants_of(description, table["parameters"], ports, source, "vehicle.parameters")
-        self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants)
+        key = "vehicle.characteristics"
+        characteristics = description.ports(names, units, ("parameter",), source, key, types=REAL_TYPES)
+        self._inputs, self._characteristics = tuple(inputs), tuple(characteristics)
+        self._outputs, self._reads_type = (*outputs, *types), bool(types)
+        ports = [*inputs.values(), *characteristics.values()]
+        constants = description.constants(table["parameters"], ports, source, "vehicle.parameters")
+        self._instances = Instances(description, ports, [*outputs.values(), *types.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
-        self.takes_slope, self.can_start_moving = "grade" in input_ports, "initial_speed" in input_ports
-        if "road_friction" not in input_ports:
+        if "road_friction" not in inputs:
             self.remarks = [
                 f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it "
                 "accelerates and brakes"
             ]
 
-    def _check_entries(
+    def _read_entries(
         self,
         key: str,
         entries: Mapping[str, str | float],
         quantities: Mapping[str, str],
-        table: Mapping[str, CharacteristicTable],
-    ) -> None:
-        """Refuse names of no quantity, and wrong values, in the study's table `vehicle.sensors` or
-        `vehicle.sumo_type`.
+        description: Description,
+        table: Parameters,
+    ) -> dict[str, str]:
+        """Check the study's table `vehicle.sensors` or `vehicle.sumo_type`, whose entries are numbers or
+        characteristics, and keep the units of the latter; returns the entries that are neither, variables of the FMU.
         """
+        variables = {}
         for name, entry in entries.items():
+            where, row = f"vehicle.{key}.{name}", table["characteristics"].get(entry)
             if name not in quantities:
-                raise unknown_name(
-                    self._guard.source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities
-                )
-            if key == "sensors" and isinstance(entry, str) and entry not in self.UNITS:
-                raise unknown_name(
-                    self._guard.source,
-                    f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic",
-                    entry,
-                    self.UNITS,
-                    ", or a number",
-                )
-            self._refuse_too_small(table, f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
-
-    def _refuse_too_small(
-        self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool
-    ) -> None:
-        """Refuse a negative number, or a characteristic with a negative lower end; 0 is legal only with `may_be_0`."""
-        lower = table[entry].lower if isinstance(entry, str) and entry in table else entry
-        if not isinstance(lower, str) and (lower < 0 or (lower == 0 and not may_be_0)):
-            problem = (
-                f"{key} = {lower:g}"
-                if lower is entry
-                else f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {key}"
-            )
-            raise InputError(self._guard.source, problem, "a number of at least 0" if may_be_0 else "a number above 0")
-
-    def _characteristic_port(self, description: Description, name: str, unit: str) -> Port:
-        key = f"vehicle.characteristics.{name}"
-        variable = description.variable(name, ("parameter",), self._guard.source, key, REAL_TYPES)
-        variable_unit = declared(variable, "unit")
-        if unit == (variable_unit or unit) or (unit == "-" and variable_unit in ("", "1")):
-            return Port(variable, SI["-"], SI["-"])
-        defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
-        if defined_unit is None:
-            raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable_unit))
-        return Port(
-            variable,
-            description.unit_for(variable, defined_unit, unit, self._guard.source, f"{key}.unit"),
-            defined_unit,
-        )
-
-    def _characteristic_units_of(
-        self, description: Description, key: str, entries: Mapping[str, str | float], quantities: Mapping[str, str]
-    ) -> dict[str, tuple[Unit, Unit]]:
-        """The units of the characteristics that set quantities, and of those quantities."""
-        pairs = {}
-        for name, unit in quantities.items():
-            if isinstance(entry := entries.get(name), str) and entry in self.UNITS:
-                defined_unit = description.units.get(self.UNITS[entry]) or COMMON_UNITS.get(self.UNITS[entry])
-                if defined_unit is None or not defined_unit.fits(SI[unit]):
-                    raise InputError(
-                        self._guard.source,
-                        f"vehicle.{key}.{name} = {entry!r}: the unit of that characteristic is {self.UNITS[entry]!r}",
-                        f"a unit of {unit}",
-                    )
-                pairs[entry] = defined_unit, SI[unit]
-        return pairs
+                raise unknown_name(self._guard.source, f"{where}: there is no such quantity", name, quantities)
+            if row is None and isinstance(entry, str):
+                if key == "sensors":
+                    problem = f"{where} = {entry!r}: there is no such characteristic"
+                    raise unknown_name(self._guard.source, problem, entry, self.UNITS, ", or a number")
+                variables[name] = entry
+                continue
+            lower = entry if row is None else row.lower
+            if lower < 0 or (lower == 0 and name != "latency"):
+                problem = f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {where}"
+                expected = "a number of at least 0" if name == "latency" else "a number above 0"
+                raise InputError(self._guard.source, problem if row else f"{where} = {lower:g}", expected)
+            if row is not None:
+                unit, si_unit = description.unit(row.unit), COMMON_UNITS[quantities[name]]
+                if unit is None or unit.exponents != si_unit.exponents:
+                    problem = f"{where} = {entry!r}: the unit of that characteristic is {row.unit!r}"
+                    raise InputError(self._guard.source, problem, f"a unit of {quantities[name]}")
+                self._units[name] = unit, si_unit
+        return variables
 
     def prepare(
         self,
@@ -224,12 +157,8 @@ class FmuVehicle(Vehicle):
         wet: bool | BoolArray = False,
     ) -> _Prepared:
         n = len(next(iter(characteristics.values())))
-        if slope is not LEVEL and not self.takes_slope:
-            raise UserCodeError(
-                self._guard.source,
-                f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
-                "a variable for the grade, or scenarios with grade 0",
-            )
+        if slope is not LEVEL and "grade" not in self._inputs:
+            self._refuse_road("grade", "the road has a grade", "grade 0")
         zeros = np.zeros(n)
         inputs = {
             "throttle": zeros,
@@ -240,34 +169,30 @@ class FmuVehicle(Vehicle):
             "step": zeros + step,
             "initial_speed": zeros,
         }
-        fleet = Fleet(self._instances, n, step, self._communication_step)
-        outputs = {}
+        fleet, outputs = Fleet(self._instances, n, step, self._communication_step), dict[str, FloatArray]()
         if self._reads_type:
-            outputs = dict(
-                zip(self._outputs, self._start(fleet, self._input_array(inputs, characteristics))[0], strict=True)
-            )
+            values, _ = self._guard.call("initialisation", fleet.start, self._input_array(inputs, characteristics))
+            outputs = dict(zip(self._outputs, values, strict=True))
 
-        def quantity_values(entry: str | float, name: str) -> FloatArray:
-            """Values of the quantity `name`, shape (n,): its entry is a number, a characteristic, or an output of the
-            FMU.
-            """
+        def quantity(name: str, entry: str | float) -> FloatArray:
+            """Values of a quantity, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
             if not isinstance(entry, str):
                 return zeros + entry
-            if entry not in characteristics:
-                return np.asarray(outputs[name])
-            unit, quantity_unit = self._characteristic_units[entry]
-            return np.asarray(unit.to(quantity_unit, characteristics[entry]))
+            if name not in self._units:
+                return outputs[name]
+            unit, si_unit = self._units[name]
+            return unit.to(si_unit, characteristics[entry])
 
-        types = SumoType(
-            *(
-                self._guard.numbers("sumo_type", name, quantity_values(self._type_entries[name], name), (n,), POSITIVE)
-                for name in TYPE_UNITS
-            )
+        types = {name: quantity(name, self._type_entries[name]) for name in TYPE_UNITS}
+        checked = [self._guard.numbers("sumo_type", name, values, (n,), POSITIVE) for name, values in types.items()]
+        sensors = {SENSOR_FIELDS[name]: quantity(name, entry) for name, entry in self._sensor_entries.items()}
+        return _Prepared(
+            fleet, inputs, characteristics, SumoType(*checked), Sensors.perfect(n)._replace(**sensors), step
         )
-        sensors = Sensors.perfect(n)._replace(
-            **{SENSOR_FIELDS[name]: quantity_values(entry, name) for name, entry in self._sensor_entries.items()}
-        )
-        return _Prepared(fleet, inputs, characteristics, types, sensors, step)
+
+    def _refuse_road(self, name: str, reason: str, otherwise: str) -> None:
+        problem = f"{self._guard.name} has no vehicle.inputs.{name}, and {reason}"
+        raise UserCodeError(self._guard.source, problem, f"a variable for it, or scenarios with {otherwise}")
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types
@@ -280,18 +205,12 @@ class FmuVehicle(Vehicle):
 
     def at_start(self, prepared: _Prepared, speed: FloatArray) -> _State:
         """The initial state at a speed [m/s], shape (N,)."""
-        if np.any(speed > 0) and not self.can_start_moving:
-            problem = (
-                f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road "
-                "in motion"
-            )
-            raise UserCodeError(
-                self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0"
-            )
+        if np.any(speed > 0) and "initial_speed" not in self._inputs:
+            self._refuse_road("initial_speed", "the traffic puts it onto the road in motion", "departSpeed 0")
         inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
-        outputs, history = self._start(prepared.fleet, inputs)
+        outputs, history = self._guard.call("initialisation", prepared.fleet.start, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
-        state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
+        state = self._state(outputs, outputs, released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
             raise self._guard.wrong_value(
                 "initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed"
@@ -315,18 +234,13 @@ class FmuVehicle(Vehicle):
         (point_outputs, step_outputs), history = self._guard.call(
             "doStep", prepared.fleet.advance, state.history, inputs
         )
-        outputs = dict(zip(self._outputs, point_outputs, strict=True))
-        outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
-        next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
+        next_state = self._state(point_outputs, step_outputs, command, state.seen, history)
+        max_speed = prepared.types.max_speed
         for i in open_rows(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
             raise self._guard.wrong_value(
                 "doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}"
             )
         return next_state
-
-    def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
-        outputs, history = self._guard.call("initialisation", fleet.start, inputs)
-        return outputs, history
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
         return np.stack(
@@ -334,11 +248,12 @@ class FmuVehicle(Vehicle):
         )
 
     def _state(
-        self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History
+        self, outputs: FloatArray, end_outputs: FloatArray, command: Command, seen: FloatArray | None, history: History
     ) -> _State:
-        n = command.throttle.shape
-        speed = np.where(np.abs(outputs["speed"]) < SPEED_ROUNDING, 0.0, outputs["speed"])
-        values = {"gear": np.ones(n), **command._asdict(), **outputs, "speed": speed}
+        """The state by the outputs at the last communication point, and by the speed at the end of the step."""
+        n, speed = command.throttle.shape, end_outputs[self._outputs.index("speed")]
+        values = {"gear": np.ones(n), **command._asdict(), **dict(zip(self._outputs, outputs, strict=True))}
+        values["speed"] = np.where(np.abs(speed) < SPEED_ROUNDING, 0.0, speed)
         columns = {
             name: self._guard.numbers("doStep", name, values[name], n, legal) for name, legal in LEGAL_STATE.items()
         }
