@@ -144,7 +144,8 @@ class Instances:
 
     def _write(self, slave: FMU2Slave, variable: ModelVariable, value: Constant) -> None:
         write = getattr(slave, f"set{self._function(variable)}")
-        write([variable.valueReference], [CONVERSIONS.get(variable.type, round)(value)])
+        convert = CONVERSIONS.get(variable.type)
+        write([variable.valueReference], [round(float(value)) if convert is None else convert(value)])
 
     def _function(self, variable: ModelVariable) -> str:
         """End of the names of the functions that set and get a variable."""

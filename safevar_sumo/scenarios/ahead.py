@@ -291,7 +291,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     @property
     def gap(self) -> float:
         """Gap to the target at the start [m]."""
-        return self.parameter("headway") * self.speed * KMH
+        return float(self.parameter("headway")) * self.speed * KMH
 
     @property
     def direction(self) -> Direction:

@@ -47,46 +47,34 @@ TYRE_STEPS = 3  # per substep, at every speed; PhysX's number below 5 m/s (setSu
 class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
-    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Quantities with names in
-    `per_step` are divided by the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and
-    by `speed_by_air` per unit of squared speed; the slope pulls with `pull` [N] and reduces it by `speed_by_slope`.
-    Below the speed `standstill` the tyres hold a braked vehicle. `grip` is the largest tyre force [N], `assumed_height`
-    the camera's assumed height over its actual height [-].
+    Inertias are divided by the tyre step, in which the speed changes by `speed_by_force` per unit of force; the slope
+    pulls with `pull` [N] and reduces it by `speed_by_slope`. Below the speed `standstill` the tyres hold a braked
+    vehicle. `grip` is the largest tyre force [N], `assumed_height` the camera's assumed height over its actual height
+    [-].
     """
 
     substeps: int
     step: float
-    throttle_rates: tuple[FloatArray, FloatArray]
-    brake_rates: tuple[FloatArray, FloatArray]
     mass: FloatArray
     radius: FloatArray
-    engine_inertia_per_step: FloatArray
-    wheel_inertia_per_step: FloatArray
-    unbraked_wheel_inertia: FloatArray
+    engine_inertia: FloatArray
+    wheel_inertia: FloatArray
     wheel_damping: FloatArray
     brake_torque: FloatArray
     grip: FloatArray
     slip_stiffness: FloatArray  # K / (3 |slip|)
     clutch: FloatArray
-    engine_torque: FloatArray
     engine_limit: FloatArray
     damping_full: FloatArray
     damping_engaged: FloatArray
     damping_neutral: FloatArray
     shift_time: FloatArray
-    shift_end: FloatArray
-    shift_latency: FloatArray
-    shift_up: FloatArray
-    shift_down: FloatArray
     air_drag: FloatArray
     speed_by_force: FloatArray
-    speed_by_air: FloatArray
     pull: FloatArray
     speed_by_slope: FloatArray
-    standstill: FloatArray
     assumed_height: FloatArray
-    slip_offset: FloatArray
-    zeros: FloatArray
+    standstill: FloatArray
 
 
 class CarlaState(NamedTuple):
@@ -109,7 +97,7 @@ def _driveline(p: _Prepared, gear: FloatArray) -> tuple[FloatArray, ...]:
     in_gear, ratio = gear > NEUTRAL, OVERALL_RATIOS[gear.astype(np.intp)]
     clutch, damping = p.clutch * in_gear, np.where(in_gear, p.damping_engaged, p.damping_neutral)
     by_ratio = ratio * clutch
-    return clutch, by_ratio, by_ratio * ratio, p.engine_inertia_per_step + damping, p.damping_full - damping
+    return clutch, by_ratio, by_ratio * ratio, p.engine_inertia + damping, p.damping_full - damping
 
 
 class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -181,44 +169,31 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         substeps = math.ceil(step / SUBSTEP - TIME_ROUNDING)
         substep = step / substeps
         tyre_step = substep / TYRE_STEPS
-        wheel_inertia, wheel_damping = WHEELS * 0.5 * WHEEL_MASS * radius * radius, WHEELS * c["dampRate"]
-        air_drag, speed_by_force = 0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"], tyre_step / c["mass"]
         prepared = _Prepared(
             substeps=substeps,
             step=substep,
             mass=c["mass"],
             radius=radius,
-            throttle_rates=(np.array(-self.throttle_fall * substep), np.array(self.throttle_rise * substep)),
-            brake_rates=(np.array(-self.brake_fall * substep), np.array(self.brake_rise * substep)),
-            engine_inertia_per_step=np.array(ENGINE_INERTIA / tyre_step),
-            wheel_inertia_per_step=wheel_inertia / tyre_step,
-            unbraked_wheel_inertia=wheel_inertia / tyre_step + wheel_damping,
-            wheel_damping=wheel_damping,
+            engine_inertia=np.array(ENGINE_INERTIA / tyre_step),
+            wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius / tyre_step,
+            wheel_damping=WHEELS * c["dampRate"],
             brake_torque=WHEELS * c["maxBrakeTorque"],
             grip=grip,
             slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
             clutch=c["clutchStrength"],
-            engine_torque=np.array(self.engine_torque),
             engine_limit=c["max_rpm"] * RPM,
             damping_full=c["dampRateFullT"],
             damping_engaged=c["dampRateZeroT_CE"],
             damping_neutral=c["dampRateZeroT_CD"],
             shift_time=c["gearSwitchTime"],
-            shift_end=c["gearSwitchTime"] - TIME_ROUNDING,
-            shift_latency=np.array(self.shift_latency),
-            shift_up=np.array(self.shift_up),
-            shift_down=np.array(self.shift_down),
-            air_drag=air_drag,
-            speed_by_force=speed_by_force,
-            speed_by_air=speed_by_force * air_drag,
+            air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"],
+            speed_by_force=tyre_step / c["mass"],
             pull=c["mass"] * slope.back,
             speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
-            slip_offset=np.full_like(radius, self.slip_offset),
-            zeros=np.zeros_like(radius),
-            standstill=np.zeros_like(radius),
+            standstill=HOLD_SPEED,
         )
-        creep_speed, _ = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.zeros)
+        creep_speed, _ = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), np.zeros_like(radius))
         return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -259,21 +234,21 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
         gear = np.ones_like(p.mass)
         for ratio in OVERALL_RATIOS[1:-1]:
-            gear += engine_in(ratio)[-1] > p.shift_up * p.engine_limit
+            gear += engine_in(ratio)[-1] > self.shift_up * p.engine_limit
         clutch_torque, brake_torque, engine_speed = engine_in(OVERALL_RATIOS[gear.astype(np.intp)])
         brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
         throttle_torque = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
         throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(throttle_torque, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
-        shifts_down = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
-        since_shift = np.where(shifts_down, p.shift_time, p.shift_latency)
+        shifts_down = (gear > 1) & (engine_speed < self.shift_down * p.engine_limit)
+        since_shift = np.where(shifts_down, p.shift_time, self.shift_latency)
         return CarlaState(speed, wheel_speed, engine_speed, gear, gear, since_shift, throttle, brake)
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
         """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may
         shift at once.
         """
-        since_shift = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
+        since_shift = np.where(state.since_shift < 0, self.shift_latency, state.since_shift)
         return state._replace(since_shift=np.where(holds, -np.inf, since_shift))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -283,8 +258,10 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         root = np.ones_like(speed)
         for _ in range(NEWTON_STEPS):  # root^3 = 1 - force / grip; see `_tyre_force`
             root = root - (root * root * root - 1 + share) / (3 * root * root)
-        driving_rim = (p.slip_stiffness * speed + p.slip_offset * (1 - root)) / (p.slip_stiffness - 1 + root)
-        return np.where(force < 0, speed - (speed + p.slip_offset) * (1 - root) / p.slip_stiffness, driving_rim), force
+        driving_rim = (p.slip_stiffness * speed + self.slip_offset * (1 - root)) / (p.slip_stiffness - 1 + root)
+        return np.where(
+            force < 0, speed - (speed + self.slip_offset) * (1 - root) / p.slip_stiffness, driving_rim
+        ), force
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
@@ -296,13 +273,15 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
         p, s, driveline = prepared, state, None
         for _ in range(p.substeps):
-            throttle = _pedal_position(command.throttle, s.throttle, p.throttle_rates)
-            brake = _pedal_position(command.brake, s.brake, p.brake_rates)
-            gear, target, since_shift = _shift(p, s, throttle)
+            throttle = _pedal_position(
+                command.throttle, s.throttle, self.throttle_fall * p.step, self.throttle_rise * p.step
+            )
+            brake = _pedal_position(command.brake, s.brake, self.brake_fall * p.step, self.brake_rise * p.step)
+            gear, target, since_shift = self._shift(p, s, throttle)
             if driveline is None or gear is not s.gear:
                 driveline = _driveline(p, gear)
             s = CarlaState(*self._roll(p, s, driveline, throttle, brake), gear, target, since_shift, throttle, brake)
-        is_held = (s.brake > p.zeros) & (s.speed < p.standstill)
+        is_held = (s.brake > ZERO) & (s.speed < p.standstill)
         if np.count_nonzero(is_held):
             s.speed[is_held] = s.wheel_speed[is_held] = ZERO
         return s
@@ -323,29 +302,40 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """
         clutch, clutch_times_ratio, clutch_at_wheel, engine_without_throttle, damping_by_throttle = driveline
         engine = engine_without_throttle + damping_by_throttle * throttle + clutch
-        wheel = p.unbraked_wheel_inertia + clutch_at_wheel * (ONE - clutch / engine)
+        wheel = p.wheel_inertia + p.wheel_damping + clutch_at_wheel * (ONE - clutch / engine)
         # Coefficients of a tyre step for the speeds (of a wheel, at its rim), for torques and for the tyre force:
-        engine_share = p.engine_inertia_per_step / engine
+        engine_share = p.engine_inertia / engine
         engine_gain = throttle * self._torque(p, s.engine_speed) / engine
         rim_by_torque = p.radius / wheel
-        rim_share, rim_by_engine = p.wheel_inertia_per_step / wheel, clutch_times_ratio * rim_by_torque
+        rim_share, rim_by_engine = p.wheel_inertia / wheel, clutch_times_ratio * rim_by_torque
         rim_loss = brake * p.brake_torque * rim_by_torque
-        rim_by_force, speed_by_force = p.radius * rim_by_torque, p.speed_by_force
-        speed_loss = p.speed_by_air * s.speed * s.speed + p.speed_by_slope
-        slip_by_force = rim_by_force + speed_by_force
+        rim_by_force = p.radius * rim_by_torque
+        speed_loss = p.speed_by_force * p.air_drag * s.speed * s.speed + p.speed_by_slope
+        slip_by_force = rim_by_force + p.speed_by_force
         engine_by_rim = clutch_times_ratio / (engine * p.radius)
 
-        speed, rim, engine_speed, zeros = s.speed, p.radius * s.wheel_speed, s.engine_speed, p.zeros
+        speed, rim, engine_speed = s.speed, p.radius * s.wheel_speed, s.engine_speed
         for _ in range(TYRE_STEPS):
             free_engine_speed = engine_share * engine_speed + engine_gain
             free_rim = rim_share * rim + rim_by_engine * free_engine_speed - rim_loss
             slip_end_force = (free_rim - speed) / slip_by_force
             force = self._tyre_force(p, speed, rim)
-            force = np.minimum(np.maximum(force, np.minimum(slip_end_force, zeros)), np.maximum(slip_end_force, zeros))
-            rim = np.maximum(free_rim - rim_by_force * force, zeros)
+            force = np.minimum(np.maximum(force, np.minimum(slip_end_force, ZERO)), np.maximum(slip_end_force, ZERO))
+            rim = np.maximum(free_rim - rim_by_force * force, ZERO)
             engine_speed = np.minimum(free_engine_speed + engine_by_rim * rim, p.engine_limit)
-            speed = np.maximum(speed + speed_by_force * force - speed_loss, zeros)
+            speed = np.maximum(speed + p.speed_by_force * force - speed_loss, ZERO)
         return speed, rim / p.radius, engine_speed
+
+    def _shift(self, p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Automatic gearbox: gear, target gear, time since the last shift began [s]; in a shift the gear is neutral."""
+        is_ready, speed_share = s.since_shift >= self.shift_latency, s.engine_speed / p.engine_limit
+        sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > ZERO)
+        up = sets_off | is_ready & (speed_share > self.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+        down = is_ready & (speed_share < self.shift_down) & (s.gear > FIRST_GEAR)
+        target = s.target_gear + up - down
+        since_shift = np.where(up | down, ZERO, s.since_shift + p.step)
+        gear = np.where((target == s.gear) | (since_shift >= p.shift_time - TIME_ROUNDING), target, NEUTRAL)
+        return gear if np.count_nonzero(gear != s.gear) else s.gear, target, since_shift
 
     def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
         """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
@@ -353,8 +343,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
         F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
         """
-        slip_speed, denominator = rim - speed, np.maximum(rim, speed) + p.slip_offset
-        root = np.maximum(denominator - p.slip_stiffness * np.abs(slip_speed), p.zeros) / denominator
+        slip_speed, denominator = rim - speed, np.maximum(rim, speed) + self.slip_offset
+        root = np.maximum(denominator - p.slip_stiffness * np.abs(slip_speed), ZERO) / denominator
         force: FloatArray = np.copysign(p.grip - p.grip * root * root * root, slip_speed)
         return force
 
@@ -363,35 +353,10 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         speed_share = engine_speed / p.engine_limit
         rising_line = TORQUE_IDLE + TORQUE_RISE * speed_share
         falling_line = TORQUE_PEAK - TORQUE_FALL * (speed_share - PEAK_SPEED)
-        torque: FloatArray = p.engine_torque * np.minimum(rising_line, falling_line)
+        torque: FloatArray = self.engine_torque * np.minimum(rising_line, falling_line)
         return torque
 
 
-def _pedal_position(command: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Position of a pedal that follows its command at limited rates."""
-    fall, rise = rates
-    return pedal + np.minimum(np.maximum(command - pedal, fall), rise)
-
-
-def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Automatic gearbox; returns gear, target gear, and time since the last shift began [s]. During a shift the gear is
-    neutral.
-    """
-    target, since_shift = s.target_gear, s.since_shift + p.step
-    is_neutral, is_ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
-    n_neutral = np.count_nonzero(is_neutral)
-    # In most steps no vehicle can shift; then numpy has less to compute.
-    sets_off = is_neutral & (s.gear == target) & (throttle > p.zeros) if n_neutral else is_neutral
-    is_fast = is_slow = is_ready
-    if np.count_nonzero(is_ready):
-        speed_share = s.engine_speed / p.engine_limit
-        is_fast, is_slow = is_ready & (speed_share > p.shift_up), is_ready & (speed_share < p.shift_down)
-    if np.count_nonzero(sets_off) or np.count_nonzero(is_fast) or np.count_nonzero(is_slow):
-        up = sets_off | is_fast & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
-        down = is_slow & (s.gear > FIRST_GEAR)
-        target = target + up - down
-        since_shift[up | down] = ZERO
-    elif not n_neutral:
-        return s.gear, target, since_shift
-    gear = np.where((target == s.gear) | (since_shift >= p.shift_end), target, NEUTRAL)
-    return gear if np.count_nonzero(gear != s.gear) else s.gear, target, since_shift
+def _pedal_position(command: FloatArray, pedal: FloatArray, fall: float, rise: float) -> FloatArray:
+    """Position of a pedal that follows its command, with the largest fall and rise."""
+    return pedal + np.minimum(np.maximum(command - pedal, -fall), rise)

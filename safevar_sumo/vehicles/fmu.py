@@ -135,7 +135,7 @@ class FmuVehicle(Vehicle):
                     raise unknown_name(self._guard.source, problem, entry, self.UNITS, ", or a number")
                 variables[name] = entry
                 continue
-            lower = entry if row is None else row.lower
+            lower = float(entry) if row is None else row.lower
             if lower < 0 or (lower == 0 and name != "latency"):
                 problem = f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {where}"
                 expected = "a number of at least 0" if name == "latency" else "a number above 0"

@@ -49,26 +49,19 @@ SUBSTEPS = 2
 class _Prepared(NamedTuple):
     """Constants of a run, SI except engine speeds in r/min; shape (N,) or ().
 
-    `pedal_share` is the share of its error that a pedal makes up in a step, `engine_share` the share that the engine
-    speed makes up in a substep. In a substep the traction control raises or lowers its torque by `traction_change` [N
-    m]. `body` is the mass of body and wheels, `steering` the full steering angle.
+    `body` is the mass of body and wheels, `steering` the full steering angle.
     """
 
     step: FloatArray
     substep: FloatArray
-    pedal_share: FloatArray
-    engine_share: FloatArray
     mass: FloatArray
     weight: FloatArray  # load on the road [N]
     body: FloatArray
     slope_deceleration: float | FloatArray  # by the slope, g sin(angle) [m/s^2]
-    slope_loss: FloatArray  # speed lost to the slope in a substep [m/s]
     standstill: FloatArray
     radius: FloatArray
-    pull_by_stiffness: FloatArray
     inertia: FloatArray
     damping: FloatArray
-    damped_inertia: FloatArray
     brake_torque: FloatArray
     motor_torque: FloatArray
     least_rpm: FloatArray
@@ -77,7 +70,6 @@ class _Prepared(NamedTuple):
     rolling_drag: FloatArray
     shift_time: FloatArray
     slip_limit: FloatArray
-    traction_change: FloatArray
     friction: FloatArray
 
 
@@ -145,23 +137,17 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ) -> _Prepared:
         c, substep = characteristics, step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
-        damping = WHEELS * self.wheel_damping_share * c["wheelDamping"]
         prepared = _Prepared(
             step=np.array(step),
             substep=np.array(substep),
-            pedal_share=np.array(step / (step + self.pedal_lag)),
-            engine_share=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)),
             mass=c["mass"],
             weight=c["mass"] * slope.down,
             body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
             slope_deceleration=slope.back,
-            slope_loss=np.asarray(slope.back * substep),
             standstill=HOLD_SPEED,
             radius=c["radius"],
-            pull_by_stiffness=substep * c["radius"],
             inertia=inertia,
-            damping=damping,
-            damped_inertia=inertia + substep * damping,
+            damping=WHEELS * self.wheel_damping_share * c["wheelDamping"],
             brake_torque=WHEELS * c["maxBrakeTorque"],
             motor_torque=c["maxMotorTorque"],
             least_rpm=c["minRpm"],
@@ -170,7 +156,6 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             rolling_drag=c["tireDragCoeff"],
             shift_time=c["shiftTime"],
             slip_limit=c["tractionControlSlipLimit"],
-            traction_change=np.array(TRACTION_RATE * substep),
             friction=np.asarray(FRICTION * road_friction),
         )
         creep_speed = _rim_at(
@@ -248,9 +233,10 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
         p = prepared
         lateral, heading, cornering_drag = self._steer(p, state)
+        pedal_share = p.step / (p.step + self.pedal_lag)  # of its error that a pedal makes up in a step
         state = _shift(p, state)._replace(
-            throttle=state.throttle + (command.throttle - state.throttle) * p.pedal_share,
-            brake=state.brake + (command.brake - state.brake) * p.pedal_share,
+            throttle=state.throttle + (command.throttle - state.throttle) * pedal_share,
+            brake=state.brake + (command.brake - state.brake) * pedal_share,
             lateral=lateral,
             heading=heading,
         )
@@ -306,22 +292,24 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     """
     h = p.substep
     steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM_PER_RAD_S
-    engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * p.engine_share
+    engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
 
     rim = p.radius * s.wheel_speed
     slip_speed = rim - s.speed
     is_spinning = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
-    traction_torque = s.traction_torque + np.where(is_spinning, -p.traction_change, p.traction_change)
+    traction_torque = s.traction_torque + np.where(is_spinning, -TRACTION_RATE * h, TRACTION_RATE * h)
 
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
-    pull = p.pull_by_stiffness * stiffness
+    pull = h * p.radius * stiffness
     damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
-    slope_speed = s.speed - p.slope_loss
+    slope_speed = s.speed - p.slope_deceleration * h
     wheel_momentum = (
         p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * slope_speed / damped_mass
     )
-    wheel_speed = np.maximum(wheel_momentum, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / damped_mass)
+    wheel_speed = np.maximum(wheel_momentum, ZERO) / (
+        p.inertia + h * p.damping + pull * p.radius - pull * pull / damped_mass
+    )
     speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
     is_held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(is_held):

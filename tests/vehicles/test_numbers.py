@@ -44,8 +44,6 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
-        from safevar_sumo.vehicles.carla import _shift
-
         one = np.ones(1)
         state = vehicle.at_rest(p)._replace(
             gear=gear * one,
@@ -54,7 +52,7 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
             throttle=one,
             engine_speed=share * limit * one,
         )
-        return float(_shift(p, state, state.throttle)[1][0])
+        return float(vehicle._shift(p, state, state.throttle)[1][0])
 
     assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
     assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [
