@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -31,16 +31,16 @@ DrawSettings = Callable[[int], FloatArray]
 
 class _Bounds(NamedTuple):
     """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size
-    `width`.
+    `width`; `condition` and `suffix` are its bounds and its unit in words.
     """
 
     constraint: Constraint
-    condition: str
-    suffix: str
     quantity: Callable[[FloatArray], FloatArray]
+    width: float
     minimum: float
     maximum: float
-    width: float
+    condition: str
+    suffix: str
 
     def excess(self, settings: FloatArray) -> FloatArray:
         """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
@@ -90,25 +90,17 @@ class FeasibleRegion:
             Naming the constraint that the first infeasible setting violates, and the values of that setting.
         """
         for setting in settings[~self.feasible(settings)][:1]:
-            for bound in self.bounds:
-                if bound.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
-                    quantity = f"{bound.constraint.quantity} = {bound.quantity(setting[np.newaxis])[0]:g}{bound.suffix}"
-                    raise InputError(
-                        source,
-                        f"violates a constraint: {quantity} ({self._describe_values(bound, setting)})",
-                        bound.condition + otherwise,
-                    )
-
-    def _describe_values(self, bound: _Bounds, setting: FloatArray) -> str:
-        return (
-            ", ".join(
+            one = setting[np.newaxis]
+            bound = next(each for each in self.bounds if each.excess(one)[0] > SLACK / len(self.bounds))
+            values = ", ".join(
                 f"{characteristic.name} = {value:g}{characteristic.suffix}"
                 for characteristic, value in zip(self.characteristics, setting, strict=True)
                 if characteristic.name in bound.constraint.sum
                 or (bound.constraint.function and value != characteristic.original)
             )
-            or "the original"
-        )
+            quantity = f"{bound.constraint.quantity} = {bound.quantity(one)[0]:g}{bound.suffix}"
+            problem = f"violates a constraint: {quantity} ({values or 'the original'})"
+            raise InputError(source, problem, bound.condition + otherwise)
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
         """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape
@@ -190,7 +182,8 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
         f"{source}: the original vehicle",
         otherwise="; the original vehicle must satisfy every constraint",
     )
-    if not _has_feasible_change(region):
+    candidates = characteristics.filter(_candidate_changes(region))
+    if not (characteristics.changed(candidates).any(axis=1) & region.feasible(candidates)).any():
         raise InputError(
             source,
             f"constraints leave only the original vehicle, as no feasible change passes the filter: {region}",
@@ -202,48 +195,30 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
 def _bounds_of(
     constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str
 ) -> _Bounds:
-    minimum = -np.inf if constraint.at_least is None else constraint.at_least
-    maximum = np.inf if constraint.at_most is None else constraint.at_most
-    condition, unit = (
-        constraint.bounds_in_words(study.vehicle.characteristics),
-        constraint.unit_of(study.vehicle.characteristics),
+    table = study.vehicle.characteristics
+    ends_and_words = (
+        -np.inf if constraint.at_least is None else constraint.at_least,
+        np.inf if constraint.at_most is None else constraint.at_most,
+        constraint.bounds_in_words(table),
+        unit_text(constraint.unit_of(table)),
     )
-    suffix = unit_text(unit)
     if constraint.sum:
         weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
         width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
-        return _Bounds(
-            constraint,
-            condition,
-            suffix,
-            lambda settings: _weighted_sum(settings, weights),
-            minimum,
-            maximum,
-            float(width),
-        )
+        return _Bounds(constraint, lambda settings: _weighted_sum(settings, weights), float(width), *ends_and_words)
     member = lookup.find({}, constraint.function, f"{key}.function")
     guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
     if not callable(member.target):
-        raise InputError(
-            lookup.source,
-            f"{guard.name} is of type {type(member.target).__name__}",
-            "a function of a mapping of arrays",
-        )
+        problem = f"{guard.name} is of type {type(member.target).__name__}"
+        raise InputError(lookup.source, problem, "a function of a mapping of arrays")
 
     def quantity(settings: FloatArray) -> FloatArray:
         columns = read_only_copy(dict(zip(characteristics.names, settings.T, strict=True)))
         return guard.numbers("its call", "values", guard.call("its call", member.target, columns), (len(settings),))
 
     samples = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
-    return _Bounds(
-        constraint,
-        condition,
-        suffix,
-        quantity,
-        minimum,
-        maximum,
-        float(np.ptp(samples)) or max(1.0, abs(float(samples[0]))),
-    )
+    width = float(np.ptp(samples)) or max(1.0, abs(float(samples[0])))
+    return _Bounds(constraint, quantity, width, *ends_and_words)
 
 
 def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
@@ -267,46 +242,20 @@ def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[fl
         for sign, limit in ((-1, minimum), (1, maximum))
         if np.isfinite(limit)
     ]
-    vertices = []
-    for column in range(len(lower)):
-        for sign in (1.0, -1.0):
-            result = linprog(
-                sign * np.eye(len(lower))[column],
-                A_ub=np.array([weights for weights, _ in inequalities]),
-                b_ub=np.array([limit for _, limit in inequalities]),
-                bounds=list(zip(lower, upper, strict=True)),
-                method="highs",
-            )
-            if not result.success:
-                return None
-            vertices.append(np.clip(result.x, lower, upper))
-    return np.array(vertices)
+    left, right = map(np.array, zip(*inequalities, strict=True))
+    goals = (sign * goal for goal in np.eye(len(lower)) for sign in (1.0, -1.0))
+    results = [linprog(goal, left, right, bounds=np.transpose([lower, upper]), method="highs") for goal in goals]
+    if not all(result.success for result in results):
+        return None
+    return np.clip([result.x for result in results], lower, upper)
 
 
-def _has_feasible_change(region: FeasibleRegion) -> bool:
-    """Whether a feasible setting still differs from the original after the filter."""
-    characteristics = region.characteristics
-    for settings in _candidate_changes(region):
-        filtered = characteristics.filter(settings)
-        if (characteristics.changed(filtered).any(axis=1) & region.feasible(filtered)).any():
-            return True
-    return False
-
-
-def _candidate_changes(region: FeasibleRegion) -> Iterator[FloatArray]:
-    """Settings to try: vertices and ends of the domains first, then random settings."""
+def _candidate_changes(region: FeasibleRegion) -> FloatArray:
+    """Settings among which a feasible change is sought: vertices, ends of the domains, and random settings."""
     characteristics, original = region.characteristics, region.characteristics.original
-    size = len(characteristics)
-    yield np.concatenate(
-        [
-            region.vertices,
-            *(
-                np.where(np.eye(size, dtype=bool), end, original)
-                for end in (characteristics.lower, characteristics.upper)
-            ),
-        ]
-    )
+    lower, upper, size = characteristics.lower, characteristics.upper, len(characteristics)
+    ends = [np.where(np.eye(size, dtype=bool), end, original) for end in (lower, upper)]
     rng = np.random.default_rng(0)
-    probes = rng.uniform(characteristics.lower, characteristics.upper, (N_PROBES, size))
+    probes = rng.uniform(lower, upper, (N_PROBES, size))
     sparse_probes = np.where(rng.random((N_PROBES, size)) < 2 / size, probes, original)
-    yield region.repaired(np.concatenate([probes, sparse_probes]))
+    return np.concatenate([region.vertices, *ends, region.repaired(np.concatenate([probes, sparse_probes]))])

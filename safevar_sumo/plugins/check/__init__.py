@@ -8,7 +8,7 @@ import inspect
 import shlex
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,60 +17,53 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from safevar_sumo.ads import ADS, ScalarAds
+from safevar_sumo.ads import ADS, Ads, ScalarAds
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError, unknown_name
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, Metric
-from safevar_sumo.plugins import Lookup, Member, unload_user_modules
+from safevar_sumo.plugins import Lookup, Member, abstract_methods, unload_user_modules
 from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_constraint, try_simulations
-from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.scenarios import SCENARIOS, Scenario
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import ModelTable, Study, load_study, study_names
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
-from safevar_sumo.vehicles import CHANGES, VEHICLES, Change
+from safevar_sumo.vehicles import CHANGES, VEHICLES, Change, Vehicle
 
-KINDS: Mapping[str, Mapping[str, Any]] = {
-    "ads": ADS,
-    "vehicle": VEHICLES,
-    "scenario": SCENARIOS,
-    "metric": {**METRICS, **OPTIONAL_METRICS},
-    "objective": CHANGES,
-    "algorithm": ALGORITHMS,
-    "traci": {},
-    "constraint": {},
+
+class Kind(NamedTuple):
+    """A kind of subjects: the key that names them in a study, the names that a study gives there, the shipped ones by
+    name, and the methods by which a class is recognised.
+    """
+
+    key: str
+    names_in: Callable[[Study], Iterable[str]]
+    members: Mapping[str, Any]
+    methods: Collection[str] = ()
+
+
+def _scenarios_in(study: Study) -> list[str]:
+    return [study.scenario.model, *(test.model for test in (study.matrix.tests if study.matrix else ()) if test.model)]
+
+
+KINDS: Mapping[str, Kind] = {
+    "traci": Kind("ads.model", lambda study: [study.ads.model] * (study.ads.kind == "traci"), {}, ("step",)),
+    "ads": Kind("ads.model", lambda study: [study.ads.model] * (study.ads.kind != "traci"), ADS, abstract_methods(Ads)),
+    "vehicle": Kind("vehicle.model", lambda study: [study.vehicle.model], VEHICLES, abstract_methods(Vehicle)),
+    "scenario": Kind("scenario.model", _scenarios_in, SCENARIOS, abstract_methods(Scenario)),
+    "metric": Kind("metrics.also", lambda study: study.metrics.also, {**METRICS, **OPTIONAL_METRICS}),
+    "objective": Kind("search.objectives", lambda study: study.search.objectives, CHANGES),
+    "algorithm": Kind("search.algorithms", lambda study: study.search.algorithms, ALGORITHMS, ("search",)),
+    "constraint": Kind(
+        "constraints.function", lambda study: filter(None, (one.function for one in study.constraints)), {}
+    ),
 }
-"""Kinds of subjects, each with its shipped subjects by name."""
-METHODS: Mapping[str, tuple[str, ...]] = {
-    "ads": ("start", "drive"),
-    "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
-    "scenario": ("begin", "observe", "encounter"),
-    "algorithm": ("search",),
-    "traci": ("step",),
-}
-"""Methods by which a class is recognised, by kind."""
+"""Kinds of subjects by name."""
 DEFAULT_STUDIES = {"traci": "native"}
 """Study to try a subject of a kind in if no study names it; `smoke` for all other kinds."""
 MAX_FILES = 50
 """Maximum number of study files that are read in a directory."""
-NAMES: Mapping[str, tuple[str, Callable[[Study], list[str]]]] = {
-    "traci": ("ads.model", lambda study: [study.ads.model] if study.ads.kind == "traci" else []),
-    "ads": ("ads.model", lambda study: [study.ads.model] if study.ads.kind != "traci" else []),
-    "vehicle": ("vehicle.model", lambda study: [study.vehicle.model]),
-    "scenario": (
-        "scenario.model",
-        lambda study: [
-            study.scenario.model,
-            *filter(None, (test.model for test in (study.matrix.tests if study.matrix else ()))),
-        ],
-    ),
-    "metric": ("metrics.also", lambda study: study.metrics.also),
-    "objective": ("search.objectives", lambda study: study.search.objectives),
-    "algorithm": ("search.algorithms", lambda study: study.search.algorithms),
-    "constraint": ("constraints.function", lambda study: [one.function for one in study.constraints if one.function]),
-}
-"""The key that names subjects of a kind, and the names that a study gives there."""
 
 
 class Subject(NamedTuple):
@@ -87,7 +80,7 @@ class Subject(NamedTuple):
     @property
     def key(self) -> str:
         """The key and name of the subject, as in errors about a study."""
-        return f"{NAMES[self.kind][0]} = {self.name!r}"
+        return f"{KINDS[self.kind].key} = {self.name!r}"
 
     @property
     def is_user_code(self) -> bool:
@@ -96,15 +89,13 @@ class Subject(NamedTuple):
     @property
     def definition(self) -> str:
         """File and line at which user code is defined; "" for anything else."""
-        member = _look_up(self.name, self.study) if ":" in self.name else Member(None)
+        member = _look_up(self.name, self.study)
         return member.guard.definition("") if member.guard else ""
 
 
 def subjects_of(study: Study) -> list[Subject]:
     """Every subject that a study names."""
-    return [
-        Subject(name, kind, study) for kind, (_, names_of) in NAMES.items() for name in dict.fromkeys(names_of(study))
-    ]
+    return [Subject(name, kind, study) for kind, each in KINDS.items() for name in dict.fromkeys(each.names_in(study))]
 
 
 def find_subject(name: str, study: str | None = None) -> Subject:
@@ -124,48 +115,34 @@ def find_subject(name: str, study: str | None = None) -> Subject:
     """
     given_study = None if study is None else load_study(study)
     name = METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name
-    kind = next((kind for kind, members in KINDS.items() if name in members), "")
-    if kind:
-        candidates = iter([given_study]) if given_study else map(load_study, study_names())
-    elif ":" in name or name.endswith(".fmu"):
-        member = _look_up(name, given_study) if ":" in name else Member(None)
-        kind, folder = _kind_of(member.target), Path(member.guard.folder if member.guard else name).absolute()
-        candidates = (
-            iter([given_study])
-            if given_study
-            else _studies_beside(Path(name).name, folder if member.guard else folder.parent)
-        )
-    else:
-        names = [*study_names(), *METRIC_OF_OBJECTIVE, *(member for members in KINDS.values() for member in members)]
-        raise unknown_name(
-            "check",
-            f"there is nothing called {name!r}",
-            name,
-            names,
-            ", package.module:Name, or the path of a study file",
-        )
+    kind = shipped_kind = next((kind for kind, each in KINDS.items() if name in each.members), "")
+    folder, member = Path(name).absolute().parent, _look_up(name, given_study)
+    if member.guard:
+        kind, folder = _kind_of(member.target), Path(member.guard.folder).absolute()
+    elif not shipped_kind and not name.endswith(".fmu"):
+        names = [*study_names(), *METRIC_OF_OBJECTIVE, *(member for each in KINDS.values() for member in each.members)]
+        otherwise = ", package.module:Name, or the path of a study file"
+        raise unknown_name("check", f"there is nothing called {name!r}", name, names, otherwise)
+    candidates: Iterable[Study] = map(load_study, study_names())
+    if given_study or not shipped_kind:
+        candidates = [given_study] if given_study else _studies_beside(Path(name).name, folder)
     for candidate in candidates:
         for subject in subjects_of(candidate):
-            if subject.name == name or (name.endswith(".fmu") and Path(subject.name).name == Path(name).name):
-                remark = (
-                    ""
-                    if given_study or name in KINDS[subject.kind]
-                    else f"tried in {candidate.origin.called}, which names it"
-                )
-                return subject._replace(kind=kind if subject.kind == "objective" else subject.kind, remark=remark)
+            if Path(subject.name).name == Path(name).name:
+                tried = "" if given_study or shipped_kind else f"tried in {candidate.origin.called}, which names it"
+                return subject._replace(kind=kind if subject.kind == "objective" else subject.kind, remark=tried)
     if not kind:
-        problem = f"no study names {name!r}" if ":" in name or Path(name).exists() else f"there is no file {name!r}"
-        raise InputError(
-            "check",
-            problem,
-            "a model, metric, algorithm or controller that a study can name, or `study=STUDY` that names it",
-        )
-    return Subject(
-        name, kind, _put_in(given_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), kind, name), is_guest=True
-    )
+        problem = f"no study names {name!r}" if member.guard or Path(name).exists() else f"there is no file {name!r}"
+        expected = "a model, metric, algorithm or controller that a study can name, or `study=STUDY` that names it"
+        raise InputError("check", problem, expected)
+    study_of_kind = given_study or load_study(DEFAULT_STUDIES.get(kind, "smoke"))
+    return Subject(name, kind, _put_in(study_of_kind, kind, name), is_guest=True)
 
 
 def _look_up(name: str, study: Study | None) -> Member:
+    """A user's member by its name; nothing for other names."""
+    if ":" not in name:
+        return Member(None)
     unload_user_modules()
     with substitute_traci():
         return Lookup("check", study.origin.places if study else ()).find({}, name, "SUBJECT")
@@ -179,9 +156,13 @@ def _kind_of(target: Any) -> str:
         return "traci" if inspect.isfunction(target) else ""
     if issubclass(target, ScalarAds):
         return "ads"
-    shares = {kind: sum(hasattr(target, name) for name in names) / len(names) for kind, names in METHODS.items()}
+    shares = {
+        kind: sum(hasattr(target, name) for name in each.methods) / len(each.methods)
+        for kind, each in KINDS.items()
+        if each.methods
+    }
     likeliest_kind = max(shares, key=lambda kind: shares[kind])
-    return likeliest_kind if shares[likeliest_kind] > 0 else ""
+    return likeliest_kind if shares[likeliest_kind] else ""
 
 
 def _put_in(study: Study, kind: str, name: str) -> Study:
@@ -291,30 +272,18 @@ def check(name: str, study: str | None = None) -> Report:
     InputError
         If the subject or the study cannot be loaded.
     """
-    if ":" in name or not (name in study_names() or name.endswith(".toml")):
-        return check_subject(find_subject(name, study))
-    if study is not None:
-        raise InputError("study", f"{study!r} is given, and {name!r} is itself a study", "one of them")
-    start, loaded = time.perf_counter(), load_study(name)
-    findings = [finding for _, finding in _findings_in(loaded, subjects_of(loaded))] or _reaction(
-        subjects_of(loaded)[0]
-    )
-    return Report(subject=name, kind="study", findings=findings, seconds=time.perf_counter() - start)
-
-
-def check_subject(subject: Subject) -> Report:
-    """Check one subject. Raises the errors of `check`."""
-    start = time.perf_counter()
-    findings = [finding for _, finding in _findings_in(subject.study, [subject])]
-    if subject.kind in ("ads", "traci") and not subject.is_guest:
-        findings = findings or _reaction(subject)
-    return Report(
-        subject=subject.name,
-        kind=subject.kind,
-        findings=findings,
-        remark=subject.remark,
-        seconds=time.perf_counter() - start,
-    )
+    start, remark = time.perf_counter(), ""
+    if ":" not in name and (name in study_names() or name.endswith(".toml")):
+        if study is not None:
+            raise InputError("study", f"{study!r} is given, and {name!r} is itself a study", "one of them")
+        kind, subjects = "study", subjects_of(load_study(name))
+    else:
+        subjects = [find_subject(name, study)]
+        name, kind, _, remark, _ = subjects[0]
+    findings = [finding for _, finding in _findings_in(subjects[0].study, subjects)]
+    if not findings and subjects[0].kind in ("ads", "traci") and not subjects[0].is_guest:
+        findings = _reaction(subjects[0])
+    return Report(subject=name, kind=kind, findings=findings, remark=remark, seconds=time.perf_counter() - start)
 
 
 def refuse_defects(study: Study) -> None:
@@ -326,10 +295,8 @@ def refuse_defects(study: Study) -> None:
         With the first defect, the input that shows it, file and line, and advice.
     """
     for names, finding in _findings_in(study, [subject for subject in subjects_of(study) if subject.is_user_code]):
-        place, command = (
-            f"{finding.file}:{finding.line}",
-            f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}",
-        )
+        place = f"{finding.file}:{finding.line}"
+        command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
         problem = f"{names} {finding.got}{'' if place in finding.got else f' ({place})'}; to reproduce it: {command}"
         raise UserCodeError(study.source, problem, f"{finding.expected}; {finding.advice}", place)
 
@@ -343,10 +310,9 @@ def _findings_in(study: Study, subjects: list[Subject]) -> Iterator[tuple[str, F
             with np.errstate(all="ignore"):
                 failure, place = next(_failures(study, trial[0]), None), ""
         except UserCodeError as error:
-            problem = next(
-                (error.problem.removeprefix(f"{one.key} ") for one in code if error.problem.startswith(one.key)),
-                error.problem,
-            )
+            problem = error.problem
+            for one in code:
+                problem = problem.removeprefix(f"{one.key} ")
             failure, place = ("contract", error.legal or "no exception", problem), error.place
         if failure is not None:
             yield " and ".join(subject.key for subject in code), _finding(code[0], failure, place)

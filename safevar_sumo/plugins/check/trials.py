@@ -75,13 +75,15 @@ def try_constraint(study: Study, function: str) -> Iterator[Failure]:
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     """Let an algorithm minimise a smooth function in place of simulations, twice, the second time after another run."""
     outputs, others = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
-    expected = "the same in every run with the same random numbers, to the bit"
-    if len(outputs) != len(others):
-        yield "repetition", expected, f"{len(others)} settings instead of {len(outputs)} in another run"
-        return
-    for row in np.flatnonzero((outputs != others).any(axis=1))[:1]:
-        difference = f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()} in another run"
-        yield "repetition", expected, difference
+    problem = f"{len(others)} settings instead of {len(outputs)}" if len(outputs) != len(others) else ""
+    for row in np.flatnonzero((outputs != others).any(axis=1))[:1] if not problem else ():
+        problem = f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()}"
+    if problem:
+        yield (
+            "repetition",
+            "the same in every run with the same random numbers, to the bit",
+            f"{problem} in another run",
+        )
 
 
 def _try(
@@ -146,11 +148,10 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     )
     for seed in seeds:
         algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)
-        search = (GuardedAlgorithm(algorithm, member.guard) if member.guard else algorithm).search(
-            problem, np.random.default_rng(seed)
-        )
-        settings = [next(search)]
+        guarded = GuardedAlgorithm(algorithm, member.guard) if member.guard else algorithm
+        search, settings = guarded.search(problem, np.random.default_rng(seed)), list[FloatArray]()
         try:
+            settings.append(next(search))
             while True:
                 settings.append(search.send(_smooth_evaluations(system, settings[-1])))
         except StopIteration as end:
@@ -164,16 +165,13 @@ def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
     """
     characteristics, scoring = system.characteristics, system.measuring.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
-    safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
-    names = {*(metric.name for metric in scoring.metrics), *(objective.name for objective in scoring.objectives)}
-    own_names = sorted(name for name in names if not name.startswith("f_"))
-    metrics = dict.fromkeys(own_names, np.abs(safety_degree)) | {"safety_degree": safety_degree}
-    collided = safety_degree < 0
+    safety_degree = 1.0 - 1.5 * share.mean(axis=1)
+    columns = {each.name for each in (*scoring.metrics, *scoring.objectives) if not each.name.startswith("f_")}
     return Evaluations(
         settings=settings,
-        outcome=np.where(collided, "collision", "stopped").astype("U16"),
-        metrics=metrics,
-        collision_speed=np.where(collided, -safety_degree, np.nan),
+        outcome=np.where(safety_degree < 0, "collision", "stopped").astype("U16"),
+        metrics=dict.fromkeys(sorted(columns), np.abs(safety_degree)) | {"safety_degree": safety_degree},
+        collision_speed=np.where(safety_degree < 0, -safety_degree, np.nan),
         f_diff=characteristics.largest_change(settings),
         f_num_diff=characteristics.number_changed(settings),
     )
