@@ -247,7 +247,7 @@ def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[fl
     results = [linprog(goal, left, right, bounds=np.transpose([lower, upper]), method="highs") for goal in goals]
     if not all(result.success for result in results):
         return None
-    return np.clip([result.x for result in results], lower, upper)
+    return np.asarray(np.clip([result.x for result in results], lower, upper))
 
 
 def _candidate_changes(region: FeasibleRegion) -> FloatArray:

@@ -166,7 +166,8 @@ def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
     characteristics, scoring = system.characteristics, system.measuring.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     safety_degree = 1.0 - 1.5 * share.mean(axis=1)
-    columns = {each.name for each in (*scoring.metrics, *scoring.objectives) if not each.name.startswith("f_")}
+    names = {metric.name for metric in scoring.metrics} | {objective.name for objective in scoring.objectives}
+    columns = (name for name in names if not name.startswith("f_"))
     return Evaluations(
         settings=settings,
         outcome=np.where(safety_degree < 0, "collision", "stopped").astype("U16"),
