@@ -215,15 +215,17 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             mover.set_speed(world, speed)
         return memory._replace(sample=memory.sample + 1, last_speed=speed)
 
-    def at_all_samples(self, world: World, sampled_world: World, step: float) -> tuple[TargetMotion, Target]:
-        """The target's motion in a recorded scene, and the target at its T samples, which are the T copies of
-        `sampled_world`.
+    def at_all_samples(self, world: World, step: float) -> tuple[TargetMotion, Target, BoolArray]:
+        """The target's motion in a recorded scene, whose T samples are the T copies of `world`; the target at each, and
+        whether it is not on the road.
         """
         motion = self._motion(world)
-        positions = motion.mover.positions(sampled_world)
+        positions = motion.mover.positions(world)
+        is_absent = np.isnan(positions[:, 0])
+        positions = positions[np.maximum.accumulate(np.where(is_absent, 0, np.arange(len(positions))))]
         target = motion.target(positions, [sample * step for sample in range(len(positions))])
         last_lateral = np.concatenate([target.lateral[:1], target.lateral[:-1]])
-        return motion, target._replace(lateral_speed=(target.lateral - last_lateral) / step)
+        return motion, target._replace(lateral_speed=(target.lateral - last_lateral) / step), is_absent
 
     def _motion(self, world: World) -> TargetMotion:
         raise NotImplementedError

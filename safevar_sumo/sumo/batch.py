@@ -29,12 +29,12 @@ from safevar_sumo.scenarios import VUT, Lane, Point, Scene
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
-from safevar_sumo.sumo.perception import PointBatch
+from safevar_sumo.sumo.perception import Perception, encounter_of, observer_of
 from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld
 from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.world import INSERTION_DECELERATION, Contacts, SumoWorld
+from safevar_sumo.sumo.world import Contacts, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
@@ -152,20 +152,25 @@ def _simulate(
     prepared = _insert_vehicles(system, settings, world)
     vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
     state = vehicle.at_start(prepared, world.speeds())
-    ads_memory, batch = system.ads.start(n, system.nominal, step), PointBatch(system.points, world, n)
-    log = _Log(n, int(batch.last_step.max()) + 1, frame)
+    ads_memory, observer = system.ads.start(n, system.nominal, step), observer_of(system.points, world)
+    size = n // len(system.points)
+    perception = Perception([point.weather for point in system.points], step, size)
+    last_step = np.repeat([round(point.scenario.duration / step) for point in system.points], size)
+    log = _Log(n, int(last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
     for sample in range(log.length):
         if watch is not None and isinstance(world, SumoWorld):
             watch(world)
         speed = world.speeds()
-        scene = batch.scene(outcomes.is_open)
+        scene = observer.observe(outcomes.is_open)
         if system.sees_nobody:
             scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
         collisions = contacts.record_collisions(world, outcomes.is_open, scene)
-        active = outcomes.judge(speed, scene.over, collisions, last=sample >= batch.last_step)
-        observation = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
+        active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_step)
+        observation = perception.observe(sample * step, speed, scene)._replace(
+            throttle=state.throttle, brake=state.brake
+        )
         observation, state = vehicle.sense(prepared, state, observation)
         if listen is not None:
             listen(observation)
@@ -193,7 +198,7 @@ def _simulate(
     trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
         trace=trace,
-        encounter=batch.encounter(trace),
+        encounter=encounter_of(system.points, trace),
         outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
         contact=contacts.first,
@@ -207,11 +212,8 @@ def _insert_vehicles(system: System, settings: FloatArray, world: DrivenWorld) -
     vehicle, n = system.vehicle, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
-    types = vehicle.sumo_type(prepared)
-    world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
-    world.depart()
-    world.set_decelerations(types.decel)
-    if isinstance(system.ads, TraciController):  # other ADSs get observations instead of reading the world
+    world.insert(vehicle.sumo_type(prepared))
+    if isinstance(world, SumoWorld) and isinstance(system.ads, TraciController):  # other ADSs get observations
         world.sensors = _sensors_in_weather(system, prepared, n)
     return prepared
 

@@ -27,6 +27,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
+from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, is_recorded, score, step_options
 from safevar_sumo.sumo.engine import Engine
@@ -271,10 +272,15 @@ def study_at(study: Study, name: str, source: object) -> Study:
 
 
 def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
-    """Yield groups of at most `size` points whose recorded scenes may share a batch, sorted by duration."""
+    """Yield groups of at most `size` points whose recorded scenes may share a batch, sorted by duration; a point whose
+    scenario observes no recorded target is alone.
+    """
     groups: dict[Hashable, list[Point]] = {}
     for point, scene in zip(points, record_scenes([point.scenario for point in points], options), strict=True):
-        groups.setdefault(scene.batch_key if isinstance(scene, Recording) else "", []).append(point)
+        key: Hashable = point.name
+        if isinstance(scene, Recording) and isinstance(point.scenario, TargetTest):
+            key = scene.batch_key
+        groups.setdefault(key, []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), max(size, 1)):

@@ -235,7 +235,7 @@ def _first_difference(network: Network) -> tuple[str, float]:
     The vehicle under test stays at its start.
     """
     with open_world(copied_network(network, 2), 2) as world:
-        world.depart(at_any_speed=True)
+        world.insert_at_any_speed()
         for step in range(1, N_STEPS + 1):
             world.advance(np.zeros(2))
             poses = world.actor_poses()

@@ -7,7 +7,7 @@ scene.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -18,36 +18,31 @@ import numpy as np
 from msgspec import msgpack, to_builtins
 
 from safevar_sumo.records import FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, GuardedScenario, Scenario
+from safevar_sumo.scenarios import VUT, GuardedScenario, Lane, Scenario
+from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import Network, copied_network, is_shipped, stage_networks, sumo_version
-from safevar_sumo.sumo.world import Api, SumoWorld, begin, direction_of
+from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
 
 MAX_RECORDINGS = 4000
 """Largest number of recorded scenes that a process keeps; a scene of ten seconds takes about ten kilobytes."""
 SCENES_FILE = "scenes.msgpack"
-EXTENT_MARGIN = 0.01
-"""Margin of the extents [m]; an actor outside its extent is not checked for a collision."""
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 
 
-class UnrecordableError(Exception):
-    """A scene cannot be recorded; the message is the reason."""
+NOT_STRAIGHT = "the vehicle under test does not depart in the middle of a lane and drive straight on"
 
 
 class Track(NamedTuple):
-    """An actor at T steps: `position` [m], shape (T, 2); `angle` clockwise from north [degrees] and `speed` [m/s],
-    shape (T,).
+    """An actor at T samples: in rows its position [m], its direction, a unit vector, and its speed [m/s]; shape (T, 5).
 
     Values are NaN while the actor is not on the road; `length` and `width` are in m.
     """
 
-    position: FloatArray
-    angle: FloatArray
-    speed: FloatArray
+    motion: FloatArray
     is_person: bool
     length: float
     width: float
@@ -84,9 +79,9 @@ class Recording:
     """A recorded scene, in which the vehicle under test departs at position `start` on the first lane of its `way` [m],
     at `speed` [m/s].
 
-    `length` and `width` are the vehicle's [m], `lanes` the shapes of all lanes, `lane_of` each vehicle's first lane.
-    `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates
-    `along` the lanes [m].
+    `length` and `width` are the vehicle's [m], `along` the direction of its way, `lanes` the shapes of all lanes,
+    `first_lanes` each vehicle's first lane. The methods are those of a world of T copies, one for each sample, in which
+    the vehicle under test stands and all other actors move as recorded, so that commands to them have no effect.
     """
 
     step_length: float
@@ -97,20 +92,40 @@ class Recording:
     way: LaneSequence
     along: FloatArray
     lanes: dict[str, tuple[tuple[float, float], ...]]
-    lane_of: dict[str, str]
+    first_lanes: dict[str, str]
     tracks: dict[str, Track]
-    extents: FloatArray
 
     @property
     def batch_key(self) -> tuple[Hashable, ...]:
         """Vehicles in scenes with the same key may share a batch."""
-        return (
-            self.step_length,
-            self.length,
-            self.width,
-            self.along.tobytes(),
-            *(column.tobytes() for column in self.way),
-        )
+        way = (column.tobytes() for column in self.way)
+        return self.step_length, self.length, self.width, self.along.tobytes(), *way
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        """Positions of the actor's front, shape (T, 2) [m]; NaN while it is not on the road."""
+        return self.tracks[actor].motion[:, :2]
+
+    person_positions = vehicle_positions
+
+    def speeds(self) -> FloatArray:
+        return np.zeros(len(next(iter(self.tracks.values())).motion))
+
+    def vehicle_length(self, actor: str) -> float:
+        return self.length if actor == VUT else self.tracks[actor].length
+
+    def person_width(self, actor: str) -> float:
+        return self.tracks[actor].width
+
+    def lane(self, lane: str) -> Lane:
+        return lane_through(lane, self.lanes[lane])
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return self.lane(self.first_lanes[vehicle])
+
+    def walk(self, *_: object) -> None:
+        """Do nothing."""
+
+    drive = turn_back = walk
 
 
 def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
@@ -126,19 +141,17 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
     """
     reasons = [_reason_against_recording(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
-    keys = [
-        (scenario, network, tuple(options))
+    keys: dict[Scenario, _Key] = {
+        scenario: (scenario, network, tuple(options))
         for scenario, network in zip(recordable, stage_networks(recordable), strict=True)
-    ]
-    new_keys = [key for key in dict.fromkeys(keys) if key not in _recordings]
+    }
+    new_keys = [key for key in keys.values() if key not in _recordings]
+    if len(_recordings) + len(new_keys) > MAX_RECORDINGS:
+        _recordings.clear()
+        new_keys = [*keys.values()]
     if new_keys:
-        for old_key in [key for key in _recordings if key not in keys][
-            : max(len(_recordings) + len(new_keys) - MAX_RECORDINGS, 0)
-        ]:
-            del _recordings[old_key]
         _recordings.update(zip(new_keys, _recordings_of(new_keys), strict=True))
-    scenes = {scenario: _recordings[scenario, network, step] for scenario, network, step in keys}
-    return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
+    return [reason or _recordings[keys[scenario]] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
 def _reason_against_recording(scenario: Scenario) -> str:
@@ -199,113 +212,70 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
 def _play(scenario: Scenario, network: Network, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, Engine.LIBSUMO, options) as world:
-        world.depart(at_any_speed=True)
-        try:
-            return _record(scenario, world)
-        except UnrecordableError as error:
-            return str(error)
+        world.insert_at_any_speed()
+        api, vut, step = world.api, copied_id(0, VUT), world.step_length
+        way = _way_of(api, vut)
+        if way is None:
+            return NOT_STRAIGHT
+        start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
+        length, vut_width = world.vehicle_length(VUT), float(api.vehicle.getWidth(vut))
+        vehicles, along = api.vehicle.getIDList(), direction_of(api.vehicle.getAngle(vut))
+        return Recording(
+            step_length=step,
+            start=start,
+            speed=speed,
+            length=length,
+            width=vut_width,
+            way=way,
+            along=along,
+            lanes={copy_and_name(id_)[1]: tuple(api.lane.getShape(id_)) for id_ in api.lane.getIDList()},
+            first_lanes={copy_and_name(id_)[1]: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_ in vehicles},
+            tracks=_tracks(scenario, world),
+        )
 
 
-def _record(scenario: Scenario, world: SumoWorld) -> Recording:
-    api, vut, step = world.api, copied_id(0, VUT), world.step_length
-    lane_sequence, along = _lane_sequence_of(api, vut)
-    start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
-    lane_of = {
-        name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _ids_in_first_copy(api.vehicle.getIDList())
-    }
-    lanes = {
-        name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_))
-        for id_, name in _ids_in_first_copy(api.lane.getIDList())
-    }
-    length = round(scenario.duration / step) + 1
-    samples, sizes, memory = dict[str, FloatArray](), dict[str, tuple[bool, float, float]](), begin(scenario, world)
+def _tracks(scenario: Scenario, world: SumoWorld) -> dict[str, Track]:
+    """How all actors except the vehicle under test move."""
+    length, tracks, memory = round(scenario.duration / world.step_length) + 1, dict[str, Track](), world.begin(scenario)
     for sample in range(length):
-        for domain in (api.vehicle, api.person):
-            for id_, name in _ids_in_first_copy(domain.getIDList()):
-                if name == VUT:
-                    continue
-                if name not in samples:
-                    samples[name] = np.full((length, 4), np.nan)
-                    sizes[name] = domain is api.person, float(domain.getLength(id_)), float(domain.getWidth(id_))
-                samples[name][sample] = *domain.getPosition(id_), domain.getAngle(id_), domain.getSpeed(id_)
+        for id_, (x, y, angle) in world.actor_poses().items():
+            _, name = copy_and_name(id_)
+            if name == VUT:
+                continue
+            if name not in tracks:
+                tracks[name] = Track(np.full((length, 5), np.nan), *world.actor_size(id_))
+            tracks[name].motion[sample] = x, y, *direction_of(angle), world.actor_speed(id_)
+        memory = (
+            scenario.move(world, world.step_length, memory)
+            if isinstance(scenario, TargetTest)
+            else scenario.observe(world, world.step_length, memory)[1]
+        )
         if sample < length - 1:
-            memory = (
-                scenario.move(world, step, memory)
-                if isinstance(scenario, TargetTest)
-                else scenario.observe(world, step, memory)[1]
-            )
             world.advance(np.zeros(1))
-    tracks = {
-        name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name])
-        for name, rows in samples.items()
-    }
-    vut_length = world.vehicle_length(VUT)
-    extents = np.full((2, length, len(tracks)), np.nan)
-    for actor, track in enumerate(tracks.values()):
-        extents[:, :, actor] = _extent_beside(track, along, vut_length)
-    return Recording(
-        step_length=step,
-        start=start,
-        speed=speed,
-        length=vut_length,
-        width=float(api.vehicle.getWidth(vut)),
-        way=lane_sequence,
-        along=along,
-        lanes=lanes,
-        lane_of=lane_of,
-        tracks=tracks,
-        extents=extents,
-    )
+    return tracks
 
 
-def _extent_beside(track: Track, along: FloatArray, vut_length: float) -> FloatArray:
-    """First and last coordinate of a vehicle's front while the vehicle is beside an actor, with a margin; shape (2, T)
-    [m].
+def _way_of(api: Api, vut: str) -> LaneSequence | None:
+    """The lanes of a vehicle's route; None if the vehicle does not depart in the middle of a lane, or the lanes do not
+    form a straight line.
     """
-    angle = np.radians(track.angle)  # clockwise from north
-    cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
-    middle = track.position @ along - cosine * (track.length / 2)
-    half_extent = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + EXTENT_MARGIN
-    return np.array([middle - half_extent, middle + half_extent + vut_length])
-
-
-def _ids_in_first_copy(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield the ids that belong to the first copy, each with its name in the original network."""
-    for id_ in ids:
-        copy, name = copy_and_name(id_)
-        if copy == 0:
-            yield id_, name
-
-
-def _lane_sequence_of(api: Api, vut: str) -> tuple[LaneSequence, FloatArray]:
-    """The lanes of the rest of a vehicle's route, and their common direction.
-
-    Raises
-    ------
-    UnrecordableError
-        If the lanes do not form a straight line.
-    """
-    if api.vehicle.getLateralLanePosition(vut):
-        raise UnrecordableError("the vehicle under test does not depart in the middle of its lane")
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
         links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[0]) == edge]
         if len(links) != 1:
-            raise UnrecordableError(f"there are {len(links)} lanes from {lanes[-1]!r} to {edge!r}")
+            return None
         next_lane, internal_lane = links[0][0], links[0][4]
         while internal_lane:
             lanes.append(internal_lane)
             internal_lane = next(iter(api.lane.getLinks(internal_lane)), ("", "", "", "", ""))[4]
         lanes.append(next_lane)
     shapes = [api.lane.getShape(lane) for lane in lanes]
-    for lane, shape in zip(lanes, shapes, strict=True):
-        if len(shape) != 2:
-            raise UnrecordableError(f"lane {copy_and_name(lane)[1]!r} of the vehicle under test is not straight")
-    starts, ends = (np.array([shape[k] for shape in shapes], dtype=float) for k in (0, 1))
+    if api.vehicle.getLateralLanePosition(vut) or any(len(shape) != 2 for shape in shapes):
+        return None
+    starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
     vector, lengths = ends - starts, np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
     if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(starts[1:] - ends[:-1]).max(initial=0.0) > 1e-6:
-        raise UnrecordableError("the lanes of the vehicle under test do not form a straight line")
-    stretch = np.maximum(shape_length, POSITION_EPS) / lengths
-    return LaneSequence(starts, vector, lengths, stretch, shape_length), direction_of(api.vehicle.getAngle(vut))
+        return None
+    return LaneSequence(starts, vector, lengths, np.maximum(shape_length, POSITION_EPS) / lengths, shape_length)

@@ -197,8 +197,8 @@ class SensedTraffic:
 
     def _snapshot(self, copy: int, names: Mapping[tuple[int, str], list[str]]) -> Snapshot:
         api, vut = self._world.api, copied_id(copy, VUT)
-        if self._world.has_left(vut):
-            return Snapshot({}, {domain: {} for domain in SENSED}, None)  # for good
+        if vut not in self._world.driving:
+            return Snapshot({}, {domain: {} for domain in SENSED}, None)
         actors: dict[str, dict[str, Values]] = {}
         for domain, functions in SENSED.items():
             getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import chain
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,11 +44,9 @@ class Body(NamedTuple):
     speed: Any
 
     @classmethod
-    def behind(
-        cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: FloatArray | float
-    ) -> Body:
-        """The body whose front has its middle at `front`."""
-        return cls(front - along * (length / 2), along, length, width, speed)
+    def behind(cls, front: FloatArray, along: FloatArray, length: Any, width: Any, speed: FloatArray | float) -> Body:
+        """The body whose front has its middle at `front`, or M of them."""
+        return cls(front - along * (np.asarray(length)[..., np.newaxis] / 2), along, length, width, speed)
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
@@ -61,34 +59,24 @@ class SumoWorld:
 
     def __init__(self, api: Api, n: int) -> None:
         self.api, self.n = api, n
-        self._set_speed, self._get_speed = (
-            _api_function(api, "vehicle", "setSpeed"),
-            _api_function(api, "vehicle", "getSpeed"),
+        self.step_length: float = api.simulation.getDeltaT()
+        self._set_speed, self._get_speed, self._get_position = (
+            _vehicle_function(api, name) for name in ("setSpeed", "getSpeed", "getPosition")
         )
-        self._vehicle_position, self._person_position = (
-            _api_function(api, domain, "getPosition") for domain in ("vehicle", "person")
-        )
-        self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
-        """Speeds and positions of vehicles under test that have left the road."""
-        self._speeds_now: FloatArray | None = None
+        self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
+        self.driving = dict(self._copy_of)
+        """Copies whose vehicle under test is on the road, by the vehicle's id."""
+        self._speeds, self._fronts = np.zeros(n), np.zeros((n, 2))
+        """Speeds and fronts of the vehicles under test; the last ones of those that have left the road."""
+        self._commanded_speeds = np.full(n, np.nan)
         self._struck_ids: dict[int, str] = {}
         """Ids of the actors that the vehicles under test collided with last, by copy."""
-        self._ids: dict[str, list[str]] = {}
-        self._positions: dict[str, FloatArray] = {}
-        self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
-        self._driving_copies, self._driving_numbers = dict(self._copy_of), np.arange(len(self._copy_of))
-        """Numbers of the copies whose vehicle under test is on the road: by the vehicle's id, and as an array."""
-        self._commanded_speeds = np.full(len(self._driving_numbers), np.nan)
-        """Last speeds commanded to the vehicles under test [m/s]."""
-        self.step_length: float = api.simulation.getDeltaT()
         self.sensors = Sensors.perfect(n)
         """The vehicles' sensors in their weather, for ADSs that read the world instead of getting observations."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
-        if name not in self._ids:
-            self._ids[name] = [copied_id(copy, name) for copy in range(self.n)]
-        return self._ids[name]
+        return _copied_ids(name, self.n)
 
     def set_types(self, types: SumoType) -> None:
         vehicletype = self.api.vehicletype
@@ -98,16 +86,29 @@ class SumoWorld:
             vehicletype.setAccel(id_, accel)
             vehicletype.setMaxSpeed(id_, max_speed)
             vehicletype.setTau(id_, tau)
-        self.set_decelerations(types.decel)
+        self._set_decelerations(types.decel)
 
-    def set_decelerations(self, decel: FloatArray) -> None:
+    def _set_decelerations(self, decel: FloatArray) -> None:
         """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
         for id_, value in zip(self.ids(VUT), decel.tolist(), strict=True):
             self.api.vehicletype.setDecel(id_, value)
             self.api.vehicletype.setEmergencyDecel(id_, value)
 
-    def depart(self, *, at_any_speed: bool = False) -> None:
-        """Insert all actors, and take control of the vehicles under test; `at_any_speed` changes their types for that.
+    def insert(self, types: SumoType) -> None:
+        """Insert all actors, the vehicles under test with these types; raises the errors of `depart`."""
+        self.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
+        self.depart()
+        self._set_decelerations(types.decel)
+
+    def insert_at_any_speed(self) -> None:
+        """Insert all actors; the types of the vehicles under test change."""
+        for id_ in self.ids(VUT):
+            self.api.vehicletype.setMaxSpeed(id_, MAX_DEPARTURE_SPEED)
+        self._set_decelerations(np.full(self.n, INSERTION_DECELERATION))
+        self.depart()
+
+    def depart(self) -> None:
+        """Insert all actors, and take control of the vehicles under test.
 
         Raises
         ------
@@ -116,10 +117,6 @@ class SumoWorld:
         """
         global _current_world
         _current_world = self
-        if at_any_speed:
-            for id_ in self.ids(VUT):
-                self.api.vehicletype.setMaxSpeed(id_, MAX_DEPARTURE_SPEED)
-            self.set_decelerations(np.full(self.n, INSERTION_DECELERATION))
         self.api.simulationStep()
         departed = set(self.api.vehicle.getIDList())
         for id_ in self.ids(VUT):
@@ -127,17 +124,45 @@ class SumoWorld:
                 raise SimulationError(f"SUMO could not insert vehicle {id_!r}; check the network's traffic file")
             self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
             self.api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
+        self._read()
+
+    def begin(self, scenario: Scenario) -> ScenarioMemory:
+        """Start a scenario before the first step, and return its memory.
+
+        Raises
+        ------
+        InputError
+            If the network lacks an actor or lane of the scenario.
+        """
+        try:
+            return scenario.begin(self)
+        except self.api.TraCIException as error:
+            raise InputError(
+                "scenario.parameters.network",
+                f"the network lacks an element of the scenario: {str(error).strip()}",
+                "a network and traffic with the ids that the scenario names",
+            ) from None
 
     def advance(self, speeds: FloatArray) -> None:
         """Simulate one step, in which the vehicles under test reach `speeds` [m/s]."""
-        set_speed, ids = self._set_speed, self.ids(VUT)
-        changed_copies = self._driving_numbers[(speeds != self._commanded_speeds)[self._driving_numbers]]
-        for copy, speed in zip(changed_copies.tolist(), speeds[changed_copies].tolist(), strict=True):
-            set_speed(ids[copy], speed)
+        for id_, copy in self.driving.items():
+            if speeds[copy] != self._commanded_speeds[copy]:
+                self._set_speed(id_, float(speeds[copy]))
         self._commanded_speeds = speeds
         self.api.simulationStep()
-        self._positions.clear()
-        self._speeds_now = None
+        self._read()
+
+    def _read(self) -> None:
+        self._speeds, self._fronts = self._speeds.copy(), self._fronts.copy()
+        copies = [*self.driving.values()]
+        self._speeds[copies] = [*map(self._get_speed, self.driving)]
+        self._fronts[copies] = [*map(self._get_position, self.driving)]
+
+    def end_runs(self, copies: Sequence[int]) -> None:
+        """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
+        for copy in copies:
+            self.api.vehicle.remove(self.ids(VUT)[copy])
+            del self.driving[self.ids(VUT)[copy]]
 
     def collisions(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
@@ -172,51 +197,17 @@ class SumoWorld:
     def _domain_of(self, id_: str) -> Api:
         return self.api.person if id_ in self.api.person.getIDList() else self.api.vehicle
 
-    def end_runs(self, copies: Sequence[int]) -> None:
-        """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
-        if not copies:
-            return
-        self._last_speeds[copies], self._last_positions[copies] = (
-            self.speeds()[copies],
-            self.vehicle_positions(VUT)[copies],
-        )
-        for id_ in [self.ids(VUT)[copy] for copy in copies]:
-            self.api.vehicle.remove(id_)
-            del self._driving_copies[id_]
-        self._driving_numbers = np.array([*self._driving_copies.values()], dtype=np.intp)
-
     def speeds(self) -> FloatArray:
-        """Speeds of the vehicles under test in this step [m/s]; repeated calls return the same array."""
-        if self._speeds_now is None:
-            self._speeds_now = self._last_speeds.copy()
-            self._speeds_now[self._driving_numbers] = [*map(self._get_speed, self._driving_copies)]
-        return self._speeds_now
+        """Speeds of the vehicles under test in this step [m/s]."""
+        return self._speeds
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        return self._positions_of(actor, self._vehicle_position)
+        if actor == VUT:
+            return self._fronts
+        return np.array([self._get_position(id_) for id_ in self.ids(actor)])
 
     def person_positions(self, actor: str) -> FloatArray:
-        return self._positions_of(actor, self._person_position)
-
-    def _positions_of(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
-        """The actor's positions in this step; repeated calls return the same array."""
-        if actor not in self._positions:
-            ids = self._driving_copies if actor == VUT else self.ids(actor)
-            positions = np.fromiter(chain.from_iterable(map(position, ids)), float, 2 * len(ids)).reshape(-1, 2)
-            if len(ids) < self.n:
-                positions, new_positions = self._last_positions.copy(), positions
-                positions[self._driving_numbers] = new_positions
-            self._positions[actor] = positions
-        return self._positions[actor]
-
-    @property
-    def lookup_errors(self) -> tuple[type[Exception], ...]:
-        """Errors raised by queries for actors or lanes that do not exist."""
-        return (self.api.TraCIException,)
-
-    def has_left(self, id_: str) -> bool:
-        """Whether a vehicle under test has left the road, for good."""
-        return id_ not in self._driving_copies
+        return np.array([self.api.person.getPosition(id_) for id_ in self.ids(actor)])
 
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the
@@ -231,6 +222,9 @@ class SumoWorld:
         """Whether an actor is a person, and its length and width [m]."""
         domain = self._domain_of(id_)
         return domain is self.api.person, domain.getLength(id_), domain.getWidth(id_)
+
+    def actor_speed(self, id_: str) -> float:
+        return float(self._domain_of(id_).getSpeed(id_))
 
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))
@@ -261,24 +255,6 @@ class SumoWorld:
             api.removeStage(id_, 0)
 
 
-def begin(scenario: Scenario, world: Any) -> ScenarioMemory:
-    """Start a scenario in a world before its first step, and return the scenario's memory.
-
-    Raises
-    ------
-    InputError
-        If the network lacks an actor or lane of the scenario.
-    """
-    try:
-        return scenario.begin(world)
-    except world.lookup_errors as error:
-        raise InputError(
-            "scenario.parameters.network",
-            f"the network lacks an element of the scenario: {str(error).strip()}",
-            "a network and traffic with the ids that the scenario names",
-        ) from None
-
-
 _current_world: SumoWorld | None = None
 """The world that this process simulates; SUMO, too, allows only one per process."""
 
@@ -288,16 +264,20 @@ def current_world() -> SumoWorld:
     return _current_world
 
 
+@lru_cache
+def _copied_ids(name: str, n: int) -> list[str]:
+    return [copied_id(copy, name) for copy in range(n)]
+
+
 def direction_of(angle: float) -> FloatArray:
     """Unit vector of a SUMO angle [degrees clockwise from north]."""
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
-def _api_function(api: Api, domain: str, name: str) -> Callable[..., Any]:
+def _vehicle_function(api: Api, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
-    wrapped = getattr(api, domain) if compiled is None else compiled
-    return getattr(wrapped, name if compiled is None else f"{domain}_{name}")  # type: ignore[no-any-return]
+    return getattr(api.vehicle, name) if compiled is None else getattr(compiled, f"vehicle_{name}")  # type: ignore[no-any-return]
 
 
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"

@@ -182,7 +182,7 @@ def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
     """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose scene changes
     linearly.
     """
-    perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), STEP)
+    perception = Perception([Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay)], STEP, 1)
     seen = []
     for time in TIMES:
         scene = Scene(
@@ -211,7 +211,7 @@ def test_the_scene_is_observed_with_delay_and_the_own_speed_without(delay: float
 
 
 def test_an_obstacle_that_appears_is_not_interpolated_from_infinity() -> None:
-    perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03), STEP)
+    perception = Perception([Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03)], STEP, 1)
     nothing = np.zeros(1)
     gaps = [
         perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
