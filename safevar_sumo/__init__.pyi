@@ -1,8 +1,9 @@
 from .analysis.compare import compare as compare
 from .analysis.compare.answer import SystemComparison as SystemComparison
 from .analysis.explain import explain as explain
+from .analysis.explain.answer import Explained as Explained
 from .analysis.explain.causes import Cause as Cause
-from .analysis.explain.result import Explained as Explained, Explanation as Explanation
+from .analysis.explain.failure import Explanation as Explanation
 from .analysis.opinion import opinion as opinion
 from .analysis.opinion.compute import Opinion as Opinion, Opinions as Opinions
 from .analysis.rating import rating as rating

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from datetime import timedelta
 from html import escape
 from threading import Event, Thread
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
@@ -98,8 +98,13 @@ def print_meanings(console: Console, characteristics: Iterable[Characteristic]) 
 
 
 def print_answer(console: Console, study: Study, no_verdict: str, parts: Iterable[str | Table]) -> None:
-    """Print the answer to a question about a study: sentences and tables, of which those without rows are left out."""
+    """Print the answer to a question about a study below its title; parts as in `print_parts`."""
     print_heading(console, study.title, no_verdict)
+    print_parts(console, parts)
+
+
+def print_parts(console: Console, parts: Iterable[str | Table]) -> None:
+    """Print sentences and tables, of which those without rows are left out."""
     for part in parts:
         if isinstance(part, str):
             print_text(console, part)
@@ -107,17 +112,24 @@ def print_answer(console: Console, study: Study, no_verdict: str, parts: Iterabl
             console.print(part)
 
 
-class ShownAnswer(Protocol):
-    """An answer that a terminal or a notebook can show."""
+class Answer:
+    """An answer to a question, which a terminal or a notebook can show."""
 
-    @property
-    def study(self) -> Study: ...
-    @property
-    def no_verdict(self) -> str: ...
-    def sentences(self) -> Iterable[str | Table]: ...
+    study: Study
+    no_verdict: str
+
+    def sentences(self) -> Iterable[str | Table]:
+        """The answer in sentences and tables, the verdict first."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.study.name}: {next(iter(self.sentences()))}>"
+
+    def _repr_html_(self) -> str:
+        return answer_as_html(self)
 
 
-def answer_as_html(answer: ShownAnswer) -> str:
+def answer_as_html(answer: Any) -> str:
     """The sentences and tables that a terminal shows, as HTML for a notebook."""
     lines = [
         f"<p>{escape(answer.no_verdict)}</p>" if answer.no_verdict else "",

@@ -22,6 +22,16 @@ OUTCOME_VERBS = {
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
+def ending_in_words(outcome: str, safety_degree: float | None) -> str:
+    """How a run ended, such as `collides at 3.21 m/s` or `stops, safety degree 0.87 m`; the safety degree is in m, or
+    -m/s on a collision.
+    """
+    degree = "" if safety_degree is None or math.isnan(safety_degree) else f"{abs(safety_degree):.2f}"
+    if outcome == Outcome.COLLISION:
+        return f"collides at {degree} m/s" if degree else "collides"
+    return OUTCOME_VERBS.get(Outcome(outcome), outcome) + (f", safety degree {degree} m" if degree else "")
+
+
 def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2
     %)`.

@@ -41,7 +41,7 @@ from safevar_sumo.cli.gate import fail, gated
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import print_answer
+from safevar_sumo.terminal import print_answer, print_parts
 from safevar_sumo.vehicles import CharacteristicSet
 
 SPREADSHEET_ENDINGS = (".xlsx",)
@@ -100,7 +100,6 @@ def explain(
     is enough, why.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
-    from safevar_sumo.analysis.explain.sentences import print_explained
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.model_spread import remarks_on_sets
 
@@ -114,7 +113,7 @@ def explain(
     if as_json:
         print_json(answer)
     else:
-        print_explained(Console(), source, result, point or "", full=full)
+        print_answer(Console(), result.study, result.no_verdict, result.parts(source, point or "", full=full))
     if out is not None:
         write_whole(out / "causes.json", json.dumps(answer, indent=2, allow_nan=False) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
@@ -317,9 +316,8 @@ def rating(
     as_json: bool,
 ) -> JsonAnswer:
     """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
-    from safevar_sumo.analysis.figures import save
-    from safevar_sumo.analysis.rating.compute import rate_variant, remarks
-    from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
+    from safevar_sumo.analysis.rating.compute import rate_variant
+    from safevar_sumo.analysis.rating.vehicles import matrix_tables
 
     subject = load_results_or_study(source)
     characteristics = CharacteristicSet.of(study_in(subject))
@@ -332,17 +330,11 @@ def rating(
         _refuse_existing(plot, "--plot", force)
     spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
     result = answer_question(rate_variant, subject, options, jobs=jobs)
-    for remark in remarks(result):
+    for remark in result.remarks:
         print_note(remark)
-    answer = result.to_dict()
-    if as_json:
-        print_json(answer)
-    else:
-        print_rating(Console(), result)
+    answer = _show(result, as_json, plot)
     if matrix and not as_json:
-        print_matrices(Console(), result)
-    if plot is not None:
-        save(matrices_figure(result), plot, "--plot")
+        print_parts(Console(), matrix_tables(result.vehicles))
     if spreadsheet is not None:
         vehicle = result.variant or result.original
         spreadsheet.fill(vehicle)

@@ -31,7 +31,7 @@ from safevar_sumo.sumo.system import System, assemble
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from safevar_sumo.analysis.explain.result import Explanation
+    from safevar_sumo.analysis.explain.failure import Explanation
 
 SAMPLED_VEHICLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""

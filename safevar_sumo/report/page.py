@@ -19,18 +19,10 @@ import pandas as pd
 from markupsafe import Markup
 
 from safevar_sumo.analysis.compare.compute import compare_systems
+from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.analysis.rating.compute import rate_variant, remarks
-from safevar_sumo.analysis.rating.render import (
-    colour_changes_in_words,
-    lost_by_test,
-    matrices_figure,
-    not_simulated,
-    rating_in_words,
-    test_in_words,
-)
+from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
@@ -358,23 +350,18 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
     if data.any_unsafe:
         options = RatingOptions(solution=data.select_handles("fewest")[0])
     rating = answer_question(rate_variant, case, options, jobs=jobs, progress=progress)
-    available = sum(sum(matrix.points) for matrix in rating.protocol.matrices)
     return {
         "title": case.study.title,
-        "sentence": f"{rating.no_verdict} {rating_in_words(rating)}".lstrip(),
-        "notes": remarks(rating),
+        "sentence": f"{rating.no_verdict} {rating.verdict}".lstrip(),
+        "notes": rating.remarks,
         "points": [
-            *(
-                (tests[0].matrix.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].matrix.points):g}")
-                for tests in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True)
-            ),
-            ("all", [f"{vehicle.points:.2f}" for vehicle in rating.vehicles], f"{available:g}"),
+            (name, [f"{total:.2f}" for total in points.sum(axis=1)], f"{possible:g}")
+            for name, points, possible in rating.points
         ],
-        "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)],
-        "turned": colour_changes_in_words(rating),
-        "picture": _picture("matrices", matrices_figure(rating)),
+        "lost": [(test, f"{lost:.2f}") for test, lost in rating.losses.items()],
+        "picture": _picture("matrices", rating.figure()),
         "names": [vehicle.name for vehicle in rating.vehicles],
-        "not_simulated": not_simulated(rating),
+        "not_simulated": rating.not_simulated,
         "commands": [
             options.command_line(directory),
             *(question_command(question, directory) for question in ("tolerance", "explain")),

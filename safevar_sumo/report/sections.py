@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.braking_comparison import sentence
+from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import Cause
-from safevar_sumo.analysis.explain.result import Explained, Explanation
+from safevar_sumo.analysis.explain.failure import ROBUST, Explanation
 from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE
-from safevar_sumo.analysis.explain.sentences import ROBUST, counts_in_words, effect_in_words, verdict_in_words
 from safevar_sumo.analysis.model_spread import compute_model_spreads
 from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
@@ -47,12 +46,12 @@ def make_verdict(data: ReportInput, explained: Explained | None, tolerance: Tole
     commands = [question_command(name, str(data.directory), data.point) for name in ("explain", "tolerance")]
     if explained is None:
         return {"sentences": ["No solution was found."], "is_bad": False, "key_figures": [], "commands": commands}
-    sentences = [explained.no_verdict] if explained.no_verdict else verdict_in_words(explained)
+    sentences = [explained.no_verdict] if explained.no_verdict else explained.verdict
     if explained.choices and explained.choices[0].handle:
         simulate = question_command("simulate", str(data.directory), data.point)
         commands.append(f"{simulate} --solution {explained.choices[0].name} --plot it.png")
     return {
-        "sentences": [*sentences, counts_in_words(explained)],
+        "sentences": [*sentences, explained.counts],
         "is_bad": explained.failures > 0,
         "key_figures": _key_figures(data, explained, tolerance),
         "commands": commands,
@@ -65,7 +64,7 @@ def describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
     largest = float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
     return {
         "failure": failure,
-        "effect": effect_in_words(failure),
+        "effect": failure.effect,
         "size": f"{len(failure.changed)} of {len(setting)} characteristics changed, by at most {100 * largest:.0f} %",
         "anchor": data.anchor("replay", failure.name),
         "changes": data.list_changes(setting),
@@ -140,7 +139,7 @@ def _make_cause_section(
         "rows": rows,
         "end": comparison.verdict(comparison.rows[-1]),
         "opinion": opinion,
-        "reason": superscript_powers(sentence(failure.because)),
+        "reason": superscript_powers(str(failure.because)),
         "player_data": player,
         "replay_anchor": data.anchor("replay", failure.name),
     }

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, measure_braking
 from safevar_sumo.records import SimulationRuns
 from tests.made_up import made_up_runs
 
@@ -37,8 +37,7 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
 
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
-    runs = drive_of(one, other)
-    return compare_braking(*(summarise_run(runs, column, 1.0) for column in (0, 1)))
+    return compare_braking(drive_of(one, other), 1, np.ones(2))
 
 
 SAME = (10.0, 15.0, 0.2, 6.0)
@@ -67,11 +66,11 @@ def test_an_obstacle_that_walks_on_leaves_nothing_unexplained() -> None:
     trace = runs.trace
     position = trace.position + walking * trace.time[:, np.newaxis]
     moved = replace(runs, trace=replace(trace, speed=trace.speed + walking, position=position))
-    stands, walks = (compare_braking(*(summarise_run(one, column, 1.0) for column in (0, 1))) for one in (runs, moved))
+    stands, walks = (compare_braking(one, 1, np.ones(2)) for one in (runs, moved))
     assert walks.parts == pytest.approx(stands.parts, abs=1e-4)
     assert abs(walks.parts["remainder"]) < 0.01
-    assert walks.changed.braking is not None
-    assert walks.changed.braking.speed == pytest.approx(11.0 + walking)
+    assert walks.changed is not None
+    assert walks.changed.speed == pytest.approx(11.0 + walking)
 
 
 def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
@@ -82,7 +81,7 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     runs.trace.brake[50:150, 1:3] = 0.5
     runs.trace.throttle[150:200, 1] = 0.1
     runs.trace.brake[150:250, 2:] = 0.01
-    plain, overshot, settling, unbraked = (summarise_run(runs, column, 1.0).braking for column in range(4))
+    plain, overshot, settling, unbraked = (measure_braking(runs, column) for column in range(4))
     assert overshot == settling == plain
     assert plain is not None
     assert plain.gap == pytest.approx(15.0)

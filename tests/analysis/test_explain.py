@@ -19,11 +19,11 @@ from rich.console import Console
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
+from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
     Cause,
-    MinimalCause,
     count_distinct_causes,
     describe_causes,
     find_minimal_causes,
@@ -31,8 +31,6 @@ from safevar_sumo.analysis.explain.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.analysis.explain.compute import explain_failures, summarise_failures
-from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.sentences import effect_in_words, print_explained
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -41,6 +39,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of
 from safevar_sumo.sumo import assemble, evaluate
+from safevar_sumo.terminal import print_answer
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
 from tests.in_process import InlinePool
 
@@ -137,7 +136,7 @@ def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
 
 def printed(explained: Explained, *, full: bool) -> str:
     console = Console(file=StringIO(), width=80, _environ={})
-    print_explained(console, "here", explained, full=full)
+    print_answer(console, explained.study, explained.no_verdict, explained.parts("here", full=full))
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
@@ -150,7 +149,7 @@ def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explain
     assert short[-1].endswith("python -m safevar_sumo explain here --full")
     assert short[1 : 1 + len(explained.sentences())] == explained.sentences()
     assert_tells_a_manager(short[1], explained)
-    braking = explained.explanations[0].because.original.braking
+    braking = explained.explanations[0].because.original
     assert braking is not None
     assert (
         f"decides every 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s"
@@ -191,7 +190,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
         (line,) = [
             line
             for line in others
-            if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, {effect_in_words(failure)}. ")
+            if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, {failure.effect}. ")
         ]
         assert failure.cause is not None
         named = re.findall(r"(\w+) [\d.]+ -> ", line.partition(" These changes alone cause it: ")[2])
@@ -244,13 +243,14 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     ]
     smallest = [subset for subset in unsafe if len(subset) == min(map(len, unsafe))]
     (result,) = find_minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
-    assert [set(cause.columns) for cause in result] == smallest
-    for cause in result:
-        assert not any(set(subset) < set(cause.columns) for subset in unsafe)
+    found = [set(map("abcde".index, cause.changes)) for cause in result]
+    assert found == smallest
+    for columns_of_cause in found:
+        assert not any(subset < columns_of_cause for subset in unsafe)
 
 
-def described(evaluator: Evaluator, causes: list[MinimalCause]) -> Cause:
-    (result,) = describe_causes(evaluator, causes, COLLISION, [None])
+def described(evaluator: Evaluator, causes: list[Cause]) -> Cause:
+    (result,) = describe_causes(evaluator, causes, COLLISION)
     return result
 
 
@@ -325,11 +325,14 @@ def test_conclusions_across_fitted_models() -> None:
     nobody = Preventability(counts={}, collisions=0, later=0)
     result = measure_across_fits(models, evaluations, COLLISION, {"a": 1.0, "b": 1.0, "c": 0.0}, nobody)
     shares = [region(settings).mean() for region in regions]
-    assert result.unsafe == (min(shares), max(shares))
-    assert result.necessary == {"a": (1.0, 1.0), "b": (0.0, 1.0), "c": (0.0, 0.0)}
-    safe = measure_across_fits(models, evaluations.take([3]), COLLISION, {}, nobody)
-    assert (safe.unsafe, safe.necessary) == ((0.0, 0.0), {}), "the original is safe with each"
-    assert result.to_dict()["unsafe"] == {"sets": 4, "range": [min(shares), max(shares)]}
+    ranges = {"a": [1.0, 1.0], "b": [0.0, 1.0], "c": [0.0, 0.0]}
+    assert result.to_dict() == {
+        "unsafe": {"sets": 4, "range": [min(shares), max(shares)]},
+        "necessary": {name: {"sets": 4, "range": ends} for name, ends in ranges.items()},
+        "preventable": {},
+    }
+    safe = measure_across_fits(models, evaluations.take([3]), COLLISION, {}, nobody).to_dict()
+    assert safe == {"unsafe": {"sets": 4, "range": [0.0, 0.0]}, "necessary": {}, "preventable": {}}, "safe with each"
 
 
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:

@@ -236,7 +236,7 @@ def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:
 def test_the_promised_record_and_the_same_again() -> None:
     first, again = (rules_of(box), rules_of(box))
     assert json.dumps(first.to_dict(), allow_nan=False) == json.dumps(again.to_dict(), allow_nan=False)
-    assert repr(first).endswith("settings, 1 rules>")
+    assert repr(first).startswith("<Rules made-up: Unsafe: collision; ")
     (record,) = first.to_dict()
     assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
     assert [list(condition) for condition in record["conditions"]] == [["characteristic", "at_least", "at_most"]] * 2

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from safevar_sumo.analysis.evaluator import open_evaluator
-from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating, rate
+from safevar_sumo.analysis.rating.compute import Rating, rate
+from safevar_sumo.analysis.rating.vehicles import RatedVehicle
 from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Rater
@@ -60,9 +61,8 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     assert verified or rated.points == 0
     for row in verified:
         across, down = map(int, str(row["Test point"]).strip("()").split(","))
-        assert str(row["Colour"]).lower() == rated.colour(
-            PROTOCOL.matrix_cell_numbers[str(row["Scenario"]), across, down]
-        ), row
+        number = PROTOCOL.matrix_cell_numbers[str(row["Scenario"]), across, down]
+        assert str(row["Colour"]).lower() == rated.colours[number], row
 
 
 def test_the_protocols_data_is_what_the_calculator_has(calculator: Calculator) -> None:

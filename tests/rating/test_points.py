@@ -11,8 +11,8 @@ import openpyxl
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
-from safevar_sumo.analysis.rating.render import rating_in_words
+from safevar_sumo.analysis.rating.compute import Rating
+from safevar_sumo.analysis.rating.vehicles import RatedVehicle
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Points, Rater, colours_of, darken
@@ -153,8 +153,8 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
         name: row.original for name, row in result.study.vehicle.characteristics.items()
     }
     result.vehicles[1].__dict__["setting"] = {**result.vehicles[0].setting, "treadDepth": 3.0}
-    assert rating_in_words(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
-    assert rating_in_words(result).endswith(" of them in CPNCO by night.")
+    assert result.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
+    assert result.verdict.endswith(" of them in CPNCO by night.")
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert set(record) == {"study", "variants", "not_simulated"}
     assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}

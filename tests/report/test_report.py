@@ -17,8 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads.reference_drivers import FullBraking
-from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.sentences import counts_in_words, effect_in_words, verdict_in_words
+from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
@@ -117,10 +116,10 @@ def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(
         html.unescape(re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)).split()
     )
     assert "^2" not in words
-    for sentence in (*verdict_in_words(explained), counts_in_words(explained)):
+    for sentence in (*explained.verdict, explained.counts):
         assert sentence.replace("^2", "²") in words
     for failure in explained.choices:
-        assert f"{failure.title.capitalize()}: {effect_in_words(failure)}" in words
+        assert f"{failure.title.capitalize()}: {failure.effect}" in words
         assert failure.cause is not None
         assert f"{failure.robustness}" in words
     for expected in (

@@ -15,7 +15,7 @@ from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.explain.result import Explained
+    from safevar_sumo.analysis.explain.answer import Explained
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.metrics import Criterion
     from safevar_sumo.terminal import Progress

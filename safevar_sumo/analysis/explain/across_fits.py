@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, Interval
-from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes, necessity_frame
+from safevar_sumo.analysis.explain.causes import Cause, find_minimal_causes, necessity_frame
 from safevar_sumo.analysis.preventability import Preventability, assess_preventability
 from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject
 
 MAX_SHARE_SETS = 8
 """Maximum number of sets with which shares are computed; the first sets lie farthest apart."""
@@ -35,61 +36,51 @@ class AcrossFits(NamedTuple):
     ----------
     sets
         Number of parameter sets with which the shares were computed, the study's own among them.
-    unsafe
-        Range of the share of settings that are unsafe.
-    necessary
-        Range of the share of failures that need a characteristic, by its name.
-    preventable
-        Range of the share of collisions in each category of drivers, and `later`, by name; empty without a collision.
+    ranges
+        The ends of each range by kind and name: `unsafe`, without a name, of the settings;
+        `necessary`, of the failures that need a characteristic; `preventable`, of the collisions in each category of
+        drivers, and `later`, if there is a collision.
     """
 
     sets: int
-    unsafe: Interval
-    necessary: Mapping[str, Interval]
-    preventable: Mapping[str, Interval]
+    ranges: Mapping[tuple[str, str], Interval]
 
     def __str__(self) -> str:
-        competent = self.preventable.get("competent_driver")
-        avoided = f"; a competent driver avoids {_in_words(competent)} of the collisions" if competent else ""
-        return (
+        sentence = (
             f"With {number_of(self.sets, 'vehicle model')} that fit the published data about as well, "
-            f"{_in_words(self.unsafe)} of the vehicles are unsafe{avoided}."
+            f"{self._words('unsafe', '')} of the vehicles are unsafe"
         )
+        if ("preventable", "competent_driver") not in self.ranges:
+            return f"{sentence}."
+        avoided = self._words("preventable", "competent_driver")
+        return f"{sentence}; a competent driver avoids {avoided} of the collisions."
+
+    def _words(self, kind: str, name: str) -> str:
+        return " to ".join(dict.fromkeys(map(share_in_words, self.ranges[kind, name])))
 
     def to_dict(self) -> JsonObject:
         """The entry `across_fits` of a summary in JSON: the ranges under the names of the shares."""
-
-        def entry(ends: Interval) -> JsonObject:
-            return {"sets": self.sets, "range": list(ends)}
-
-        return {
-            "unsafe": entry(self.unsafe),
-            "necessary": {name: entry(ends) for name, ends in self.necessary.items()},
-            "preventable": {name: entry(ends) for name, ends in self.preventable.items()},
-        }
+        kinds: dict[str, JsonObject] = {"unsafe": {}, "necessary": {}, "preventable": {}}
+        for (kind, name), ends in self.ranges.items():
+            kinds[kind][name] = {"sets": self.sets, "range": list(ends)}
+        return {**kinds, "unsafe": kinds["unsafe"][""]}
 
 
-def _in_words(ends: Interval) -> str:
-    low, high = map(share_in_words, ends)
-    return low if low == high else f"{low} to {high}"
-
-
-def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[MinimalCause], unsafe: Unsafe) -> list[int]:
+def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[Cause], unsafe: Unsafe) -> list[int]:
     """With how many sets each cause holds: its changes alone are unsafe, and safe if any one of them is left out."""
-    if not causes or not evaluators:
-        return [0] * len(causes)
-    original, groups = evaluators[0].characteristics.original, list[FloatArray]()
-    for cause in causes:
-        parts = np.tile(cause.setting, (1 + len(cause.columns), 1))
-        for row, column in enumerate(cause.columns, 1):
-            parts[row, column] = original[column]
-        groups.append(parts)
-    starts = np.cumsum([0, *map(len, groups)])[:-1]
     counts = np.zeros(len(causes), dtype=int)
+    if not causes or not evaluators:
+        return counts.tolist()
+    characteristics, groups = evaluators[0].characteristics, list[FloatArray]()
+    for cause in causes:
+        setting = cause.setting(characteristics)
+        left_out = np.diag(setting != characteristics.original)[setting != characteristics.original]
+        groups.append(np.vstack([setting, np.where(left_out, characteristics.original, setting)]))
+    starts = np.cumsum([0, *map(len, groups[:-1])])
     for evaluator in evaluators:
         is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
         counts += is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1)
-    return [int(count) for count in counts]
+    return counts.tolist()
 
 
 def measure_across_fits(
@@ -100,46 +91,34 @@ def measure_across_fits(
     preventability: Preventability,
 ) -> AcrossFits:
     """The ranges of the shares over the sets; the arguments have the shares with the study's own parameters."""
-    own = evaluators[0]
-    order = np.random.default_rng(own.study.search.seed).permutation(len(evaluations))
+    order = np.random.default_rng(evaluators[0].study.search.seed).permutation(len(evaluations))
     vehicles = evaluations.settings[order[:MAX_VEHICLES]]
     failures = evaluations.take(unsafe.of(evaluations))
     failures = failures.take(np.argsort(failures.f_num_diff, kind="stable")[:MAX_FAILURES])
 
-    def shares_of(evaluator: Evaluator) -> Mapping[str, Mapping[str, float]]:
-        """All shares with the parameters of a set, by kind and name."""
+    def sample(evaluator: Evaluator) -> pd.Series[float]:
+        """All shares with the parameters of a set."""
         causes = find_minimal_causes(evaluator, failures.settings, unsafe)
         rows = [row for row, of_failure in enumerate(causes) if of_failure]
         changed = evaluator.characteristics.changed(failures.settings[rows])
         frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
         here = evaluator.evaluate(vehicles, STAGE)
         avoided = assess_preventability(evaluator, here.take(here.collided)).shares if preventability.shares else {}
-        return {
-            "unsafe": {"": float(np.mean(unsafe.of(here)))},
-            "necessary": dict(zip(frame["characteristic"], frame["necessary"], strict=True)),
-            "preventable": avoided,
-        }
+        return _by_kind(unsafe.of(here), dict(zip(frame["characteristic"], frame["necessary"], strict=True)), avoided)
 
-    samples = [shares_of(evaluator) for evaluator in evaluators[:MAX_SHARE_SETS]]
-
-    def ranges(kind: str, shares: Mapping[str, float]) -> dict[str, Interval]:
-        return {
-            name: _range_of(share, [sample[kind].get(name) for sample in samples]) for name, share in shares.items()
-        }
-
-    return AcrossFits(
-        sets=len(samples),
-        unsafe=ranges("unsafe", {"": float(np.mean(unsafe.of(evaluations)))})[""],
-        necessary=ranges("necessary", necessary),
-        preventable=ranges("preventable", preventability.shares),
+    shares = _by_kind(unsafe.of(evaluations), necessary, preventability.shares)
+    samples = pd.concat([sample(evaluator) for evaluator in evaluators[:MAX_SHARE_SETS]], axis=1).reindex(shares.index)
+    differences = samples.sub(samples[0].fillna(shares), axis=0)  # none where a sample has no failure, or no collision
+    ends = (
+        (shares + extremes.fillna(0.0)).clip(0.0, 1.0).tolist()
+        for extremes in (differences.min(axis=1), differences.max(axis=1))
     )
+    return AcrossFits(samples.shape[1], dict(zip(shares.index, zip(*ends, strict=True), strict=True)))
 
 
-def _range_of(share: float, samples: Sequence[float | None]) -> Interval:
-    """The range of a share over sets, from its values in each set's sample, the study's own first; None where the
-    sample has no failure, or no collision, that could have the share.
-    """
-    own = share if samples[0] is None else samples[0]
-    differences = [sample - own for sample in samples if sample is not None]
-    low, high = (float(np.clip(share + end(differences, default=0.0), 0.0, 1.0)) for end in (min, max))
-    return low, high
+def _by_kind(
+    is_unsafe: BoolArray, necessary: Mapping[str, float], preventable: Mapping[str, float]
+) -> pd.Series[float]:
+    """Shares by kind and name."""
+    kinds = {"unsafe": {"": is_unsafe.mean()}, "necessary": necessary, "preventable": preventable}
+    return pd.concat({kind: pd.Series(shares, dtype=float) for kind, shares in kinds.items()})

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.words import OUTCOME_VERBS
-from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
+from safevar_sumo.analysis.words import ending_in_words
+from safevar_sumo.records import STANDSTILL, FloatArray, SimulationRuns
 
 PEDAL_SHARE = 0.9
 """Share of the brake command at which the brake pedal counts as having followed the command [-]."""
@@ -33,6 +33,18 @@ CRUISE_SHARE = 0.9
 """A vehicle cruises at this share of its highest speed or more [-]."""
 REGULATION_SHARE = 0.05
 """With less than this share of its largest brake command, a vehicle only regulates its speed [-]."""
+MIN_PART = 0.005
+"""Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
+PART_PHRASES = {
+    "gap": ("gap", "m", "it begins to brake at a {} gap", "smaller", "larger"),
+    "speed": ("speed", "m/s at the command", "it is {}", "faster", "slower"),
+    "delay": ("delay", "s after the command", "its brake pedal follows {}", "later", "sooner"),
+    "slowing": ("speed_lost", "m/s", "it loses {} speed while the pedal moves", "less", "more"),
+    "deceleration": ("deceleration", "m/s^2", "it decelerates {} with the pedal down", "less", "more"),
+}
+"""For each part the attribute of `Braking` that explains it, its unit, and a phrase with a word each for a part that
+costs distance and for one that gains it.
+"""
 
 
 class Braking(NamedTuple):
@@ -52,6 +64,8 @@ class Braking(NamedTuple):
         Mean deceleration after the delay [m/s^2], averaged over the distance, as in UN R13-H.
     obstacle_speed
         Mean speed of the obstacle along the vehicle's path from the command on [m/s]; `deceleration` is relative to it.
+    nearest_gap
+        The gap when the obstacle is nearest, without a collision [m]; None on a collision.
     """
 
     gap: float
@@ -60,50 +74,61 @@ class Braking(NamedTuple):
     speed_deficit: float
     speed_lost: float
     deceleration: float
-    obstacle_speed: float = 0.0
+    obstacle_speed: float
+    nearest_gap: float | None
 
     @property
-    def closing_speed(self) -> float:
-        """Speed towards the obstacle when the brake was commanded [m/s]."""
-        return self.speed - self.obstacle_speed
+    def quantities(self) -> list[float]:
+        """The quantities whose differences explain a lost margin."""
+        closing_speed = self.speed - self.obstacle_speed
+        return [self.gap, closing_speed, self.delay, self.speed_deficit, self.speed_lost, 1 / self.deceleration]
 
     @property
-    def margin(self) -> float:
-        """Gap at the command minus the distance by which it shrinks [m], if the mean deceleration continues after the
-        run.
+    def remainder(self) -> float:
+        """The part of the nearest gap that the margin does not explain [m], 0 on a collision.
+
+        The margin is the gap at the command minus the distance by which it shrinks, if the mean deceleration continues
+        after the run.
         """
-        speed_after_delay = self.closing_speed - self.speed_lost
-        while_pedal_moves = (self.closing_speed - self.speed_deficit) * self.delay
-        return self.gap - while_pedal_moves - speed_after_delay**2 / (2 * self.deceleration)
-
-
-class RunSummary(NamedTuple):
-    """Summary of one run; `braking` is None if the vehicle did not brake for the obstacle.
-
-    `safety_degree` is a distance [m] or, on a collision, minus its speed [m/s]; NaN if undefined. `remainder` is the
-    part of the gap when the obstacle is nearest that the margin does not explain [m], 0 on a collision.
-    """
-
-    outcome: str
-    safety_degree: float
-    braking: Braking | None
-    remainder: float = 0.0
+        if self.nearest_gap is None:
+            return 0.0
+        gap, speed, delay, deficit, lost, softness = self.quantities
+        return self.nearest_gap - (gap - (speed - deficit) * delay - (speed - lost) ** 2 * softness / 2)
 
 
 class BrakingComparison(NamedTuple):
-    """Runs of the original and of the changed vehicle, and the parts of the margin that the changed vehicle lost [m].
+    """How the original and the changed vehicle brake, and the parts of the margin that the changed vehicle lost [m].
 
-    One of the `parts` is the remainder, which no difference explains; `parts` is empty if one of the vehicles never
-    braked. `point` is the name of a test point.
+    A braking is None if the vehicle did not brake for the obstacle; `parts` is empty if one did not. One of the parts
+    is the remainder, which no difference explains. `endings` say how both runs end; `point` is the name of a test
+    point.
     """
 
-    original: RunSummary
-    changed: RunSummary
+    original: Braking | None
+    changed: Braking | None
     parts: dict[str, float]
+    endings: tuple[str, str]
     point: str = ""
 
     def __str__(self) -> str:
-        return sentence(self)
+        """Why the changed vehicle is less safe than the original; a part below 0 is gained."""
+        subject = f"At {self.point}: the" if self.point else "The"
+        endings = f"{subject} original {self.endings[0]}; this one {self.endings[1]}."
+        if not self.parts:
+            return f"{endings} {'It' if self.changed is None else 'The original'} never slows down by braking."
+        phrases = []
+        for name, part in sorted(self.parts.items(), key=lambda item: -item[1]):
+            if name in PART_PHRASES and abs(part) >= MIN_PART:
+                attribute, unit, phrase, costs, gains = PART_PHRASES[name]
+                here, there = (getattr(braking, attribute) for braking in (self.changed, self.original))
+                reason = phrase.format(costs if part > 0 else gains)
+                phrases.append(f"{part:.2f} m because {reason} ({here:.2f} instead of {there:.2f} {unit})")
+        if abs(self.parts["remainder"]) > MAX_OMITTED_REMAINDER:
+            phrases.append(f"{self.parts['remainder']:.2f} m unexplained")
+        return (
+            f"{endings} Its margin, the gap at the brake command less the distance needed to stop, is "
+            f"{sum(self.parts.values()):.2f} m smaller: {', '.join(phrases) or 'they brake alike'}."
+        )
 
 
 def brake_onset(runs: SimulationRuns, column: int) -> int | None:
@@ -136,19 +161,12 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     return onset
 
 
-def summarise_run(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
-    """Summary of the run of vehicle `column`."""
-    outcome, nearest, onset = str(runs.outcome[column]), runs.nearest(column), brake_onset(runs, column)
-    last = int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest
-    braking = None if onset is None else _measure_braking(runs, column, onset, last)
-    if braking is None or nearest is None or np.isfinite(runs.collision_speed[column]):
-        return RunSummary(outcome, safety_degree, braking)
-    return RunSummary(outcome, safety_degree, braking, float(runs.trace.gap[nearest, column]) - braking.margin)
-
-
-def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
-    """The braking from sample `first` to `last`; None if the vehicle only coasts after the pedal has followed."""
-    trace = runs.trace
+def measure_braking(runs: SimulationRuns, column: int) -> Braking | None:
+    """The braking of vehicle `column`; None if it does not brake, or only coasts after the pedal has followed."""
+    first, nearest, trace = brake_onset(runs, column), runs.nearest(column), runs.trace
+    if first is None:
+        return None
+    last = int(np.flatnonzero(trace.active[:, column])[-1]) if nearest is None else nearest
     speed, position = trace.speed[: last + 1, column], trace.position[: last + 1, column]
     elapsed = trace.time[last] - trace.time[first]
     shift = position[last] + trace.gap[last, column] - position[first] - trace.gap[first, column]  # of the obstacle
@@ -161,91 +179,39 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
     if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
     initial_speed, delay = float(speed[first]), (followed - first) * trace.step
-    mean_speed = float(position[followed] - position[first]) / delay if delay else initial_speed
+    has_collided = nearest is None or np.isfinite(runs.collision_speed[column])
     return Braking(
         gap=float(trace.gap[first, column]),
         speed=initial_speed + obstacle_speed,
         delay=delay,
-        speed_deficit=initial_speed - mean_speed,
+        speed_deficit=initial_speed - float(position[followed] - position[first]) / delay if delay else 0.0,
         speed_lost=initial_speed - float(speed[followed]),
         deceleration=specific_energy / distance,
         obstacle_speed=obstacle_speed,
+        nearest_gap=None if has_collided else float(trace.gap[last, column]),
     )
 
 
-def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
-    """Compare a changed vehicle's run with the original vehicle's run at the same test point, whose name is `point`."""
-    brakings = [run.braking for run in (original, changed) if run.braking is not None]
-    if len(brakings) < 2:
-        return BrakingComparison(original, changed, {}, point)
-    gap, *quantities = np.array(
-        [
-            [one.gap, one.closing_speed, one.delay, one.speed_deficit, one.speed_lost, 1 / one.deceleration]
-            for one in brakings
-        ]
-    ).T
-    speed, delay, deficit, lost, softness = (values.mean() for values in quantities)
-    more_speed, more_delay, more_deficit, more_lost, more_softness = (float(np.diff(one)[0]) for one in quantities)
+def compare_braking(runs: SimulationRuns, column: int, degrees: FloatArray, point: str = "") -> BrakingComparison:
+    """Compare vehicle `column` with the original vehicle, which is vehicle 0, at the same test point.
+
+    `degrees` are the safety degrees of all vehicles, `point` is the name of the point.
+    """
+    original, changed = measure_braking(runs, 0), measure_braking(runs, column)
+    endings = ending_in_words(runs.outcome[0], degrees[0]), ending_in_words(runs.outcome[column], degrees[column])
+    if original is None or changed is None:
+        return BrakingComparison(original, changed, {}, endings, point)
+    quantities = np.array([original.quantities, changed.quantities])
+    _, speed, delay, deficit, lost, softness = quantities.mean(axis=0)
+    more_gap, more_speed, more_delay, more_deficit, more_lost, more_softness = np.diff(quantities, axis=0)[0]
     per_speed_after_delay = (speed - lost) * softness
-    speeds_after_delay = quantities[0] - quantities[3]
+    speeds_after_delay = quantities[:, 1] - quantities[:, 4]
     parts = {
-        "gap": gap[0] - gap[1],
+        "gap": -more_gap,
         "speed": more_speed * (delay + per_speed_after_delay),
         "delay": more_delay * (speed - deficit),
         "slowing": -more_deficit * delay - more_lost * per_speed_after_delay,
         "deceleration": more_softness * np.mean(speeds_after_delay**2) / 2,
         "remainder": original.remainder - changed.remainder,
     }
-    return BrakingComparison(original, changed, {name: float(part) for name, part in parts.items()}, point)
-
-
-MIN_PART = 0.005
-"""Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
-PART_PHRASES = {
-    "gap": ("gap", "m", "it begins to brake at a smaller gap", "it begins to brake at a larger gap"),
-    "speed": ("speed", "m/s at the command", "it is faster", "it is slower"),
-    "delay": ("delay", "s after the command", "its brake pedal follows later", "its brake pedal follows sooner"),
-    "slowing": (
-        "speed_lost",
-        "m/s",
-        "it loses less speed while the pedal moves",
-        "it loses more speed while the pedal moves",
-    ),
-    "deceleration": (
-        "deceleration",
-        "m/s^2",
-        "it decelerates less with the pedal down",
-        "it decelerates more with the pedal down",
-    ),
-}
-"""For each part the attribute of `Braking` that explains it, its unit, and phrases: if it costs distance, and if it
-gains distance.
-"""
-
-
-def ending_in_words(run: RunSummary) -> str:
-    """How a run ended, in words."""
-    if run.outcome == Outcome.COLLISION:
-        return f"collides at {-run.safety_degree:.2f} m/s"
-    end = OUTCOME_VERBS[Outcome(run.outcome)]
-    return end if np.isnan(run.safety_degree) else f"{end}, safety degree {run.safety_degree:.2f} m"
-
-
-def sentence(comparison: BrakingComparison) -> str:
-    """Why the changed vehicle is less safe than the original; a part below 0 is gained."""
-    original, changed = comparison.original, comparison.changed
-    subject = f"At {comparison.point}: the" if comparison.point else "The"
-    endings = f"{subject} original {ending_in_words(original)}; this one {ending_in_words(changed)}."
-    if not comparison.parts:
-        return f"{endings} {'It' if changed.braking is None else 'The original'} never slows down by braking."
-    phrases = []
-    for name, part in sorted(comparison.parts.items(), key=lambda item: -item[1]):
-        if name in PART_PHRASES and abs(part) >= MIN_PART:
-            attribute, unit, costs, gains = PART_PHRASES[name]
-            here, there = (getattr(run.braking, attribute) for run in (changed, original))
-            phrase = costs if part > 0 else gains
-            phrases.append(f"{part:.2f} m because {phrase} ({here:.2f} instead of {there:.2f} {unit})")
-    if abs(comparison.parts["remainder"]) > MAX_OMITTED_REMAINDER:
-        phrases.append(f"{comparison.parts['remainder']:.2f} m unexplained")
-    lost = f"{endings} Its margin, the gap at the brake command less the distance needed to stop, is "
-    return f"{lost}{sum(comparison.parts.values()):.2f} m smaller: {', '.join(phrases) or 'they brake alike'}."
+    return BrakingComparison(original, changed, {name: float(part) for name, part in parts.items()}, endings, point)

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import combinations, islice
 from math import comb
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,39 +27,116 @@ MAX_SUBSETS = 20_000
 """Maximum number of subsets simulated in one call; further subsets are made only after it, which bounds the memory."""
 
 
-class MinimalCause(NamedTuple):
-    """A smallest unsafe subset of a setting's changes: the columns that keep their changed values, and the outcome.
+class BoundaryState(StrEnum):
+    """What lies on a line just below its smallest unsafe share."""
 
-    `setting` has shape (n,); `safety_degree` is in m, or -m/s.
+    SAFE = "safe"
+    FILTER = "filter threshold"
+    NOT_SIMULATED = "not simulated"
+
+
+BELOW = {
+    BoundaryState.SAFE: "slightly less is safe",
+    BoundaryState.FILTER: "with less, a change falls below the filter's threshold and counts as none",
+    BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
+
+    `find_minimal_causes` finds its first three values, `describe_causes` the limits.
+
+    Attributes
+    ----------
+    changes
+        The failure's values of these characteristics, in their units.
+    outcome, safety_degree
+        Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
+    boundary
+        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays
+        unsafe.
+    alone
+        For each characteristic, the value to which it can return towards the original while the others stay as in
+        `changes`.
+    end
+        The end of the shrinking: the state just below `fraction`.
+    neighbours
+        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
+        the simulations would take too long.
+    sets, holds
+        Number of fitted vehicle models (`ExplainOptions.fits`), and with how many of them the cause is one; 0 and 0 of
+        a study with a single model.
     """
 
-    columns: tuple[int, ...]
-    setting: FloatArray
+    changes: dict[str, float]
     outcome: str
     safety_degree: float | None
+    boundary: dict[str, float] = field(default_factory=dict)
+    fraction: float = 1.0
+    alone: dict[str, float] = field(default_factory=dict)
+    end: BoundaryState = BoundaryState.SAFE
+    neighbours: Robustness | None = None
+    sets: int = 0
+    holds: int = 0
+
+    @property
+    def robustness(self) -> float | None:
+        """Share of the neighbours of these changes that are unsafe too."""
+        return None if self.neighbours is None else self.neighbours.share
+
+    @property
+    def limit(self) -> str:
+        """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
+        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {BELOW[self.end]}."
+
+    @property
+    def notes(self) -> str:
+        """How robust the cause is and with how many fitted vehicle models it is one, in brackets; empty if neither is
+        known.
+        """
+        notes = [] if self.neighbours is None else [str(self.neighbours)]
+        notes += [f"in {self.holds} of {self.sets} fitted vehicle models"] if self.sets else []
+        return f" ({'; '.join(notes)})" if notes else ""
+
+    def setting(self, characteristics: CharacteristicSet) -> FloatArray:
+        """The original vehicle with these changes only, shape (n,)."""
+        return np.array([self.changes.get(item.name, item.original) for item in characteristics])
+
+    def to_dict(self) -> JsonObject:
+        """An entry of `minimal_causes` in `explain --json`."""
+        names = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
+        across_fits = {"sets": self.sets, "holds": self.holds} if self.sets else None
+        return {name: getattr(self, name) for name in names} | {"across_fits": across_fits}
 
 
-def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
-    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list if no subset is
-    unsafe.
+def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[Cause]]:
+    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n), without limits; an empty list if
+    no subset is unsafe.
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
-    original = evaluator.characteristics.original
-    columns_by_row = [tuple(np.flatnonzero(flags).tolist()) for flags in evaluator.characteristics.changed(settings)]
-    causes: list[list[MinimalCause]] = [[] for _ in settings]
-    for size in range(max(map(len, columns_by_row), default=0) + 1):
-        open_rows = [row for row in range(len(settings)) if not causes[row]]
-        subsets = ((row, columns) for row in open_rows for columns in combinations(columns_by_row[row], size))
+    original, names = evaluator.characteristics.original, evaluator.characteristics.names
+    changed = [np.flatnonzero(flags).tolist() for flags in evaluator.characteristics.changed(settings)]
+    causes: list[list[Cause]] = [[] for _ in settings]
+    for size in range(max(map(len, changed), default=0) + 1):
+        subsets = (
+            (row, list(columns))
+            for row, found in enumerate(causes)
+            if not found  # in a smaller size: all subsets of this one are tried
+            for columns in combinations(changed[row], size)
+        )
         while chunk := list(islice(subsets, MAX_SUBSETS)):
             partial_settings = np.tile(original, (len(chunk), 1))
-            for index, (row, columns) in enumerate(chunk):
-                partial_settings[index, list(columns)] = settings[row, list(columns)]
+            for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
+                partial[columns] = settings[row, columns]
             evaluations = evaluator.evaluate(partial_settings, f"subsets of {size} changes")
             for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
-                (row, columns), degree = chunk[index], finite_or_none(evaluations.f_safe[index])
-                outcome = str(evaluations.outcome[index])
-                causes[row].append(MinimalCause(columns, partial_settings[index], outcome, degree))
+                row, columns = chunk[index]
+                changes = {names[column]: float(settings[row, column]) for column in columns}
+                outcome, degree = str(evaluations.outcome[index]), finite_or_none(evaluations.f_safe[index])
+                causes[row].append(Cause(changes=changes, outcome=outcome, safety_degree=degree))
     return causes
 
 
@@ -83,7 +159,7 @@ def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evalu
 
 
 def necessity_frame(
-    characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]], failures: int
+    characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[Cause]], failures: int
 ) -> pd.DataFrame:
     """How often each characteristic is changed, and how often it is needed.
 
@@ -105,41 +181,30 @@ def necessity_frame(
         because the sample is drawn without replacement from finitely many failures), the share itself if all failures
         were analysed. Ordered by necessary, involved, changed; no rows if there is no failure.
     """
-    number = max(len(changed), 1)
-    sets = [[set(cause.columns) for cause in failure_causes] for failure_causes in causes]
-    necessary = Counter(column for columns in sets if columns for column in set.intersection(*columns))
-    involved = Counter(column for columns in sets for column in set().union(*columns))
-    frame = pd.DataFrame(
-        [
-            (
-                name,
-                np.count_nonzero(changed[:, column]) / number,
-                necessary[column] / number,
-                involved[column] / number,
-                *(
-                    clopper_pearson(necessary[column], number)
-                    if len(changed) < failures
-                    else [necessary[column] / number] * 2
-                ),
-            )
-            for column, name in enumerate(characteristics.names)
-        ],
-        columns=["characteristic", "changed", "necessary", "involved", "necessary_lower", "necessary_upper"],
+    number, names = max(len(changed), 1), characteristics.names
+    sets = [[set(cause.changes) for cause in of_one] for of_one in causes if of_one]
+    necessary = Counter(name for of_one in sets for name in set.intersection(*of_one))
+    involved = Counter(name for of_one in sets for name in set.union(*of_one))
+    shares = [necessary[name] / number for name in names]
+    frame = pd.DataFrame({"characteristic": names, "changed": changed.sum(axis=0) / number, "necessary": shares})
+    frame["involved"] = [involved[name] / number for name in names]
+    frame[["necessary_lower", "necessary_upper"]] = (
+        [clopper_pearson(necessary[name], number) for name in names]
+        if len(changed) < failures
+        else np.transpose([shares] * 2)
     )
-    order = ["necessary", "involved", "changed"]
-    return frame[: len(frame) if len(changed) else 0].sort_values(
-        order, ascending=False, kind="stable", ignore_index=True
-    )
+    frame = frame if len(changed) else frame.head(0)
+    return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
 
 
-def cause_key(characteristics: CharacteristicSet, cause: MinimalCause) -> tuple[str, ...]:
+def cause_key(characteristics: CharacteristicSet, cause: Cause) -> tuple[str, ...]:
     """The directions of a cause's changes, without their sizes, such as ('mass up', 'tireFric down')."""
     return tuple(
-        direction_in_words(characteristics.members[column], float(cause.setting[column])) for column in cause.columns
+        direction_in_words(item, cause.changes[item.name]) for item in characteristics if item.name in cause.changes
     )
 
 
-def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[MinimalCause]]) -> pd.DataFrame:
+def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
     """Every distinct minimal cause, most frequent first.
 
     Returns
@@ -148,9 +213,7 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
         Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause;
         and `share`, their share of all failures.
     """
-    counts = Counter(
-        key for failure_causes in causes for key in {cause_key(characteristics, cause) for cause in failure_causes}
-    )
+    counts = Counter(key for of_one in causes for key in {cause_key(characteristics, cause) for cause in of_one})
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
@@ -167,111 +230,32 @@ RESOLUTION = 1 / (LINE_SETTINGS * PARTS_PER_ROUND**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
 
 
-class BoundaryState(StrEnum):
-    """What lies on a line just below its smallest unsafe share."""
-
-    SAFE = "safe"
-    FILTER = "filter threshold"
-    NOT_SIMULATED = "not simulated"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cause:
-    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
-
-    Attributes
-    ----------
-    changes
-        The failure's values of these characteristics, in their units.
-    boundary
-        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays
-        unsafe.
-    alone
-        For each characteristic, the value to which it can return towards the original while the others stay as in
-        `changes`.
-    outcome, safety_degree
-        Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
-    end
-        The end of the shrinking: the state just below `fraction`.
-    neighbours
-        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
-        the simulations would take too long.
-    sets, holds
-        Number of fitted vehicle models (`ExplainOptions.fits`), and with how many of them the cause is one; 0 and 0 of
-        a study with a single model.
-    """
-
-    changes: dict[str, float]
-    boundary: dict[str, float]
-    fraction: float
-    alone: dict[str, float]
-    outcome: str
-    safety_degree: float | None
-    end: BoundaryState = BoundaryState.SAFE
-    neighbours: Robustness | None = None
-    sets: int = 0
-    holds: int = 0
-
-    @property
-    def robustness(self) -> float | None:
-        """Share of the neighbours of these changes that are unsafe too."""
-        return None if self.neighbours is None else self.neighbours.share
-
-    @property
-    def fits_in_words(self) -> str:
-        return f"in {self.holds} of {self.sets} fitted vehicle models"
-
-    @property
-    def limit(self) -> str:
-        """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
-        below = {
-            BoundaryState.SAFE: "slightly less is safe",
-            BoundaryState.FILTER: "with less, a change falls below the filter's threshold and counts as none",
-            BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
-        }[self.end]
-        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
-
-    def to_dict(self) -> JsonObject:
-        """An entry of `minimal_causes` in `explain --json`."""
-        names = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
-        across_fits = {"sets": self.sets, "holds": self.holds} if self.sets else None
-        return {name: getattr(self, name) for name in names} | {"across_fits": across_fits}
-
-
-def describe_causes(
-    evaluator: Evaluator, causes: Sequence[MinimalCause], unsafe: Unsafe, robustnesses: Sequence[Robustness | None]
-) -> list[Cause]:
+def describe_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> list[Cause]:
     """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the
     filter's thresholds.
     """
+    if not causes:
+        return []
     characteristics = evaluator.characteristics
-    names, original = characteristics.names, characteristics.original
-    groups = [(cause, group) for cause in causes for group in (cause.columns, *((one,) for one in cause.columns))]
-    ends = np.array([cause.setting for cause, _ in groups]).reshape(-1, len(names))
-    is_scaled = np.array([np.isin(range(len(names)), group) for _, group in groups], dtype=bool).reshape(ends.shape)
+    settings, original = np.array([cause.setting(characteristics) for cause in causes]), characteristics.original
+    is_changed = settings != original
+    groups = [np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]]) for flags in is_changed]
+    is_scaled, ends = np.concatenate(groups), np.repeat(settings, [len(group) for group in groups], axis=0)
+    starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
         characteristics.threshold, np.abs(ends - original), out=np.zeros(ends.shape), where=is_scaled
     )
-    starts = np.where(is_scaled, original, ends)
-    shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1, initial=0.0))
-    limits = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0]
-    rows = np.cumsum([0, *(1 + len(cause.columns) for cause in causes)])[:-1]
-
-    def values(cause: MinimalCause, setting: FloatArray) -> dict[str, float]:
-        return {names[column]: float(setting[column]) for column in cause.columns}
-
+    shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1))
+    limits, rows = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0], np.cumsum([0, *map(len, groups)])
     return [
-        Cause(
-            changes=values(cause, cause.setting),
-            boundary=values(cause, limits[row]),
-            fraction=float(shares[row]) if cause.columns else 0.0,
-            alone={names[one]: float(limits[row + k, one]) for k, one in enumerate(cause.columns, 1)},
-            outcome=cause.outcome,
-            safety_degree=cause.safety_degree,
-            end=states[row] if cause.columns else BoundaryState.SAFE,
-            neighbours=robustness,
+        replace(
+            cause,
+            boundary=dict(zip(cause.changes, limits[row, flags].tolist(), strict=True)),
+            alone=dict(zip(cause.changes, np.diagonal(limits[row + 1 : end, flags]).tolist(), strict=True)),
+            fraction=float(shares[row]) if cause.changes else 0.0,
+            end=states[row],
         )
-        for cause, row, robustness in zip(causes, rows.tolist(), robustnesses, strict=True)
+        for cause, flags, row, end in zip(causes, is_changed, rows[:-1], rows[1:], strict=True)
     ]
 
 
@@ -302,9 +286,10 @@ def find_boundary_shares(
         shares[:, -1] = high
         inner = settings_on_lines(starts, ends, shares[:, :-1])
         evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), stage)
-        is_unsafe, is_valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
-        is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(number, parts - 1)
-        is_valid[:, :-1] = evaluations.valid.reshape(number, parts - 1)
+        is_unsafe, is_valid = (
+            np.column_stack([flags.reshape(number, parts - 1), np.ones(number, dtype=bool)])
+            for flags in (unsafe.of(evaluations), evaluations.valid)
+        )
         index = np.argmax(is_unsafe, axis=1)
         below = rows, np.maximum(index - 1, 0)
         low_is_valid = np.where(index > 0, is_valid[below], low_is_valid)

@@ -35,40 +35,27 @@ class Robustness(NamedTuple):
 
     @property
     def borderline(self) -> bool:
-        return is_borderline(self.share)
+        """Whether small perturbations remove a failure, because too few of its neighbours are unsafe."""
+        return self.share < MIN_ROBUST_SHARE
 
     def __str__(self) -> str:
         """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
         step, least_share = min(self.shares_by_step.items(), key=lambda item: item[1])
-        disagrees = is_borderline(least_share) and not self.borderline
-        return robustness_in_words(self.share) + (
-            f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else ""
-        )
-
-
-def is_borderline(share: float) -> bool:
-    """Whether small perturbations remove a failure, because too few of its neighbours are unsafe."""
-    return share < MIN_ROBUST_SHARE
-
-
-def robustness_in_words(share: float) -> str:
-    """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
-    return (
-        f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are "
-        "unsafe too"
-    )
+        phrase = f"{100 * self.share:.0f} % of the neighbours are unsafe too"
+        if self.borderline:
+            return f"borderline: only {phrase}"
+        exception = f", but only {100 * least_share:.0f} % with a step of {step:g} s"
+        return f"robust: {phrase}{exception if least_share < MIN_ROBUST_SHARE else ''}"
 
 
 def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, seed: int) -> FloatArray:
     """The neighbours of M settings, shape (M, n), one setting after the other; they differ from it by at most the
     filter's threshold.
     """
-    offsets = (
-        np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
-    )
-    return np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(
-        -1, len(characteristics)
-    )
+    n = len(characteristics)
+    offsets = np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, n)) * characteristics.threshold
+    neighbours = settings[:, np.newaxis] + offsets
+    return np.clip(neighbours, characteristics.lower, characteristics.upper).reshape(-1, n)
 
 
 def estimate_robustness(
@@ -88,10 +75,7 @@ def estimate_robustness(
             flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid)
         )
         shares[step * factor] = (is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1)
-    return [
-        Robustness({step: float(step_shares[row]) for step, step_shares in shares.items()})
-        for row in range(len(settings))
-    ]
+    return [Robustness(dict(zip(shares, row, strict=True))) for row in np.transpose(list(shares.values())).tolist()]
 
 
 def find_smallest_robust_failure(
@@ -102,18 +86,18 @@ def find_smallest_robust_failure(
     Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no
     tried failure is robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
-    order, settings = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff]), failures.settings
-    others, neighbour_sets = STEP_FACTORS[1:], 0
+    order, neighbour_sets = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff]), 0
+    own, others = STEP_FACTORS[:1], STEP_FACTORS[1:]
     least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(others)  # just robust if all other shares are 1
     for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start : start + FAILURES_PER_BATCH]
         neighbour_sets += len(rows)
-        estimates = estimate_robustness(evaluator, settings[rows], step, unsafe, STEP_FACTORS[:1])
+        estimates = estimate_robustness(evaluator, failures.settings[rows], step, unsafe, own)
         candidates = [pair for pair in zip(rows.tolist(), estimates, strict=True) if pair[1].share >= least_share]
         if candidates:
             neighbour_sets += len(others) * len(candidates)
-            rows = np.array([row for row, _ in candidates])
-            further = estimate_robustness(evaluator, settings[rows], step, unsafe, others)
+            settings = failures.settings[[row for row, _ in candidates]]
+            further = estimate_robustness(evaluator, settings, step, unsafe, others)
             for (row, estimate), other in zip(candidates, further, strict=True):
                 if not Robustness(estimate.shares_by_step | other.shares_by_step).borderline:
                     return int(row)

@@ -17,21 +17,21 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.robustness import draw_neighbours, is_borderline, robustness_in_words
+from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE, draw_neighbours
 from safevar_sumo.analysis.figures import FONT_SIZE, new_figure
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of
+from safevar_sumo.analysis.words import ending_in_words, join_phrases, list_of_changes, number_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import Progress, answer_as_html, show_no_progress
+from safevar_sumo.terminal import Answer, Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -51,11 +51,8 @@ class RunEnd(msgspec.Struct, frozen=True):
     safety_degree: float | None = None
 
     def __str__(self) -> str:
-        """Such as `a collision at 3.21 m/s`."""
-        if self.outcome == Outcome.COLLISION:
-            return "a collision" if self.safety_degree is None else f"a collision at {-self.safety_degree:.2f} m/s"
-        degree = "" if self.safety_degree is None else f", safety degree {self.safety_degree:.2f} m"
-        return f"{OUTCOME_VERBS.get(Outcome(self.outcome), self.outcome)}{degree}" if self.outcome else "not driven"
+        """Such as `collides at 3.21 m/s`."""
+        return ending_in_words(self.outcome, self.safety_degree) if self.outcome else "was not driven"
 
 
 class Opinion(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,8 +78,8 @@ class Opinion(msgspec.Struct, frozen=True, kw_only=True):
     because: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Opinions:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Opinions(Answer):
     """Opinions on the minimal causes of failures.
 
     Attributes
@@ -111,12 +108,9 @@ class Opinions:
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each cause: the keys of `to_dict`, with outcome and safety degree of `here` and `there`."""
+        astuple = msgspec.structs.astuple
         rows = [
-            {
-                **msgspec.structs.asdict(one),
-                **{f"{key}_here": value for key, value in msgspec.structs.asdict(one.here).items()},
-                **{f"{key}_there": value for key, value in msgspec.structs.asdict(one.there).items()},
-            }
+            (one.solution, one.changes, *astuple(one.here), *astuple(one.there), one.opinion, one.because)
             for one in self.opinions
         ]
         ends = [f"{key}_{side}" for side in ("here", "there") for key in RunEnd.__struct_fields__]
@@ -125,10 +119,11 @@ class Opinions:
     @property
     def counts(self) -> str:
         """The number of causes with each verdict."""
-        labels = {"outside": "outside (no answer)"}
         numbers = Counter(one.opinion for one in self.opinions)
         counts = [
-            f"{numbers[verdict]} {labels.get(verdict, verdict)}" for verdict in get_args(Verdict) if verdict in numbers
+            f"{numbers[verdict]} {verdict}{' (no answer)' if verdict == 'outside' else ''}"
+            for verdict in get_args(Verdict)
+            if verdict in numbers
         ]
         total = number_of(len(self.opinions), "minimal cause")
         return f"of {total} {join_phrases(counts)}" if counts else "there is no cause to judge"
@@ -143,36 +138,30 @@ class Opinions:
         characteristics = CharacteristicSet.of(self.study)
         lines = [
             f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {self.counts}.",
-            f"The original vehicle with our model: {self.original_here}; with the second: {self.original_there}.",
+            f"The original vehicle {self.original_here} with our model; it {self.original_there} with the second.",
             *(f"note: {note}" for note in self.notes),
         ]
         for one in self.opinions:
             lines += [
                 f"{one.solution}: {one.opinion}: {list_of_changes(characteristics, one.changes)}",
-                f"  with our model {one.here}; {one.because}",
+                f"  With our model it {one.here}; {one.because}.",
             ]
         return lines
 
     def figure(self) -> Figure:
         """The safety degree of each cause with both models; on the line they agree."""
-        figure, axes = new_figure(f"{self.study.name}: causes with two vehicle models", 1, 1, (4.6, 4.0))
-        axis = axes[0, 0]
+        figure, ((axis,),) = new_figure(f"{self.study.name}: causes with two vehicle models", 1, 1, (4.6, 4.0))
+        driven = self.to_frame().dropna(subset=["safety_degree_here", "safety_degree_there"])
         for verdict, marker in zip(get_args(Verdict), "xos^", strict=True):
-            causes = [one for one in self.opinions if one.opinion == verdict and one.there.safety_degree is not None]
-            ends = [[end.safety_degree for end in (one.here, one.there)] for one in causes]
-            if ends:
-                axis.plot(*zip(*ends, strict=True), marker, label=verdict)
+            causes = driven[driven["opinion"] == verdict]
+            if len(causes):
+                axis.plot("safety_degree_here", "safety_degree_there", marker, data=causes, label=verdict)
         axis.axline((0, 0), slope=1, color="black", linewidth=0.8, linestyle="--")
         axis.set_xlabel("safety degree with our model [m, or -m/s]")
         axis.set_ylabel("with the second model [m, or -m/s]")
-        if axis.get_legend_handles_labels()[0]:
+        if len(driven):
             axis.legend(fontsize=FONT_SIZE)
         return figure
-
-    _repr_html_ = answer_as_html
-
-    def __repr__(self) -> str:
-        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {self.counts}>"
 
 
 SIMULATION_LIMIT = 12_000
@@ -214,11 +203,11 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, evaluator: E
     assemble_both_systems(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     explained = explain_failures(source, explain_options, evaluator)
-    causes = [(str(failure.handle), cause) for failure in explained.explanations for cause in failure.causes]
+    causes = [(failure.name, cause) for failure in explained.explanations for cause in failure.causes]
     return replace(
         judge_causes(source.study, causes, explained.unsafe, evaluator.progress),
         no_verdict=explained.no_verdict,
-        without_cause=tuple(str(failure.handle) for failure in explained.explanations if not failure.causes),
+        without_cause=tuple(failure.name for failure in explained.explanations if not failure.causes),
     )
 
 
@@ -230,72 +219,68 @@ def judge_causes(
     Raises the errors of `assemble_both_systems`.
     """
     system, vehicle = assemble_both_systems(study)
-    second_system = replace(system, vehicle=vehicle)
-    original = system.characteristics.original
-    changed = [system.characteristics.setting(cause.changes, "cause", beyond=True) for _, cause in causes]
-    settings = np.stack([original, *changed])
+    second_system, characteristics = replace(system, vehicle=vehicle), system.characteristics
+    original = characteristics.original
+    settings = np.stack([original, *(cause.setting(characteristics) for _, cause in causes)])
     progress(STAGE, 0, len(settings))
     # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
-    ours = evaluate(system, settings)
-    theirs = evaluate(second_system, np.concatenate([settings, scaled]))
-    fails_here, fails_there = unsafe.of(ours), unsafe.of(theirs)
+    ours, theirs = evaluate(system, settings), evaluate(second_system, np.concatenate([settings, scaled]))
+    here, there, fails_there = _run_ends(ours), _run_ends(theirs), unsafe.of(theirs)
     fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
-    ends_here, ends_there = _run_ends(ours), _run_ends(theirs)
+
+    def judge(row: int, cause: Cause) -> tuple[Verdict, str]:
+        """The verdict on a cause, and its reason."""
+        if reasons := vehicle.reasons_to_omit(cause.changes):
+            return "outside", "; ".join(reasons)
+        if unsafe.of(ours)[0]:
+            return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
+        if fails_there[0] or not theirs.valid[0]:
+            return "outside", f"the original vehicle itself is not safe with the second model: it {there[0]}"
+        if not theirs.valid[row]:
+            return "outside", f"with the second model it {there[row]}"
+        if settings[row].tobytes() in vehicle.spinning:  # filled by `evaluate(second_system, ...)` above
+            return "outside", f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
+        verdict: Verdict = "contradicted"
+        because = f"safe with the second model: it {there[row]}; the original vehicle {there[0]}"
+        if fails_there[row]:
+            verdict, safe_share = "confirmed", np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])
+            because = (
+                f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[0]}. "
+                f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
+                f"model, {cause.fraction:.1%} with ours"
+            )
+        reason = _why_borderline(second_system, settings[row], cause, fails_there[row], unsafe, study.search.seed)
+        return ("borderline", f"{reason}; {because}") if reason else (verdict, because)
+
     opinions = []
     for row, (solution, cause) in enumerate(causes, 1):
-        there = ends_there[row]
-        verdict: Verdict = "outside"
-        if reasons := vehicle.reasons_to_omit(cause.changes):
-            because = "; ".join(reasons)
-            there = RunEnd()
-        elif fails_here[0]:
-            because = "the original vehicle itself is unsafe, so that no change is a cause"
-        elif fails_there[0] or not theirs.valid[0]:
-            because = f"the original vehicle itself is not safe with the second model: {ends_there[0]}"
-        elif not theirs.valid[row]:
-            because = f"it could not be simulated with the second model: {there}"
-        elif settings[row].tobytes() in vehicle.spinning:  # filled by `evaluate(second_system, ...)` above
-            because = f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
-        else:
-            verdict = "contradicted"
-            because = f"safe with the second model: {there}; the original vehicle: {ends_there[0]}"
-            if fails_there[row]:
-                verdict = "confirmed"
-                largest_safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])
-                because = (
-                    f"also unsafe with the second model: {there}; the original vehicle is safe: {ends_there[0]}. "
-                    f"{largest_safe_share:.0%} to {largest_safe_share + CHANGE_SHARES[0]:.0%} of the changes are "
-                    f"enough with the second model, {cause.fraction:.1%} with ours"
-                )
-            seed, robustness = study.search.seed, cause.robustness
-            if reason := _why_borderline(second_system, settings[row], robustness, fails_there[row], unsafe, seed):
-                verdict = "borderline"
-                because = f"{reason}; {because}"
-        changes, here = dict(cause.changes), ends_here[row]
-        opinions.append(
-            Opinion(solution=solution, changes=changes, here=here, there=there, opinion=verdict, because=because)
+        verdict, because = judge(row, cause)
+        end = RunEnd() if vehicle.reasons_to_omit(cause.changes) else there[row]
+        opinion = Opinion(
+            solution=solution, changes=cause.changes, here=here[row], there=end, opinion=verdict, because=because
         )
+        opinions.append(opinion)
         progress(STAGE, row + 1, len(settings))
     return Opinions(
-        study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0]
+        study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=here[0], original_there=there[0]
     )
 
 
 def _why_borderline(
-    second_system: System, setting: FloatArray, our_robustness: float | None, is_unsafe: bool, unsafe: Unsafe, seed: int
+    second_system: System, setting: FloatArray, cause: Cause, is_unsafe: bool, unsafe: Unsafe, seed: int
 ) -> str:
     """In which model a cause is borderline; empty if in none."""
-    if our_robustness is None:  # in a rated study, whose neighbours take too long
+    if cause.neighbours is None:  # in a rated study, whose neighbours take too long
         return ""
-    if is_borderline(our_robustness):
-        return f"with our model {robustness_in_words(our_robustness)}"
+    if cause.neighbours.borderline:
+        return f"with our model {cause.neighbours}"
     neighbours = draw_neighbours(second_system.characteristics, setting[np.newaxis], seed)
     runs = evaluate(second_system, neighbours[second_system.region.feasible(neighbours)])
-    same = (unsafe.of(runs) == is_unsafe)[runs.valid]
-    share = int(np.sum(same)) / max(len(same), 1)
+    share = np.mean((unsafe.of(runs) == is_unsafe)[runs.valid]) if runs.valid.any() else 0.0
     result = "unsafe" if is_unsafe else "safe"
-    return f"with the second model only {share:.0%} of the neighbours are {result}, too" if is_borderline(share) else ""
+    is_borderline = share < MIN_ROBUST_SHARE
+    return f"with the second model only {share:.0%} of the neighbours are {result}, too" if is_borderline else ""
 
 
 def _run_ends(runs: Evaluations) -> list[RunEnd]:

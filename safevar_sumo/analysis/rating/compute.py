@@ -4,9 +4,9 @@ rules.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,137 +14,37 @@ import pandas as pd
 from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.figures import FONT_SIZE, new_panels
 from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.rating.vehicles import DECIMALS, LEGEND, POINT_KINDS, RatedVehicle, draw_matrix, max_points
 from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.protocol import EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
-from safevar_sumo.protocol.rater import Points, Rater, darken, with_protocol
-from safevar_sumo.records import CellResults, FloatArray, JsonObject, finite_or_none
-from safevar_sumo.results import SolutionId, row_of_handle
+from safevar_sumo.protocol.rater import darken, with_protocol
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.results import SolutionId, choose_handle, record, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import answer_as_html
+from safevar_sumo.terminal import Answer, WholeTable
+from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-POINT_KINDS = ("standard", "extended", "robustness")
-DECIMALS = 9
-"""Decimals of points and speeds in JSON; further decimals would hold only rounding errors."""
+SUMMARY_CHOICES = {
+    "fewest": "Fewest changes that cost a point",
+    "smallest": "Smallest largest change that costs a point",
+    "most_points": "Most points lost",
+}
 
 
-@dataclass(frozen=True, kw_only=True)
-class RatedTest:
-    """One vehicle's result in a test (by day or by night if the test has both); `points` are in the order of
-    `POINT_KINDS`.
-
-    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; day and night have
-    the same layers.
-    """
-
-    matrix: CellMatrix
-    points: tuple[float, float, float]
-    layers: Mapping[str, bool | None]
-
-    @property
-    def total(self) -> float:
-        return sum(self.points)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RatedVehicle:
-    """One vehicle with its setting, its results in every cell, and the points that they earn."""
-
-    name: str
-    setting: Mapping[str, float]
-    rater: Rater
-    cells: CellResults
-
-    @property
-    def protocol(self) -> Protocol:
-        return self.rater.protocol
-
-    @cached_property
-    def scores(self) -> Points:
-        return self.rater.points(self.cells)
-
-    @property
-    def points(self) -> float:
-        return float(self.scores.total[0])
-
-    @cached_property
-    def tests(self) -> list[RatedTest]:
-        tests = []
-        for matrix in self.protocol.matrices:
-            test = matrix.test_name
-            standard, extended, robustness = self.scores.tests[matrix.name][0].round(DECIMALS).tolist()
-            layers: dict[str, bool | None] = {}
-            for layer in self.protocol.layers_of(test):
-                claimed = layer.name in self.rater.claims.get(test, ()) or None
-                held = self.scores.layers.get((test, layer.name))
-                layers[layer.name] = claimed if held is None else bool(held[0])
-            tests.append(RatedTest(matrix=matrix, points=(standard, extended, robustness), layers=layers))
-        return tests
-
-    def colour(self, cell_number: int) -> str | None:
-        """Colour of a cell; None if the vehicle could not drive the test."""
-        colour = int(self.scores.colours[0, cell_number])
-        return None if colour < 0 else COLOURS[colour]
-
-    def measured(self, cell_number: int) -> tuple[float | None, float | None]:
-        """Relative impact speed [km/h] and time to collision at the warning [s] in a cell; None without impact or
-        warning.
-        """
-        impact, warning = (finite_or_none(values[0, cell_number]) for values in (self.cells.impact, self.cells.warning))
-        return None if impact is None else round(impact, DECIMALS), None if warning is None else round(
-            warning, DECIMALS
-        )
-
-    def to_dict(self) -> JsonObject:
-        cells: dict[str, list[JsonObject]] = {matrix.name: [] for matrix in self.protocol.matrices}
-        for cell_number, cell in enumerate(self.protocol.cells):
-            impact, warning = self.measured(cell_number)
-            cells[cell.matrix.name].append(
-                {
-                    "range": cell.range_or_layer,
-                    "vut_speed": cell.vut_speed,
-                    "target_speed": cell.target_speed,
-                    "impact_location": cell.impact_location,
-                    "colour": self.colour(cell_number),
-                    "relative_impact_speed": impact,
-                    "warning_ttc": warning,
-                }
-            )
-        tests = [
-            {
-                "test": test.matrix.test_name,
-                "light": test.matrix.light,
-                **dict(zip(POINT_KINDS, test.points, strict=True)),
-                "possible": dict(zip(POINT_KINDS, test.matrix.points, strict=True)),
-                "cells": cells[test.matrix.name],
-                "layers": test.layers,
-            }
-            for test in self.tests
-        ]
-        return {
-            "name": self.name,
-            "setting": dict(self.setting),
-            "points": round(self.points, DECIMALS),
-            "possible": max_points(self.protocol),
-            "tests": tests,
-        }
-
-
-def max_points(protocol: Protocol) -> float:
-    """Maximum points of all simulated tests."""
-    return round(sum(sum(matrix.points) for matrix in protocol.matrices), DECIMALS)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rating:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Rating(Answer):
     """A rating of the original vehicle, `vehicles[0]`, and of its variants."""
 
     study: Study
@@ -169,6 +69,24 @@ class Rating:
         """The original vehicle's points minus the variant's points; negative if the variant earns more."""
         return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
 
+    @property
+    def losses(self) -> dict[str, float]:
+        """Points that the variant loses in each test, the largest loss first; only tests with a loss."""
+        pairs = zip(self.original.tests, self.variant.tests if self.variant else (), strict=False)
+        losses = {test_in_words(before.matrix): round(before.total - after.total, DECIMALS) for before, after in pairs}
+        return {test: loss for test, loss in sorted(losses.items(), key=lambda item: -item[1]) if loss > 0}
+
+    @property
+    def points(self) -> list[tuple[str, FloatArray, float]]:
+        """The name of each test, the points of each vehicle, shape (vehicles, 3), and the possible points; last of all
+        tests.
+        """
+        rows = [
+            (tests[0].matrix.name, np.array([test.points for test in tests]), sum(tests[0].matrix.points))
+            for tests in zip(*(vehicle.tests for vehicle in self.vehicles), strict=True)
+        ]
+        return [*rows, ("all", np.sum([points for _, points, _ in rows], axis=0), max_points(self.protocol))]
+
     def to_frame(self) -> pd.DataFrame:
         """One row for each vehicle and test.
 
@@ -192,23 +110,122 @@ class Rating:
             ],
         }
 
-    def sentences(self) -> Sequence[str | Table]:
+    def sentences(self) -> list[str | Table]:
         """The verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
-        from safevar_sumo.analysis.rating.render import rating_parts
+        return [self.verdict, self._points_table(), self._layers_table(), self.not_simulated]
 
-        return rating_parts(self)
+    @property
+    def verdict(self) -> str:
+        """How many points the variant loses and in which test; without a variant, the original's points."""
+        earned, possible = f"{self.original.points:.2f}", f"{max_points(self.protocol):g}"
+        if self.variant is None:
+            return f"The original vehicle earns {earned} of the {possible} points of the tests that are simulated."
+        changes = [
+            f"{item.short_name} {float(item.text(self.variant.setting[item.name])):g}{item.suffix}"
+            for item in CharacteristicSet.of(self.study)
+            if self.variant.setting[item.name] != item.original
+        ]
+        result = f"loses {self.lost:.2f}"
+        if self.lost < 0:
+            result = f"earns {-self.lost:.2f} points more, {self.variant.points:.2f} instead"
+        most = "".join(f", {loss:.2f} of them in {test}" for test, loss in list(self.losses.items())[:1])
+        return (
+            f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned} points that "
+            f"the original earns (of {possible} that are simulated){most if self.lost >= 0 else ''}."
+        )
+
+    def _points_table(self) -> Table:
+        """Points of every test as standard + extended + robustness = total."""
+        table = WholeTable(
+            "test",
+            right=[*(vehicle.name for vehicle in self.vehicles), *(["lost"] if self.variant else []), "of"],
+            title="Points: standard + extended + robustness = total",
+        )
+        for name, points, possible in self.points:
+            totals = points.sum(axis=1)
+            lost = round(totals[0] - totals[-1], 2)
+            sums = [
+                f"{'+'.join(f'{value:.2f}' for value in row)} = {total:.2f}"
+                for row, total in zip(points, totals, strict=True)
+            ]
+            table.add_row(name, *sums, *([f"{lost:.2f}" if lost else ""] if self.variant else []), f"{possible:g}")
+        return table
+
+    def _layers_table(self) -> Table:
+        """The layers that are simulated or claimed, the same by day and night; a variant has a row only where it
+        differs from the original.
+        """
+        table = WholeTable("test", "vehicle", "layers that hold", "layers that fail", title="Robustness layers")
+        for tests in zip(*(vehicle.tests for vehicle in self.vehicles), strict=True):
+            for vehicle, (matrix, _, layers) in zip(self.vehicles, tests, strict=True):
+                if matrix.light != "night" and (vehicle is self.original or layers != tests[0].layers):
+                    claimed = vehicle.rater.claims.get(matrix.test_name, ())
+                    names = {name: f"{name} (claimed)" if name in claimed else name for name in layers}
+                    held, failed = (
+                        ", ".join(names[name] for name, holds in layers.items() if holds is state)
+                        for state in (True, False)
+                    )
+                    table.add_row(matrix.test_name, vehicle.name, held, failed)
+        return table
+
+    @property
+    def not_simulated(self) -> str:
+        """Sentences on the tests and robustness layers without points."""
+        points_by_test = self.protocol.points_not_simulated
+        tests = ", ".join(f"{test} {points:g}" for test, points in points_by_test.items())
+        open_points = sum(
+            matrix.points[2] * [*layers.values()].count(None) / len(layers) for matrix, _, layers in self.original.tests
+        )
+        return (
+            f"Not simulated, neither passed nor failed: {tests}; {sum(points_by_test.values()):g} points. "
+            f"Robustness layers neither simulated nor claimed: {open_points:.2f} points of the simulated tests."
+        )
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks on the weather, required cells, invalid tests and missing warnings, to be read with the rating."""
+        weather, lines = weather_of(self.study.weather, f"study {self.study.name!r}"), []
+        if weather.wet or weather.road_friction != 1:
+            lines.append(
+                f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
+                f"{darken(weather).name!r}."
+            )
+        for vehicle in self.vehicles:
+            scores, name = vehicle.scores, vehicle.name
+            if scores.fails[0]:
+                lines.append(f"{name}: it earns nothing, because {REQUIRED} is not green in the whole standard range.")
+            elif scores.colours[0, self.protocol.unchecked_cells].any():
+                lines.append(
+                    f"{name}: {UNCHECKED} is not green, which Euro NCAP requires; Euro NCAP's calculator "
+                    f"{self.protocol.calculator_version} does not check this, nor do these points."
+                )
+            if invalid := np.count_nonzero(~vehicle.cells.valid):
+                lines.append(
+                    f"{name}: {invalid} cells, in which it cannot hold the speed, are invalid and earn nothing."
+                )
+        if all(np.isnan(vehicle.cells.warning).all() for vehicle in self.vehicles):
+            lines.append("The driving system never warns: rows with FCW are red.")
+        return lines
 
     def figure(self) -> Figure:
         """The matrices of all tests with the colours of their cells."""
-        from safevar_sumo.analysis.rating.render import matrices_figure
+        points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in self.vehicles)
+        arrangement = " (original left, variant right)" if self.variant else ""
+        title = f"{self.study.name}: {points} of {max_points(self.protocol):g}{arrangement}"
+        figure, axes = new_panels(title, len(self.protocol.matrices), 4, (3.75, 2.6), 15.0, 0.0)
+        for axis, matrix in zip(axes, self.protocol.matrices, strict=True):
+            draw_matrix(axis, self.vehicles, matrix)
+        figure.supxlabel(
+            f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; "
+            "asterisk: colour differs from the original's",
+            fontsize=FONT_SIZE,
+        )
+        figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT_SIZE)
+        return figure
 
-        return matrices_figure(self)
 
-    _repr_html_ = answer_as_html
-
-    def __repr__(self) -> str:
-        vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.vehicles)
-        return f"<Rating of {self.study.name}, points of {max_points(self.protocol):g}: {vehicles}>"
+def test_in_words(matrix: CellMatrix) -> str:
+    return f"{matrix.test_name} by {matrix.light}" if matrix.light else matrix.test_name
 
 
 def rate_variant(subject: Study | Case, options: RatingOptions, evaluator: Evaluator) -> Rating:
@@ -223,19 +240,16 @@ def rate_variant(subject: Study | Case, options: RatingOptions, evaluator: Evalu
         If a vehicle cannot be simulated.
     """
     study, characteristics = evaluator.study, evaluator.characteristics
-    setting_values, name = dict[str, float](), "variant"
+    values, name = dict[str, float](), "variant"
     if options.solution is not None:
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(options.solution))]
-        setting_values, name = (
-            {characteristic: float(row[characteristic]) for characteristic in characteristics.names},
-            options.solution,
-        )
+        values, name = {key: float(row[key]) for key in characteristics.names}, options.solution
     if options.changes:
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
-        setting_values, name = {**setting_values, **options.changes}, f"{name} changed" if setting_values else name
-    variants = {name: characteristics.setting(setting_values, "changes")} if setting_values else {}
+        values, name = {**values, **options.changes}, f"{name} changed" if values else name
+    variants = {name: characteristics.setting(values, "changes")} if values else {}
     if options.changes:
         evaluator.region.check(variants[name][np.newaxis], "changes")
     return rate(evaluator, variants)
@@ -254,43 +268,43 @@ def rate(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     study = with_protocol(evaluator.study, EURO_NCAP_2026)
     rater, rated = assemble(study, study.source).rater, evaluator.for_study(study)
     assert rater is not None
-    settings_by_name = {"original": rated.characteristics.original, **settings}
-    cells = rated.simulate_cells(np.stack(list(settings_by_name.values())), "cells and robustness layers")
-    names = rated.characteristics.names
+    names, settings = rated.characteristics.names, {"original": rated.characteristics.original, **settings}
+    cells = rated.simulate_cells(np.stack(list(settings.values())), "cells and robustness layers")
     vehicles = [
         RatedVehicle(
             name=name, setting=dict(zip(names, setting.tolist(), strict=True)), rater=rater, cells=cells.of([index])
         )
-        for index, (name, setting) in enumerate(settings_by_name.items())
+        for index, (name, setting) in enumerate(settings.items())
     ]
     return Rating(study=study, vehicles=vehicles, no_verdict=rated.no_verdict)
 
 
-def remarks(rating: Rating) -> list[str]:
-    """Remarks on the weather, required cells, invalid tests and missing warnings, to be read with the rating."""
-    weather, protocol = weather_of(rating.study.weather, f"study {rating.study.name!r}"), rating.protocol
-    lines = []
-    if weather.wet or weather.road_friction != 1:
-        lines.append(
-            f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
-            f"{darken(weather).name!r}."
-        )
-    for vehicle in rating.vehicles:
-        if vehicle.scores.fails[0]:
-            lines.append(
-                f"{vehicle.name}: it earns nothing, because {REQUIRED} is not green in the whole standard range."
-            )
-        elif vehicle.scores.colours[0, protocol.unchecked_cells].any():
-            lines.append(
-                f"{vehicle.name}: {UNCHECKED} is not green, which Euro NCAP requires; "
-                f"Euro NCAP's calculator {protocol.calculator_version} does not check this, nor do these points."
-            )
-        invalid_cells = np.count_nonzero(~vehicle.cells.valid)
-        if invalid_cells:
-            lines.append(
-                f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle "
-                "cannot hold the speed."
-            )
-    if all(np.isnan(vehicle.cells.warning).all() for vehicle in rating.vehicles):
-        lines.append("The driving system never warns: rows with FCW are red.")
-    return lines
+def summarise_rated_solutions(
+    study: Study, solutions: pd.DataFrame, original: Evaluations, directory: str
+) -> list[str]:
+    """Summarise the solutions of a rated study in lines, the last with commands for the next steps.
+
+    `directory` is the results directory in these commands; the other parameters are those of
+    `safevar_sumo.analysis.explain.compute.summarise_failures`, which calls this function for rated studies.
+    """
+    points, characteristics = float(original.column(RATING_POINTS.name)[0]), CharacteristicSet.of(study)
+    unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
+    losing = int(unsafe.rows(solutions).sum())
+    if not losing:
+        return [
+            f"No solution loses a point of the original's {points:.2f}.",
+            f"Points against each characteristic: {question_command('tolerance', directory)}",
+        ]
+    lines, handle = [], ""
+    for choice, title in SUMMARY_CHOICES.items():
+        handle = str(choose_handle(solutions, unsafe, choice, study.name))
+        row = solutions.iloc[row_of_handle(solutions, SolutionId.parse(handle))]
+        changes = list_of_changes(characteristics, {name: float(row[name]) for name in characteristics.names})
+        lines.append(f"{title}: {handle} loses {points - row[RATING_POINTS.name]:.2f} points with {changes}.")
+    number = number_of(len(solutions), "solution")
+    return [
+        f"The original vehicle earns {points:.2f} points. {losing} of {number} lose at least one point.",
+        *lines,
+        f"Which cells change colour: {question_command('rating', directory)} --solution {quote(handle)} --matrix; "
+        f"which changes cause it: {question_command('explain', directory)}",
+    ]

@@ -18,13 +18,11 @@ import openpyxl
 from openpyxl.utils import coordinate_to_tuple
 from openpyxl.utils.exceptions import InvalidFileException
 
-from safevar_sumo.analysis.rating.compute import RatedVehicle
+from safevar_sumo.analysis.rating.vehicles import RatedVehicle
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
-from safevar_sumo.protocol.cells import WARNING
 from safevar_sumo.protocol.rater import DECIMALS, passing_cells, round_half_up
-from safevar_sumo.records import JsonObject
 
 PARAMETERS, VERSION = "Input parameters", "Version"
 NOT_ASSESSED_MARK, SELF_CLAIMED_MARK = "N/A", "Self claimed"
@@ -61,9 +59,16 @@ class _Spreadsheet:
             raise self._refusal(f"has no sheet {name!r}")
         return self._workbook[name]
 
-    def _save(self) -> None:
+    def fill(self, vehicle: RatedVehicle) -> None:
+        """Fill in what is known of a vehicle, and save the spreadsheet."""
+        for cell, value in self._values(vehicle):
+            cell.value = value
         with whole_file(self.output, "xlsx") as file:
             self._workbook.save(file)
+
+    def _values(self, vehicle: RatedVehicle) -> Iterator[tuple[Any, str | float]]:
+        """The cells to fill, with their values."""
+        raise NotImplementedError
 
 
 class Template(_Spreadsheet):
@@ -77,8 +82,7 @@ class Template(_Spreadsheet):
         for matrix in self.protocol.matrices:
             top, _ = coordinate_to_tuple(matrix.first_cell)
             expected[matrix.sheet, matrix.name_cell] = matrix.name
-            for k, row in enumerate(matrix.rows):
-                expected[matrix.sheet, f"A{top + k}"] = f"{row.vut_speed:g} km/h"
+            expected |= {(matrix.sheet, f"A{top + k}"): f"{row.vut_speed:g} km/h" for k, row in enumerate(matrix.rows)}
         for layer in self.protocol.layers:
             expected[layer.sheet, f"B{coordinate_to_tuple(layer.claim_cell)[0]}"] = layer.name
         for (sheet, address), heading in expected.items():
@@ -86,35 +90,26 @@ class Template(_Spreadsheet):
             if str(value).strip() != heading:
                 raise self._refusal(f"sheet {sheet!r}, cell {address}: {value!r} in place of {heading!r}")
 
-    def _iterate_parameters(self) -> Iterator[tuple[str, str, Any]]:
-        """Test (in the sheet's words "Scenario"), name, and cell for the value, of every input parameter."""
-        test = ""
-        for *_, scenario, parameter, value_cell in self._sheet(PARAMETERS).iter_rows(min_row=2, max_col=7):
-            test = str(scenario.value or test).strip()
-            if parameter.value is not None:
-                yield test, str(parameter.value), value_cell
-
-    def fill(self, vehicle: RatedVehicle) -> None:
-        """Fill in a vehicle's colours, rows' functions, layers that hold or are claimed, and self-claimed tests."""
-        for cell_number, cell in enumerate(self.protocol.cells):
-            if not cell.is_robustness_cell:
-                top, left = coordinate_to_tuple(cell.matrix.first_cell)
-                colour = vehicle.colour(cell_number) or "red"
-                self._sheet(cell.matrix.sheet).cell(top + cell.row, left + cell.column).value = colour.capitalize()
-        for matrix in self.protocol.matrices:
-            top, _ = coordinate_to_tuple(matrix.first_cell)
-            for row_number, row in enumerate(matrix.rows):
-                if row.has_function_choice:
-                    function = "FCW" if matrix.is_rated_by_warning(row_number) else "AEB"
-                    self._sheet(matrix.sheet)[f"{matrix.function_column}{top + row_number}"].value = function
+    def _values(self, vehicle: RatedVehicle) -> Iterator[tuple[Any, str | float]]:
+        """A vehicle's colours, rows' functions, layers that hold or are claimed, and self-claimed tests."""
+        for (_, row, column), number in self.protocol.matrix_cell_numbers.items():
+            matrix = self.protocol.cells[number].matrix
+            top, left = coordinate_to_tuple(matrix.first_cell)
+            colour = vehicle.colours[number] or "red"
+            yield self._sheet(matrix.sheet).cell(top + row, left + column), colour.capitalize()
+            if matrix.rows[row].has_function_choice:
+                function = "FCW" if matrix.is_rated_by_warning(row) else "AEB"
+                yield self._sheet(matrix.sheet)[f"{matrix.function_column}{top + row}"], function
         layers = {test.matrix.test_name: test.layers for test in vehicle.tests}
         for layer in self.protocol.layers:
             holds = layers[layer.test_name][layer.name]
-            self._sheet(layer.sheet)[layer.claim_cell].value = "YES" if holds else "NO"
-        for test, parameter, value_cell in self._iterate_parameters():
-            if "Heading correction" not in parameter:  # a lane departure parameter, which does not accept N/A
-                value_cell.value = SELF_CLAIMED_MARK if test in self.protocol.tests else NOT_ASSESSED_MARK
-        self._save()
+            yield self._sheet(layer.sheet)[layer.claim_cell], "YES" if holds else "NO"
+        test = ""  # in the sheet's words "Scenario", in the first row of each test
+        for *_, scenario, parameter, cell in self._sheet(PARAMETERS).iter_rows(min_row=2, max_col=7):
+            test = str(scenario.value or test).strip()
+            # "Heading correction", a lane departure parameter, does not accept N/A.
+            if parameter.value is not None and "Heading correction" not in str(parameter.value):
+                yield cell, SELF_CLAIMED_MARK if test in self.protocol.tests else NOT_ASSESSED_MARK
 
 
 class PreprocessedFile(_Spreadsheet):
@@ -124,45 +119,34 @@ class PreprocessedFile(_Spreadsheet):
 
     def __init__(self, source: Path, output: Path) -> None:
         super().__init__(source, output)
-        numbers = self.protocol.matrix_cell_numbers
-        self._numbers = {(matrix, f"{row},{column}"): number for (matrix, row, column), number in numbers.items()}
         sheets = dict.fromkeys(matrix.sheet.removesuffix("pred.") for matrix in self.protocol.matrices)
         self._drawn_cells = [drawn_cell for sheet in sheets for drawn_cell in self._read_drawn_cells(f"{sheet}verif.")]
 
-    def _read_drawn_cells(self, name: str) -> Iterator[tuple[JsonObject, int]]:
+    def _read_drawn_cells(self, name: str) -> Iterator[tuple[dict[str, Any], int]]:
         """The spreadsheet's cells by heading, and the cell number, of every drawn cell of a simulated test."""
-        headings = list[str]()
+        headings, matrices = list[str](), {matrix.name for matrix in self.protocol.matrices}
         for row in self._sheet(name).iter_rows():
             values = [str(cell.value or "").strip() for cell in row]
             if "Test point" in values:
                 headings = values
                 continue
-            cells = dict(zip(headings, row, strict=False))
-            if not headings or not cells["Test point"].value:
-                continue
-            matrix, point = str(cells["Scenario"].value).strip(), str(cells["Test point"].value)
-            if matrix in {matrix.name for matrix in self.protocol.matrices}:
-                key = matrix, re.sub("[() ]", "", point)
-                if key not in self._numbers:
+            texts = dict(zip(headings, values, strict=False))
+            if texts.get("Scenario") in matrices and texts["Test point"]:
+                matrix, point = texts["Scenario"], texts["Test point"]
+                key = matrix, *map(int, re.findall(r"\d+", point))
+                if key not in self.protocol.matrix_cell_numbers:
                     raise self._refusal(f"sheet {name!r}, row {row[0].row}: {matrix} has no test point {point!r}")
-                yield cells, self._numbers[key]
+                yield dict(zip(headings, row, strict=False)), self.protocol.matrix_cell_numbers[key]
 
-    def fill(self, vehicle: RatedVehicle) -> None:
-        """Fill in each drawn cell's simulated value and, if a variation is drawn with it, whether that passes."""
+    def _values(self, vehicle: RatedVehicle) -> Iterator[tuple[Any, str | float]]:
+        """Each drawn cell's simulated value and, if a variation is drawn with it, whether that passes."""
         passes = passing_cells(self.protocol, vehicle.scores.colours)[0]
         numbers = {cell.name: number for number, cell in enumerate(self.protocol.cells)}
-        for cells, cell_number in self._drawn_cells:
-            cell = self.protocol.cells[cell_number]
-            cells["Value"].value = _measurement(vehicle, cell_number)
+        for cells, number in self._drawn_cells:
+            # 0 km/h without an impact; 0 s without a warning.
+            yield cells["Value"], float(round_half_up(np.array(max(vehicle.measured(number) or 0.0, 0.0)), DECIMALS))
             if "Verification condition" in cells and "Robustness" in cells:
                 layer, condition = (cells[name].value for name in ("Robustness layer", "Verification condition"))
-                number = numbers.get(f"{cell.name}, {layer} {condition}")
-                if number is not None:
-                    cells["Robustness"].value = "PASS" if passes[number] else "FAIL"
-        self._save()
-
-
-def _measurement(vehicle: RatedVehicle, cell_number: int) -> float:
-    """Relative impact speed [km/h], 0 without an impact; in a row with FCW the time to collision at the warning [s]."""
-    value = vehicle.measured(cell_number)[vehicle.protocol.cells[cell_number].judged_by == WARNING]
-    return float(round_half_up(np.array(max(value or 0.0, 0.0)), DECIMALS))
+                varied = numbers.get(f"{self.protocol.cells[number].name}, {layer} {condition}")
+                if varied is not None:
+                    yield cells["Robustness"], "PASS" if passes[varied] else "FAIL"

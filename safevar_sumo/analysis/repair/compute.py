@@ -355,8 +355,10 @@ class _Finder:
         causes = find_minimal_causes(driver, rows, unsafe)
         distinct = {cause_key(driver.characteristics, cause): cause for group in causes for cause in group}
         chosen = list(distinct.values())
-        described = describe_causes(driver, chosen, unsafe, [None] * len(chosen))
-        worst = driver.evaluate(np.array([cause.setting for cause in chosen]), "full braking").worst_points
+        described = describe_causes(driver, chosen, unsafe)
+        worst = driver.evaluate(
+            np.array([cause.setting(driver.characteristics) for cause in chosen]), "full braking"
+        ).worst_points
         names = [""] * len(chosen) if worst is None else [self.system.points[number].name for number in worst.tolist()]
         return [NotRepairable(cause.boundary, name, share) for cause, name in zip(described, names, strict=True)]
 

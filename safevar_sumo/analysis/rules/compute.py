@@ -25,8 +25,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.terminal import answer_as_html, constraints_in_words, meanings
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.terminal import Answer, constraints_in_words, meanings
+from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,24 +71,31 @@ class Rule(NamedTuple):
         """Whether the density is significantly above a share; always true of a rule without limits."""
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
+    def conditions(self, characteristics: CharacteristicSet) -> list[str]:
+        """Its limits in words, such as `mass above 2500 kg`; `everywhere` without any."""
+        conditions = []
+        for item in characteristics:
+            low, high = self.limits.get(item.name, (None, None))
+            if low is not None or high is not None:
+                limit = (
+                    f"below {high:g}"
+                    if low is None
+                    else f"above {low:g}"
+                    if high is None
+                    else f"from {low:g} to {high:g}"
+                )
+                conditions.append(f"{item.name} {limit}{item.suffix}")
+        return conditions or ["everywhere"]
+
     def in_words(self, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
         """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 %`."""
         others = ", the others anywhere" if 0 < len(self.limits) < len(characteristics) else ""
-        conditions = [
-            _condition_in_words(characteristic, *self.limits[characteristic.name])
-            for characteristic in characteristics
-            if characteristic.name in self.limits
-        ]
         density, coverage = (
-            f"{100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)" if interval else "-"
-            for share, interval in (
-                (self.density or 0.0, self.density_interval),
-                (self.coverage or 0.0, self.coverage_interval),
-            )
+            f"{100 * (share or 0.0):.0f} % ({100 * ends[0]:.0f} % to {100 * ends[1]:.0f} %)" if ends else "-"
+            for share, ends in ((self.density, self.density_interval), (self.coverage, self.coverage_interval))
         )
-        return (
-            f"{join_phrases(conditions or ['everywhere'])}{others}: {unsafe.in_words} in {density}, covers {coverage}"
-        )
+        conditions = join_phrases(self.conditions(characteristics))
+        return f"{conditions}{others}: {unsafe.in_words} in {density}, covers {coverage}"
 
     def to_dict(self) -> JsonObject:
         """An entry of `rules --json`."""
@@ -99,8 +106,8 @@ class Rule(NamedTuple):
         return {"conditions": conditions, **dict(zip(self._fields[1:], shares, strict=True))}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rules:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Rules(Answer):
     """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe, with its 95 %
     interval.
     """
@@ -137,36 +144,21 @@ class Rules:
 
     def figure(self) -> Figure:
         """The density and coverage of each rule, with their 95 % intervals."""
-        members = CharacteristicSet.of(self.study).members
-        figure, axes = new_figure(
-            f"{self.study.name}: rules (unsafe: {self.unsafe})", 1, 1, (7.2, 1.1 + 0.5 * len(self.rules))
-        )
-        axis, places = axes[0, 0], [-number for number in range(len(self.rules))]
+        title, size = f"{self.study.name}: rules (unsafe: {self.unsafe})", (7.2, 1.1 + 0.5 * len(self.rules))
+        figure, ((axis,),) = new_figure(title, 1, 1, size)
+        places, characteristics = -np.arange(len(self.rules)), CharacteristicSet.of(self.study)
         for kind, colour in (("density", VERMILION), ("coverage", BLUE)):
-            for place, rule in zip(places, self.rules, strict=True):
-                axis.plot(
-                    getattr(rule, f"{kind}_interval") or (math.nan, math.nan), [place] * 2, color=colour, linewidth=1.5
-                )
-            axis.plot(
-                self.to_frame().drop_duplicates("rule")[kind].astype(float), places, "o", color=colour, label=kind
-            )
-        conditions = [
-            [_condition_in_words(one, *rule.limits[one.name]) for one in members if one.name in rule.limits]
-            for rule in self.rules
-        ]
-        texts = ["\n".join(phrases) or "everywhere" for phrases in conditions]
+            shares = np.array([getattr(rule, kind) for rule in self.rules], dtype=float)
+            ends = [getattr(rule, f"{kind}_interval") or (math.nan, math.nan) for rule in self.rules]
+            axis.hlines(places, *np.reshape(ends, (-1, 2)).T, color=colour, linewidth=1.5)
+            axis.plot(shares, places, "o", color=colour, label=kind)
+        texts = ["\n".join(rule.conditions(characteristics)) for rule in self.rules]
         axis.set_yticks(places, list(map(escape_dollars, texts)), fontsize=FONT_SIZE - 1)
         axis.set_xlim(-0.02, 1.02)
         axis.set_ylim(0.5 - max(len(places), 1), 0.5)
         axis.set_xlabel("unsafe share within a rule (density), share of all unsafe within it (coverage)")
         axis.legend(fontsize=FONT_SIZE)
         return figure
-
-    _repr_html_ = answer_as_html
-
-    def __repr__(self) -> str:
-        share = f"{self.unsafe_share:.2%} of {self.samples}"
-        return f"<Rules of {self.study.name}, unsafe {self.unsafe}: {share} settings, {len(self.rules)} rules>"
 
     def sentences(self) -> Iterator[str | Table]:
         """Every rule with its density and coverage."""
@@ -192,12 +184,6 @@ class Rules:
             yield f"{RULES_NOTE} In brackets: {100 * CONFIDENCE:.0f} % intervals."
 
 
-def _condition_in_words(characteristic: Characteristic, low: float | None, high: float | None) -> str:
-    if low is not None and high is not None:
-        return f"{characteristic.name} from {low:g} to {high:g}{characteristic.suffix}"
-    return f"{characteristic.name} {f'below {high:g}' if low is None else f'above {low:g}'}{characteristic.suffix}"
-
-
 def find_rules(source: Study | Case, options: RulesOptions, evaluator: Evaluator) -> Rules:
     """Find rules that say where a study is unsafe, from random settings of the whole domain.
 
@@ -208,23 +194,24 @@ def find_rules(source: Study | Case, options: RulesOptions, evaluator: Evaluator
     """
     characteristics, unsafe = evaluator.characteristics, evaluator.choose_criterion(options.unsafe, source)
     evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
-    in_training = np.arange(len(evaluations)) < len(evaluations) // 2
-    training, validation = (evaluations.take(evaluations.valid & half) for half in (in_training, ~in_training))
+    half = len(evaluations) // 2
+    training, validation = (
+        evaluations.take(rows[evaluations.valid[rows]]) for rows in np.split(np.arange(len(evaluations)), [half])
+    )
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
-    unsafe_count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
-    all_unsafe = unsafe_count + int(np.count_nonzero(is_unsafe_validation))
+    count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
     remark, boxes = "", list[FloatArray]()
-    if unsafe_count == len(is_unsafe) > 0:
+    if count == len(is_unsafe) > 0:
         boxes = [np.repeat([[-np.inf], [np.inf]], len(characteristics), axis=1)]
-    elif min(unsafe_count, len(is_unsafe) - unsafe_count) < MIN_SETTINGS:
+    elif min(count, len(is_unsafe) - count) < MIN_SETTINGS:
         remark = (
-            f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} "
-            "unsafe and as many safe "
-            "settings (the command rules --samples N simulates more)"
+            f"{count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many "
+            "safe settings (the command rules --samples N simulates more)"
         )
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(box, validation.settings, is_unsafe_validation, characteristics.names) for box in boxes]
+    all_unsafe = count + int(np.count_nonzero(is_unsafe_validation))
     return Rules(
         study=evaluator.study,
         unsafe=unsafe,
@@ -269,9 +256,8 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
         )
 
     path = np.unique(np.maximum(new_tree(0.0).cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))[:-1]
-    prunings = (
-        path[np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
-    )
+    some = np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))
+    prunings = path[some] if len(path) else np.zeros(1)
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
     scores = np.array(
         [
@@ -331,11 +317,11 @@ def _validate_rule(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray, 
         if np.isfinite([low, high]).any()
     }
     count = int(np.count_nonzero(is_inside & is_unsafe))
-    inside, everywhere = int(np.count_nonzero(is_inside)), int(np.count_nonzero(is_unsafe))
-    return Rule(
-        limits,
-        density=count / inside if inside else None,
-        coverage=count / everywhere if everywhere else None,
-        density_interval=clopper_pearson(count, inside) if inside else None,
-        coverage_interval=clopper_pearson(count, everywhere) if everywhere else None,
-    )
+    density, density_interval = _share(count, int(np.count_nonzero(is_inside)))
+    coverage, coverage_interval = _share(count, int(np.count_nonzero(is_unsafe)))
+    return Rule(limits, density, coverage, density_interval, coverage_interval)
+
+
+def _share(count: int, total: int) -> tuple[float, Interval] | tuple[None, None]:
+    """The share `count` / `total` with its 95 % interval; None if there is none."""
+    return (count / total, clopper_pearson(count, total)) if total else (None, None)

@@ -10,7 +10,7 @@ import pandas as pd
 from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE
-from safevar_sumo.analysis.explain.sentences import situation_in_words
+from safevar_sumo.analysis.explain.answer import situation_in_words
 from safevar_sumo.analysis.figures import (
     BLUE,
     DEGREE_LABEL,

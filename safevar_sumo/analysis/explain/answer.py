@@ -1,0 +1,335 @@
+"""The answer of `explain`: explained failures and statistics of all failures, in JSON and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from rich.table import Table
+
+from safevar_sumo.analysis.explain.across_fits import AcrossFits
+from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, LABELS, REASONS, ROBUST, Explanation, speed_in_words
+from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, escape_dollars, new_figure
+from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.analysis.words import OUTCOME_VERBS, list_of_changes, number_of, question_command, simulate_command
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.records import Evaluations, JsonObject, Outcome
+from safevar_sumo.scenarios import distance_in_words, equals_clear, weather_in_words
+from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import Answer, WholeTable, constraints_in_words
+from safevar_sumo.vehicles import Characteristic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MAX_DISTINCT_CAUSES, MAX_NECESSARY = 10, 4
+"""Maximum number of distinct causes in the table of all failures, and of characteristics named as necessary most often.
+"""
+FRAME_COLUMNS = (
+    "failure",
+    "algorithm",
+    "run",
+    "index",
+    "cause",
+    "characteristic",
+    "unit",
+    "original",
+    "value",
+    "boundary",
+    "alone",
+    "fraction",
+    "outcome",
+    SAFETY_DEGREE,
+    "robustness",
+    "whose",
+    "points",
+)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Explained(Answer):
+    """The answer of `explain`: explanations of the chosen failures, and statistics of all analysed failures.
+
+    Attributes
+    ----------
+    original, nearest
+        Evaluations of the original vehicle, and of the least safe of the evaluated settings; of none, an empty one.
+    explanations
+        Explanations of the chosen failures.
+    necessity, distinct
+        Statistics of all analysed failures: the frames that `necessity_frame` and `count_distinct_causes` return.
+    looked_at, failures, analysed
+        Number of evaluated settings, of failures among these, and of failures that the statistics cover.
+    otherwise
+        Number of solutions that ended otherwise than in the results: with another outcome than the recorded one.
+    preventability
+        Shares of the collisions among the evaluated settings that reference drivers avoid.
+    no_verdict
+        Why simulations tell nothing about the driving system; "" if they do.
+    across_fits
+        Ranges of the shares over the fitted vehicle models; None for a study with a single model.
+    """
+
+    study: Study
+    unsafe: Unsafe
+    original: Evaluations
+    nearest: Evaluations
+    explanations: tuple[Explanation, ...]
+    necessity: pd.DataFrame
+    distinct: pd.DataFrame
+    looked_at: int
+    failures: int
+    analysed: int
+    otherwise: int
+    preventability: Preventability
+    no_verdict: str = ""
+    across_fits: AcrossFits | None = None
+
+    @property
+    def by_reason(self) -> Mapping[str, Explanation]:
+        """The chosen failures by the reasons for their choice."""
+        return {reason: failure for failure in self.explanations for reason in failure.reasons}
+
+    @property
+    def choices(self) -> list[Explanation]:
+        """The failures that were chosen by their size or severity, in the order in which they are shown."""
+        failures = (self.by_reason.get(reason) for reason in LABELS if reason != DISTINCT_CAUSE)
+        return list({id(failure): failure for failure in failures if failure}.values())
+
+    @property
+    def sample(self) -> str:
+        """Which failures the statistics cover, in words."""
+        if self.analysed == self.failures:
+            return f"all of {number_of(self.failures, 'failure')}"
+        return f"random sample: {self.analysed} of {self.failures} failures"
+
+    @property
+    def counts(self) -> str:
+        """The criterion, how many settings are unsafe by it, and in which range with other fitted vehicle models."""
+        vehicles = number_of(self.looked_at, "different vehicle")
+        counts = f"{self.failures} of {vehicles} are unsafe: {self.unsafe.description}."
+        counts += (
+            f" {number_of(self.otherwise, 'setting')} with another outcome than recorded." if self.otherwise else ""
+        )
+        return f"{counts} {self.across_fits}" if self.across_fits else counts
+
+    @property
+    def verdict(self) -> list[str]:
+        """The verdict in sentences: the situation, the failure to lead with, the robust one, and who would have avoided
+        the collisions.
+
+        The failure to lead with has the fewest changes; of several the robust one, else the most severe.
+        """
+        situation = situation_in_words(assemble(self.study), self.original, self.nearest, self.looked_at)
+        parts, reasons = [situation], self.by_reason
+        robust, first = reasons.get(ROBUST), reasons.get(REASONS["fewest"], next(iter(self.explanations), None))
+        if first is None or first.cause is None:
+            return parts if self.no_verdict else [*parts, "Nothing unsafe was found."]
+        if not first.cause.changes:
+            return [*parts, "No change is needed for it to be unsafe."]
+        if robust is not None and len(robust.changed) == len(first.changed):
+            first = robust
+        parts.append(first.finding)
+        if first.robustness.borderline:
+            parts.append(
+                f"The robust failure with the fewest changes: {robust.finding}"
+                if robust
+                else "No failure tested is robust."
+            )
+        return [part[0].upper() + part[1:] for part in [*parts, str(self.preventability)] if part]
+
+    def sentences(self) -> list[str]:
+        """The answer in sentences: the verdict as a paragraph, the counts, and why and by how little the first failure
+        fails.
+        """
+        sentences = [" ".join(self.verdict), self.counts]
+        if not self.explanations:
+            return sentences
+        first = self.explanations[0]
+        full_names = {item.name: _full_name(item) for item in first.characteristics}
+        sentences.append(f"Why {first.name} fails: {first.because}")
+        if first.cause and first.cause.changes:
+            limits = ", ".join(
+                f"{full_names[item.name]} {item.original:g} -> "
+                f"{item.text(first.cause.boundary[item.name])}{item.suffix}"
+                for item in first.characteristics
+                if item.name in first.cause.boundary
+            )
+            sentences.append(f"How little is enough: {limits}.")
+        if self.analysed and len(self.distinct):
+            common = self.distinct.iloc[0]
+            rows = self.necessity[self.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
+            necessary = ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows)
+            sentences += [
+                f"In every cause of a failure most often ({self.sample}): {necessary or 'no change is common to all'}.",
+                f"{number_of(len(self.distinct), 'distinct minimal cause')}; the most frequent: "
+                f"{', '.join(common['cause']) or 'none'} ({100 * common['share']:.0f} % of the failures).",
+            ]
+        return sentences
+
+    def choices_in_words(self) -> list[str]:
+        """A sentence for each failure that was chosen by its size or severity: its effect, and the cause that is
+        named.
+        """
+        return [
+            f"{failure.title.capitalize()}: {failure.name}, {failure.effect}. These changes alone cause it: "
+            f"{list_of_changes(failure.characteristics, failure.cause.changes)}."
+            for failure in self.choices
+            if failure.cause
+        ]
+
+    def parts(self, subject: str, point: str = "", *, full: bool = False) -> Iterator[str | Table]:
+        """The answer in about ten lines; `full` adds every chosen failure. Commands name `subject` and `point`."""
+        yield from self.sentences()
+        if not self.explanations:
+            yield f"How far each characteristic may go: {question_command('tolerance', subject, point)}"
+            return
+        first = self.explanations[0]
+        if first.cause and first.cause.changes:
+            yield f"Try it: {simulate_command(subject, first.cause.boundary, point)}"
+        yield from constraints_in_words(self.study)
+        if not full:
+            command = f"{question_command('explain', subject, point)} --full"
+            yield f"{number_of(len(self.explanations), 'failure')} explained in full: {command}"
+            return
+        if braking := first.because.original:
+            step = next(iter(first.robustness.shares_by_step))
+            yield (
+                f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers "
+                f"{braking.speed * step:.2f} m at {braking.speed:.1f} m/s. Along a characteristic the safety degree is "
+                "a sawtooth of about that height: more digits of a value than a command has mean nothing."
+            )
+        for failure in self.explanations:
+            yield from failure.details(subject, point)
+        yield from self._statistics()
+
+    def _statistics(self) -> Iterator[str | Table]:
+        table = WholeTable(
+            "characteristic",
+            right=("changed", "necessary", "in some cause"),
+            title=f"Changed vs. necessary ({self.sample})",
+        )
+        for row in self.necessity.to_dict("records"):
+            shares = f"{100 * row['changed']:.0f} %", _necessary_share(row), f"{100 * row['involved']:.0f} %"
+            table.add_row(row["characteristic"], *shares)
+        yield table
+        yield (
+            "Shares of the failures. necessary: every minimal cause of a failure contains it, none does without; in "
+            "some cause: at least one minimal cause contains it, others may do without. In brackets: 95 % intervals "
+            f"for all {number_of(self.failures, 'failure')} (Clopper and Pearson's), where only a sample was analysed."
+        )
+        causes = WholeTable(
+            "minimal cause", right=("failures", "share"), title=f"Distinct minimal causes: {len(self.distinct)}"
+        )
+        for _, names, failures, share in self.distinct.head(MAX_DISTINCT_CAUSES).itertuples():
+            causes.add_row(", ".join(names) or "none: the original vehicle", str(failures), f"{100 * share:.0f} %")
+        yield causes
+
+    def to_dict(self) -> list[JsonObject]:
+        """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
+        by_name = self.necessity.set_index("characteristic")
+        summary = {
+            "necessary": by_name["necessary"].to_dict(),
+            "changed": by_name["changed"].to_dict(),
+            "necessary_interval": by_name[["necessary_lower", "necessary_upper"]].T.to_dict("list"),
+            "preventable": self.preventability.to_dict(),
+            "across_fits": None if self.across_fits is None else self.across_fits.to_dict(),
+            **driven_entry(self.no_verdict),
+        }
+        return [*(failure.to_dict() for failure in self.explanations), {"summary": summary}]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each change of each minimal cause of each explanation.
+
+        Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`,
+        `unit`, `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s],
+        `robustness`, `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
+        """
+        rows = [
+            (
+                *(number, *(failure.handle or (None, None, None)), cause_number, item.name, item.unit, item.original),
+                *(values[item.name] for values in (cause.changes, cause.boundary, cause.alone)),
+                *(cause.fraction, cause.outcome, cause.safety_degree, failure.robustness.share),
+                *(failure.preventable, "; ".join(failure.points)),
+            )
+            for number, failure in enumerate(self.explanations)
+            for cause_number, cause in enumerate(failure.causes)
+            for item in failure.characteristics
+            if item.name in cause.changes
+        ]
+        return pd.DataFrame(rows, columns=list(FRAME_COLUMNS))
+
+    def figure(self) -> Figure:
+        """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
+        frame, size = self.necessity.iloc[::-1], (6.4, 1.4 + 0.3 * max(len(self.necessity), 4))
+        figure, ((axis,),) = new_figure(f"{self.study.name}: changed vs. necessary", 1, 1, size)
+        names = [escape_dollars(name) for name in frame["characteristic"]]
+        for column, label, colour, height in (
+            ("changed", "changed", GREY, 0.8),
+            ("involved", "in some minimal cause", SKY_BLUE, 0.5),
+            ("necessary", "necessary: in every minimal cause", BLUE, 0.24),
+        ):
+            axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
+        axis.set_xlim(0, 100)
+        axis.set_xlabel(f"share of {self.analysed} failures [%]")
+        axis.grid(visible=False, axis="y")
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=FONT_SIZE)
+        return figure
+
+
+def _necessary_share(row: Mapping[Any, Any]) -> str:
+    """The share of failures that need a characteristic; with an interval if the failures are a sample."""
+    low, high = row["necessary_lower"], row["necessary_upper"]
+    interval = f" ({100 * low:.0f} % to {100 * high:.0f} %)" if low < high else ""
+    return f"{100 * row['necessary']:.0f} %{interval}"
+
+
+def _full_name(characteristic: Characteristic) -> str:
+    """A characteristic's name, with its short name if that differs."""
+    name, short_name = characteristic.name, characteristic.short_name
+    return name if short_name == name else f"{name} ({short_name})"
+
+
+def situation_in_words(
+    system: System, original: Evaluations, nearest: Evaluations | None = None, number: int = 0
+) -> str:
+    """The conditions and how the original vehicle's run ends; first that nothing collides, if so of `number` vehicles.
+
+    `nearest` is the evaluation of the least safe of these vehicles.
+    """
+    where, own_ending = _place_in_words(system), _ending_in_words(system, original)
+    if not nearest or nearest.collided[0] or original.collided[0] or RATING_POINTS.name in original.metrics:
+        return f"{where}, the original vehicle {own_ending}."
+    other = f"{original.f_safe[0]:.2f} m" if nearest.outcome[0] == original.outcome[0] else own_ending
+    return (
+        f"No collision in {number_of(number, 'vehicle')}; the worst {_ending_in_words(system, nearest)}, "
+        f"the original {other}, {where[0].lower()}{where[1:]}."
+    )
+
+
+def _place_in_words(system: System) -> str:
+    """The weather, or the points of a matrix, as the beginning of a sentence."""
+    points, weather = system.points, system.points[0].weather
+    if system.matrix:
+        return f"At the worst of {len(points)} test points" if len(points) > 1 else f"At {points[0].name}"
+    return f"{weather_in_words(weather)}{' (which changes neither road nor sensors)' * equals_clear(weather)}"
+
+
+def _ending_in_words(system: System, run: Evaluations) -> str:
+    """How the only run of an evaluation ends."""
+    degree, outcome = float(run.f_safe[0]), Outcome(str(run.outcome[0]))
+    if RATING_POINTS.name in run.metrics:
+        return f"earns {run.metrics[RATING_POINTS.name][0]:.2f} points"
+    if outcome == Outcome.COLLISION:
+        return f"itself collides, at {speed_in_words(degree)}"
+    if outcome == Outcome.STOPPED and all(point.scenario.pre_crash.startswith("pedestrian") for point in system.points):
+        return f"stops {degree:.2f} m short of the pedestrian"
+    verb = OUTCOME_VERBS[outcome]
+    if np.isnan(degree):
+        return verb
+    return f"{verb} with a safety degree of {distance_in_words(system.points[0].scenario, degree)}"

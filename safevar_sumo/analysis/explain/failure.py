@@ -1,0 +1,168 @@
+"""One explained failure: its causes, why it is less safe than the original, and whether it is robust; in JSON and in
+words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from rich.table import Table
+
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison
+from safevar_sumo.analysis.explain.causes import Cause
+from safevar_sumo.analysis.explain.robustness import Robustness
+from safevar_sumo.analysis.words import list_of_changes, number_of, simulate_command, two_decimals
+from safevar_sumo.records import KMH_PER_MS, JsonObject, Outcome
+from safevar_sumo.results import SolutionId
+from safevar_sumo.study import unit_text
+from safevar_sumo.terminal import WholeTable, meanings
+from safevar_sumo.vehicles import CharacteristicSet
+
+ROBUST = "smallest robust"
+"""The reason for choosing the robust failure with the fewest changes."""
+REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest": "smallest changes"}
+"""The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
+DISTINCT_CAUSE = "a cause of its own"
+"""The reason for choosing the simplest failure with a cause that no other chosen failure has."""
+LABELS = {
+    ROBUST: "robust with the fewest changes",
+    REASONS["fewest"]: "fewest changes",
+    REASONS["smallest"]: "smallest largest change",
+    REASONS["most_severe"]: "most severe",
+    DISTINCT_CAUSE: "distinct cause",
+}
+"""Titles of failures by the reason for their choice, in the order in which they are shown."""
+MAX_CHANGES_LISTED = 4
+"""Maximum number of changes that the verdict lists, the largest first."""
+MAX_CAUSES = 3
+"""Maximum number of minimal causes printed for a failure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """The explanation of one failure; `handle` is None if the setting is no solution.
+
+    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `because` states why it is less safe:
+    the comparison of its braking with the original vehicle's. `preventable` is the `PreventableBy` of a collision, as
+    text. `points` are the names of the test points at which the setting is unsafe; in a rated study, of the cells whose
+    colour is worse than the original's.
+    """
+
+    characteristics: CharacteristicSet = field(repr=False)
+    handle: SolutionId | None
+    reasons: tuple[str, ...]
+    setting: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+    causes: tuple[Cause, ...]
+    robustness: Robustness
+    because: BrakingComparison
+    preventable: str = ""
+    points: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return str(self.handle or "a sampled setting")
+
+    @property
+    def title(self) -> str:
+        """Why it was chosen, as a title."""
+        return "; ".join(label for reason, label in LABELS.items() if reason in self.reasons) or ", ".join(self.reasons)
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        return tuple(item.name for item in self.characteristics if self.setting[item.name] != item.original)
+
+    @property
+    def cause(self) -> Cause | None:
+        """The cause that is named: the most robust, the first of several or in a rated study; None if the setting is
+        not unsafe.
+        """
+        return max(self.causes, key=lambda cause: cause.robustness or 0.0, default=None)
+
+    @property
+    def effect(self) -> str:
+        """What happens, such as `a collision at 1.5 m/s, 5 km/h`."""
+        if self.safety_degree is None:
+            return self.outcome
+        if self.outcome == Outcome.COLLISION:
+            return f"a collision at {speed_in_words(self.safety_degree)}"
+        return f"a safety degree of only {self.safety_degree:.2f} m"
+
+    @property
+    def finding(self) -> str:
+        """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with 10 changes: ...; 3 of
+        them are enough`.
+        """
+        number, cause = len(self.changed), self.cause
+        shares = {
+            item.short_name: (self.setting[item.name] - item.original) / abs(item.original)
+            for item in self.characteristics
+            if item.name in self.changed
+        }
+        largest = sorted(shares.items(), key=lambda share: -abs(share[1]))[:MAX_CHANGES_LISTED]
+        changes = ", ".join(f"{name} {100 * share:+.0f} %" for name, share in largest)
+        changes += f" and {number - MAX_CHANGES_LISTED} more" if number > MAX_CHANGES_LISTED else ""
+        finding = f"{self.effect} ({self.name}, {self.robustness})"
+        if cause is None or len(cause.changes) == number:
+            return f"{finding} needs {number_of(number, 'change')}: {changes}."
+        enough = f"{len(cause.changes)} of them {'are' if len(cause.changes) > 1 else 'is'} enough{cause.notes}"
+        return f"{finding} was found with {number} changes: {changes}; {enough}."
+
+    def to_dict(self) -> JsonObject:
+        """An entry of `explain --json`."""
+        algorithm, run, index = self.handle or (None, None, None)
+        return {
+            "algorithm": algorithm,
+            "run": run,
+            "index": index,
+            "setting": self.setting,
+            "outcome": self.outcome,
+            "safety_degree": self.safety_degree,
+            "changed": list(self.changed),
+            "minimal_causes": [cause.to_dict() for cause in self.causes],
+            "robustness": self.robustness.share,
+            "because": str(self.because),
+            "reasons": list(self.reasons),
+            **({"points": list(self.points)} if self.points else {}),
+        }
+
+    def details(self, subject: str, point: str) -> Iterator[str | Table]:
+        """Everything about the failure, as sentences and tables; printed commands name `subject` and `point`."""
+        yield f"\n{self.name} ({self.title})"
+        changes = list_of_changes(self.characteristics, self.setting)
+        yield f"{self.outcome}, SD {two_decimals(self.safety_degree)} with {changes}"
+        for cause in self.causes[:MAX_CAUSES]:
+            changes = list_of_changes(self.characteristics, cause.changes)
+            yield f"Minimal cause: {changes}: {cause.outcome}, SD {two_decimals(cause.safety_degree)}"
+            changed = [item for item in self.characteristics if item.name in cause.changes]
+            table = WholeTable(
+                "characteristic", right=("original", "here", "limit (all scaled)", "limit (this one only)")
+            )
+            for item in changed:
+                values = (item.text(limits[item.name]) for limits in (cause.changes, cause.boundary, cause.alone))
+                table.add_row(item.name + unit_text(item.unit, " [{}]"), f"{item.original:g}", *values)
+            yield table
+            yield meanings(changed)
+            if changed:
+                yield f"{cause.limit} It is a cause{cause.notes}: {simulate_command(subject, cause.changes, point)}"
+        if len(self.causes) > MAX_CAUSES:
+            yield f"... and {len(self.causes) - MAX_CAUSES} more of the same number of changes (--json has all)."
+        if len(self.causes) > 1:
+            names = set.intersection(*(set(cause.changes) for cause in self.causes))
+            necessary = ", ".join(name for name in self.changed if name in names)
+            yield f"Necessary, as all of them need it: {necessary or 'nothing'}."
+        yield f"Because: {self.because}"
+        if self.because.point:
+            yield f"It is worse at {number_of(len(self.points), 'point')}: {'; '.join(self.points) or 'none'}."
+        if self.preventable:
+            yield f"In the same vehicle: {self.preventable}."
+        if self.causes:
+            yield f"It is {self.robustness}."
+
+
+def speed_in_words(degree: float) -> str:
+    """The collision speed of a safety degree in m/s, and in whole km/h or, below 3 km/h, with a decimal."""
+    speed = -degree * KMH_PER_MS
+    return f"{-degree:.1f} m/s, {speed:.{int(speed < 3)}f} km/h"
