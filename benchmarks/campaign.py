@@ -29,10 +29,11 @@ from measuring import Record, clock_seconds, print_records
 
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.campaign.cluster import cluster_pool
-from safevar_sumo.campaign.evaluation import evaluate_batch, identity_of, pack_study
+from safevar_sumo.campaign.evaluation import Task, evaluate_batch
+from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.local import local_pool
-from safevar_sumo.campaign.pool import Pool, Report, Share
-from safevar_sumo.campaign.share import carry_out_share
+from safevar_sumo.campaign.pool import Batch, Job, Pool, Report, evaluate_batches
+from safevar_sumo.campaign.worker import carry_out_job
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
@@ -42,7 +43,7 @@ from safevar_sumo.sumo.network import stage_network
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-Batch = tuple[bytes, FloatArray]
+Computed = tuple[bytes, FloatArray]
 """A packed study, which says where its vehicles drive, and the settings."""
 
 
@@ -60,18 +61,13 @@ class ThisProcess:
     workers = 1
 
     def __init__(self) -> None:
-        self.batches: list[Batch] = []
+        self.batches: list[Computed] = []
         self.simulation = 0.0
 
-    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
-        future: Future[Evaluations] = Future()
-        future.set_result(self._evaluate(work, settings))
-        return future
-
-    def carry(self, share: Share, report: Report) -> Future[None]:
+    def carry(self, job: Job, report: Report) -> Future[None]:
         future: Future[None] = Future()
         self.batches, self.simulation = [], 0.0  # without the batches that warmed this process up
-        future.set_result(carry_out_share(share, report, self._evaluate))
+        future.set_result(carry_out_job(job, report, self._evaluate))
         return future
 
     def _evaluate(self, work: bytes, settings: FloatArray) -> Evaluations:
@@ -104,8 +100,7 @@ def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
 def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     """Carry out a study in a pool that is at work already."""
     with tempfile.TemporaryDirectory() as folder, opened as pool:
-        for future in [pool.submit(pack_study(study), drawn(study, MAX_VEHICLES)) for _ in range(4 * pool.workers)]:
-            future.result()
+        evaluate_batches([Batch(Task(study=study).packed, drawn(study, MAX_VEHICLES))] * 4 * pool.workers, pool)
         before = processors()
         results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
         clock = clock_seconds(
@@ -114,12 +109,12 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
         return Cost(clock, processors() - before)
 
 
-def compute(batches: list[Batch]) -> None:
+def compute(batches: list[Computed]) -> None:
     for work, settings in batches:
         evaluate_batch(work, settings)
 
 
-def ceiling(batches: list[Batch]) -> float:
+def ceiling(batches: list[Computed]) -> float:
     """How much faster two processes are than one that only compute the same batches."""
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-import threading
 from concurrent.futures import Future
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -16,17 +15,14 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.campaign import all_runs, run_campaign
-from safevar_sumo.campaign.evaluation import evaluate_batch, identity_of
-from safevar_sumo.campaign.pool import Report, Share
-from safevar_sumo.campaign.share import carry_out_share
+from safevar_sumo.campaign.evaluation import evaluate_batch
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.pool import Job, Report
+from safevar_sumo.campaign.worker import carry_out_job
 from safevar_sumo.cli.program import main
-from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
-
-_libsumo_lock = threading.Lock()
-"""A process has one libsumo, and threads that retry batches ask for several at once."""
 
 
 class InlinePool:
@@ -36,19 +32,10 @@ class InlinePool:
 
     def __init__(self, jobs: int = 1, time_limit: float = 0.0) -> None: ...
 
-    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
-        future: Future[Evaluations] = Future()
-        try:
-            with _libsumo_lock:
-                future.set_result(evaluate_batch(work, settings))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-    def carry(self, share: Share, report: Report) -> Future[None]:
+    def carry(self, job: Job, report: Report) -> Future[None]:
         future: Future[None] = Future()
         try:
-            future.set_result(carry_out_share(share, report, evaluate_batch))
+            future.set_result(carry_out_job(job, report, evaluate_batch))
         except Exception as error:
             future.set_exception(error)
         return future

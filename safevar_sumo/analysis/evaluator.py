@@ -12,11 +12,11 @@ import numpy as np
 
 from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.campaign.batches import VERIFIED_SETTINGS, ask_why_no_verdict, evaluate_all, inputs_of
-from safevar_sumo.campaign.evaluation import EVERYTHING, Inputs, Selection, pack_study
+from safevar_sumo.campaign.batches import evaluate_all
+from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Inputs, Selection, Task
+from safevar_sumo.campaign.identity import ask_why_no_verdict, inputs_of
 from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.campaign.pool import Pool, wait_for_result
-from safevar_sumo.campaign.retrying import RetryingPool
+from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import cells_of_part
@@ -160,19 +160,22 @@ class Evaluator:
         assert rater is not None
         cell_count = len(rater.protocol.cells)
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
-        inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
-        work = [pack_study(self.study, inputs, cells=(part, parts)) for part in range(parts)]
-        futures, results, done = [pool.submit(one, settings) for one in work], list[CellResults](), 0
-        for future, numbers in zip(futures, cells, strict=True):
+        task = Task(study=self.study, inputs=self._inputs)
+        tasks = [msgspec.structs.replace(task, cells=(part, parts)) for part in range(parts)]
+        results, done = list[CellResults](), 0
+
+        def show_more_done(part: int, size: int) -> None:
+            nonlocal done
+            done += len(cells[part])
             self.progress(stage, done, cell_count)
-            evaluations = wait_for_result(future)
+
+        self.progress(stage, done, cell_count)
+        for evaluations in evaluate_batches([Batch(one.packed, settings) for one in tasks], self._pool, show_more_done):
             if evaluations.cells is None:
                 reason = evaluations.reason(int(np.argmax(evaluations.failed)))
                 raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
             results.append(evaluations.cells)
-            done += len(numbers)
-        self.progress(stage, done, cell_count)
         self.simulated += len(settings)
         order = np.argsort(np.concatenate(cells))
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in zip(*results, strict=True))

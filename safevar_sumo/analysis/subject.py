@@ -223,9 +223,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     InputError
         If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
-    from safevar_sumo.campaign import files_read_by_algorithms
-    from safevar_sumo.campaign.batches import source_digests
-    from safevar_sumo.campaign.evaluation import identity_of
+    from safevar_sumo.campaign.identity import identity_of
     from safevar_sumo.campaign.local import local_pool
     from safevar_sumo.sumo.system import assemble
 
@@ -234,8 +232,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         return []
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
-        sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
-    present = manifest_of(study, identity_of(study, system, sources))
+        present = manifest_of(study, identity_of(study, system, pool))
     changes = [
         text
         for _, text, changes_simulations in input_differences(directory, manifest, present, study)

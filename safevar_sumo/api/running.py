@@ -9,19 +9,9 @@ from pathlib import Path
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import (
-    Campaign,
-    Observer,
-    RunKey,
-    RunProgress,
-    algorithm_of,
-    all_runs,
-    files_read_by_algorithms,
-    run_campaign,
-)
-from safevar_sumo.campaign.batches import ask_why_no_verdict, source_digests
+from safevar_sumo.campaign import Campaign, Observer, RunKey, RunProgress, algorithm_of, all_runs, run_campaign
 from safevar_sumo.campaign.cluster import cluster_pool
-from safevar_sumo.campaign.evaluation import identity_of
+from safevar_sumo.campaign.identity import ask_why_no_verdict, identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
@@ -127,8 +117,7 @@ def carry_out_runs(
     SafevarError
         If another process works on one of the runs, or `run_campaign` raises it.
     """
-    sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
-    results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
+    results = ResultsDirectory(directory, study, identity_of(study, system, pool), system.measuring.scoring)
     engine_used, reason = choose_engine(system, engine)
     for remark in _extent_remarks(results, study):
         observer.warned(remark)

@@ -18,6 +18,5 @@ from safevar_sumo.campaign.pool import RunKey as RunKey, RunProgress as RunProgr
 from safevar_sumo.campaign.run import (
     algorithm_of as algorithm_of,
     all_runs as all_runs,
-    files_read_by_algorithms as files_read_by_algorithms,
     random_generator_of as random_generator_of,
 )

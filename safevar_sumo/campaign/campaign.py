@@ -7,31 +7,17 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections import deque
-from collections.abc import Generator, Iterable, Sequence
-from concurrent.futures import Future
+from collections.abc import Iterable, Sequence
 from contextlib import closing, suppress
-from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 from typing import NamedTuple, Protocol
 
 import msgspec
 
-from safevar_sumo.campaign.batches import check_code, source_digests, works_for_sumo
-from safevar_sumo.campaign.evaluation import identity_of, pack_study
-from safevar_sumo.campaign.pool import (
-    Message,
-    Pool,
-    PoolLostError,
-    RunKey,
-    RunProgress,
-    RunResult,
-    Share,
-    WorkerLostError,
-    wait_for_next,
-)
-from safevar_sumo.campaign.retrying import ATTEMPTS, RetryingPool
+from safevar_sumo.campaign.batches import works_for_sumo
+from safevar_sumo.campaign.evaluation import Task
+from safevar_sumo.campaign.identity import check_code, evaluate_original, identity_of
+from safevar_sumo.campaign.pool import Pool, RunKey, RunProgress, RunResult, Share, carry_out
 from safevar_sumo.campaign.run import all_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
@@ -122,8 +108,10 @@ def run_campaign(
     SafevarError
         If a journal cannot be written, or the study is at fault.
     """
-    work, batch = pack_study(study, results.inputs, engine=engine), batch or MAX_COPIES
-    original = _baseline(study, work, results, RetryingPool(pool, study), observer)
+    batch = batch or MAX_COPIES
+    work = Task(study=study, inputs=results.inputs, engine=engine).packed
+    check_code(study, results.inputs, pool)
+    original = _evaluate_original(study, work, results, pool, observer)
     results.begin(original)
     sumo_work, recorded_work = works_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
     directory, identity = results.path.absolute(), results.digest
@@ -145,24 +133,6 @@ def run_campaign(
     )
 
 
-def _baseline(
-    study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer
-) -> Evaluations:
-    """Check the study's user code, and evaluate the original vehicle; raises an error if the runs need another one."""
-    check_code(study, results.inputs, pool)
-    original = _evaluate_original(work, results, pool, observer)
-    if not original.valid[0]:
-        raise InputError(
-            study.source,
-            "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
-            "so there is no baseline",
-            "tests whose speed the vehicle can hold",
-        )
-    if original.collided[0] and not is_rated(study):
-        observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
-    return original
-
-
 def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
     """Deal runs out in shares of equal size and with equally many runs of each algorithm, a multiple of the number of
     workers.
@@ -173,81 +143,11 @@ def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequen
     return [keys[number::count] for number in range(count)]
 
 
-class _ShareUnderWay:
-    """A share, the attempt that its worker makes now, and the number of workers that died outside of an attempt."""
-
-    def __init__(self, share: Share) -> None:
-        self.share = share
-        self._attempt: bytes | None = None
-        self._other_deaths = 0
-
-    def note(self, message: Message) -> None:
-        """Note what a worker reports: the next worker does not carry out finished runs, and knows of deaths in the
-        present round only.
-        """
-        if isinstance(message, bytes):
-            self._attempt = message
-        elif isinstance(message, list):
-            self._attempt, self._other_deaths, self.share = None, 0, self.share._replace(deaths={})
-        elif isinstance(message, RunResult | RunKey):
-            finished = message if isinstance(message, RunKey) else message.progress.key
-            self.share = self.share._replace(keys=tuple(key for key in self.share.keys if key != finished))
-
-    def note_death(self, error: WorkerLostError) -> None:
-        """Note the death of a worker; raises its error if it is not the fault of a batch and occurs again and again."""
-        if self._attempt is None:
-            self._other_deaths += 1
-            if self._other_deaths > ATTEMPTS:
-                raise error
-            return
-        setting, deaths = self._attempt, self.share.deaths
-        self.share = self.share._replace(deaths={**deaths, setting: (*deaths.get(setting, ()), str(error))})
-        self._attempt = None
-
-
-def _carry_out(shares: Iterable[Share], pool: Pool) -> Generator[Message]:
-    """Carry out shares on a pool, again from their journals after the death of a worker; yields the workers'
-    messages.
-    """
-    events: SimpleQueue[tuple[_ShareUnderWay, Message | Future[None]]] = SimpleQueue()
-    waiting, under_way, is_over = deque(map(_ShareUnderWay, shares)), set[_ShareUnderWay](), False
-
-    def report(share: _ShareUnderWay, message: Message) -> None:
-        if is_over:
-            raise PoolLostError("the campaign is over")
-        events.put((share, message))
-
-    def done(share: _ShareUnderWay, future: Future[None]) -> None:
-        events.put((share, future))
-
-    try:
-        while waiting or under_way:
-            while waiting and len(under_way) < pool.workers:
-                under_way.add(share := waiting.popleft())
-                pool.carry(share.share, partial(report, share)).add_done_callback(partial(done, share))
-            share, event = wait_for_next(events)
-            if not isinstance(event, Future):
-                share.note(event)
-                yield event
-                continue
-            under_way.discard(share)
-            error = PoolLostError("the pool was closed") if event.cancelled() else event.exception()
-            if error is None and share.share.keys:
-                error = WorkerLostError("a worker ended before its runs")
-            if isinstance(error, WorkerLostError):
-                share.note_death(error)
-                waiting.appendleft(share)
-            elif error is not None:
-                raise error
-    finally:
-        is_over = True
-
-
-def _collect(shares: Iterable[Share], pool: Pool, observer: Observer) -> tuple[dict[RunKey, RunResult], list[RunKey]]:
+def _collect(shares: Sequence[Share], pool: Pool, observer: Observer) -> tuple[dict[RunKey, RunResult], list[RunKey]]:
     """Carry out shares; returns the finished runs, and the runs that another process carries out."""
     run_results, busy = dict[RunKey, RunResult](), list[RunKey]()
-    with closing(_carry_out(shares, pool)) as messages:
-        for message in messages:
+    with closing(carry_out(shares, pool)) as messages:
+        for _, message in messages:
             if isinstance(message, RunResult):
                 run_results[message.progress.key] = message
                 observer.finished(message.progress)
@@ -260,25 +160,30 @@ def _collect(shares: Iterable[Share], pool: Pool, observer: Observer) -> tuple[d
     return run_results, busy
 
 
-def _evaluate_original(work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer) -> Evaluations:
-    """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails."""
+def _evaluate_original(
+    study: Study, work: bytes, results: ResultsDirectory, pool: Pool, observer: Observer
+) -> Evaluations:
+    """Evaluate the original vehicle, or read its journal; raises an error if the runs need another one."""
     try:
-        journal = results.journal(ORIGINAL)
+        with closing(results.journal(ORIGINAL)) as journal:
+            if journal.content.tail_size:
+                observer.warned(journal.remark_on_tail)
+            original = journal.content.evaluations
+            if not len(original):
+                original = evaluate_original(study, work, pool)
+                journal.append([0], original, original.files)
     except JournalBusyError:  # another process, such as a job of an array, writes this journal
-        return pool.evaluate_original(work)
-    try:
-        if journal.content.tail_size:
-            observer.warned(
-                f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is "
-                "simulated again"
-            )
-        if journal.content.positions:
-            return journal.content.evaluations
-        evaluations = pool.evaluate_original(work)
-        journal.append([0], evaluations, evaluations.files)
-        return evaluations
-    finally:
-        journal.close()
+        original = evaluate_original(study, work, pool)
+    if not original.valid[0]:
+        raise InputError(
+            study.source,
+            "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
+            "so there is no baseline",
+            "tests whose speed the vehicle can hold",
+        )
+    if original.collided[0] and not is_rated(study):
+        observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
+    return original
 
 
 class Forecast(NamedTuple):
@@ -336,8 +241,7 @@ def forecast(
     keys = all_runs(probe)[: max(runs_of_worker, 1) * pool.workers]
     stopwatch = _Stopwatch(len(keys))
     with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
-        identity = identity_of(probe, system, source_digests(probe, pool))
-        results = ResultsDirectory(Path(folder), probe, identity, system.measuring.scoring)
+        results = ResultsDirectory(Path(folder), probe, identity_of(probe, system, pool), system.measuring.scoring)
         with suppress(_Enough):
             run_campaign(probe, keys, results, pool, stopwatch, batch, engine=engine)
     evaluations = runs * search.evaluations

@@ -1,17 +1,13 @@
-"""Evaluation of a batch, a pure function for any process on any machine; and the identity of a study: all inputs of its
-results.
-"""
+"""Evaluation of a batch, a pure function for any process on any machine."""
 
 from __future__ import annotations
 
 import faulthandler
-import platform
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
-from typing import IO
+from typing import IO, Literal
 
 import msgspec
 import numpy as np
@@ -19,9 +15,8 @@ import numpy as np
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import changed_files, digests, files_named_in, note_inputs, unload_user_modules
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
-from safevar_sumo.results import LAYERS_OF_FILES, RESULTS, evaluation_keys
+from safevar_sumo.plugins import changed_files, digests, note_inputs, unload_user_modules
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
@@ -33,8 +28,12 @@ Inputs = dict[str, dict[str, str]]
 """Digests of files, by layer and name."""
 
 
+VERIFIED_SETTINGS = 50
+"""Number of settings to verify in SUMO: of a study in questions; and of each run of a campaign, besides the
+solutions.
+"""
 Evaluate = Callable[[bytes, FloatArray], Evaluations]
-"""A function that evaluates settings of a packed study, as `evaluate_batch` does."""
+"""A function that does a packed task with settings, as `evaluate_batch` does."""
 
 
 class Selection(msgspec.Struct, frozen=True):
@@ -56,58 +55,39 @@ EVERYTHING = Selection()
 """All points, with the parameters of the study."""
 
 
-class Task(msgspec.Struct, frozen=True):
-    """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
+class Task(msgspec.Struct, frozen=True, kw_only=True):
+    """What a worker computes of a study.
 
-    See `pack_study` for the fields.
-    """
-
-    study: Study
-    inputs: Inputs
-    engine: Engine
-    afresh: bool
-    check: bool
-    cells: tuple[int, int] | None
-    empty_road: bool
-    selection: Selection
-
-
-def pack_study(
-    study: Study,
-    inputs: JsonObject | None = None,
-    *,
-    engine: Engine = Engine.RECORDED,
-    afresh: bool = False,
-    check: bool = False,
-    cells: tuple[int, int] | None = None,
-    empty_road: bool = False,
-    selection: Selection = EVERYTHING,
-) -> bytes:
-    """Pack a study for a worker as bytes.
-
-    Parameters
+    Attributes
     ----------
     inputs
-        Digests of files by layer and name; by default those of the present networks. A worker refuses to compute with
-        other files, and reports files that user code reads and `sources` lacks.
+        Digests of files by layer and name: a worker refuses to compute with other files of a network, and reports files
+        that user code reads and `sources` lacks.
     engine
         What moves the vehicles.
     afresh
         Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
-    check
-        Whether the worker only checks the user code.
+    purpose
+        What to do with the settings; "check" only checks the user code, "empty road" only applies `why_no_verdict`: the
+        sentence, if any, is the only one of the result's `reasons`.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
-    empty_road
-        Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's
-        `reasons`.
     selection
         Parameters of the ADS that vary, and points; by default no parameter, and all points.
     """
-    if inputs is None:
-        inputs = {"network": network_digests(assemble(study))}
-    shared_inputs = {layer: dict(inputs[layer]) for layer in LAYERS_OF_FILES if layer in inputs}
-    return msgspec.msgpack.encode(Task(study, shared_inputs, engine, afresh, check, cells, empty_road, selection))
+
+    study: Study
+    inputs: Inputs = {}
+    engine: Engine = Engine.RECORDED
+    afresh: bool = False
+    purpose: Literal["evaluate", "check", "empty road"] = "evaluate"
+    cells: tuple[int, int] | None = None
+    selection: Selection = EVERYTHING
+
+    @property
+    def packed(self) -> bytes:
+        """The task as bytes."""
+        return msgspec.msgpack.encode(self)
 
 
 @lru_cache(maxsize=8)
@@ -117,7 +97,7 @@ def task_of(work: bytes) -> Task:
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
-    """Evaluate settings, shape (k, n), of a packed study.
+    """Do a packed task with settings, shape (k, n).
 
     Raises
     ------
@@ -125,7 +105,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         If files of the study have changed since the campaign began.
     """
     task = task_of(work)
-    if task.check:
+    if task.purpose == "check":
         from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
 
         refuse_defects(task.study)
@@ -133,10 +113,10 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     if task.afresh:
         unload_user_modules()
     with note_inputs() as reading:
-        system = assemble(task.study) if task.afresh else system_of(work)
+        system = assemble(task.study) if task.afresh else system_of(task)
         if "network" in task.inputs:
             refuse_changed_files(changed_files(task.inputs["network"], network_digests(system)))
-        if task.empty_road:
+        if task.purpose == "empty road":
             reason = why_no_verdict(system)
             evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
         elif task.cells is not None:
@@ -188,16 +168,14 @@ def evaluate_in_time(work: bytes, settings: FloatArray, time_limit: float, last_
         faulthandler.cancel_dump_traceback_later()
 
 
-def system_of(work: bytes) -> System:
-    """The system of a packed study; it is kept, and stays the same even if source files change."""
-    task = task_of(work)
-    return _assemble_packed(msgspec.msgpack.encode((task.study, task.inputs)))
+def system_of(task: Task) -> System:
+    """The system of a task's study; it is kept, and stays the same even if source files change."""
+    return _assemble_packed(Task(study=task.study, inputs=task.inputs).packed)
 
 
 @lru_cache(maxsize=4)
-def _assemble_packed(study_and_inputs: bytes) -> System:
-    study, _ = msgspec.msgpack.decode(study_and_inputs, type=tuple[Study, Inputs])
-    return assemble(study)
+def _assemble_packed(work: bytes) -> System:
+    return assemble(task_of(work).study)
 
 
 def refuse_changed_files(files: list[str]) -> None:
@@ -208,39 +186,6 @@ def refuse_changed_files(files: list[str]) -> None:
             "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
             "the file as it was, and the same command; or another `out`",
         )
-
-
-def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> JsonObject:
-    """The layers of a manifest except the study: plain values that are the same in every process.
-
-    `resolved` are the tables of the study with all defaults of models and all numbers of the weather; `network` and
-    `sources` are digests by file; `results` is the version of the results; `platform` are properties of the machine
-    that may affect the last bit of a result.
-
-    Parameters
-    ----------
-    sources
-        Digests of the files that user code reads: see `safevar_sumo.campaign.batches.source_digests`.
-    """
-    resolved = evaluation_keys(study)
-    for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
-        if isinstance(model, msgspec.Struct):
-            texts_and_paths = {
-                key: value
-                for key, value in resolved[table]["parameters"].items()
-                if isinstance(value, str) or any(files_named_in(value, study.origin.places))
-            }
-            resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **texts_and_paths}}
-    resolved["weather"] = msgspec.to_builtins(system.weather)
-    if system.matrix and system.rater is None:
-        resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
-    return {
-        "resolved": resolved,
-        "network": network_digests(system),
-        "sources": dict(sources),
-        "results": RESULTS,
-        "platform": {"system": platform.system(), "machine": platform.machine()},
-    }
 
 
 def network_digests(system: System) -> dict[str, str]:

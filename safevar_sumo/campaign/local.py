@@ -11,27 +11,31 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import connection
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
 
 from safevar_sumo.campaign.evaluation import Evaluate, evaluate_in_time
-from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError, block_interrupts, defer_interrupts
-from safevar_sumo.campaign.share import carry_out_share
+from safevar_sumo.campaign.pool import (
+    Job,
+    Message,
+    PoolLostError,
+    Report,
+    WorkerLostError,
+    block_interrupts,
+    defer_interrupts,
+)
+from safevar_sumo.campaign.worker import carry_out_job
 from safevar_sumo.errors import EnvironmentFault, SafevarError, describe_error
 from safevar_sumo.plugins import added_import_folders, inherit_import_folders
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.records import Evaluations, FloatArray
 
 MAX_START_TIME = 120.0
 """Longest time until a worker process is ready for its first batch [s]."""
-START_ATTEMPTS = 5
-"""Number of workers in a row that may die before they are ready, which is never the fault of a batch."""
 TIMEOUT_MARK = "Timeout ("
 """Begin of what the interpreter writes when a process exceeds its time limit."""
 _start_lock = threading.Lock()
@@ -61,13 +65,8 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
             pool.close()
 
 
-Argument = TypeVar("Argument")
-Result = TypeVar("Result")
-
-
 class LocalPool:
-    """Computes batches and carries shares in processes. For each process, a thread of this process waits for its
-    messages.
+    """Carries jobs out in processes. For each process, a thread of this process waits for its messages.
 
     Workers share no queue and no lock: a worker may die at any moment without harm to the others.
     """
@@ -79,14 +78,14 @@ class LocalPool:
         self._live_workers: set[_Worker] = set()
         self._closed = False
 
-    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
-        return self._start(_evaluate, (work, settings), lambda message: None)
-
-    def carry(self, share: Share, report: Report) -> Future[None]:
-        return self._start(carry_out_share, share, report)
+    def carry(self, job: Job, report: Report) -> Future[None]:
+        try:
+            return self._threads.submit(self._carry, job, report)
+        except RuntimeError:
+            raise PoolLostError("the worker processes are closed down") from None
 
     def close(self) -> None:
-        """Drop waiting batches and end all workers."""
+        """Drop waiting jobs and end all workers."""
         self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
         while self._live_workers:
@@ -94,46 +93,32 @@ class LocalPool:
                 self._end(worker)
         self._threads.shutdown()
 
-    def _start(self, function: Callable[..., Result], argument: Argument, report: Report) -> Future[Result]:
-        try:
-            return self._threads.submit(self._call, function, argument, report)
-        except RuntimeError:
-            raise PoolLostError("the worker processes are closed down") from None
-
-    def _call(self, function: Callable[..., Result], argument: Argument, report: Report) -> Result:
-        """Call a function in this thread's worker; if the worker is lost or `report` fails, the worker is ended."""
+    def _carry(self, job: Job, report: Report) -> None:
+        """Let this thread's worker carry out a job; if the worker is lost or `report` fails, the worker is ended."""
         worker: _Worker | None = getattr(self._thread_data, "worker", None)
         if worker is None or not worker.alive:
             worker = self._thread_data.worker = self._new_worker()
         try:
-            is_answer, answer = worker.call(function, argument)
-            while not is_answer:
-                report(answer)
-                is_answer, answer = worker.receive()
+            worker.send(job)
+            while (message := worker.receive()) is not None and not isinstance(message, Exception):
+                report(message)
         except BaseException:
             self._end(worker)
             raise
-        if isinstance(answer, Exception):
-            raise answer
-        result: Result = answer
-        return result
+        if message is not None:
+            raise message
 
     def _new_worker(self) -> _Worker:
-        for _ in range(START_ATTEMPTS):
+        worker = _Worker(self._time_limit)
+        self._live_workers.add(worker)
+        try:
             if self._closed:
                 raise PoolLostError("the worker processes are closed down")
-            worker = _Worker(self._time_limit)
-            self._live_workers.add(worker)
-            if self._closed:
-                worker.end()
-            try:
-                worker.receive(MAX_START_TIME)
-            except WorkerLostError as error:
-                self._end(worker)
-                cause = error
-            else:
-                return worker
-        raise PoolLostError(f"no worker process starts: {cause}")
+            worker.receive(MAX_START_TIME)
+        except BaseException:
+            self._end(worker)
+            raise
+        return worker
 
     def _end(self, worker: _Worker) -> None:
         worker.end()
@@ -163,14 +148,13 @@ class _Worker:
     def alive(self) -> bool:
         return self._process.is_alive()
 
-    def call(self, function: Callable[..., Result], argument: Argument) -> tuple[bool, Any]:
-        """Let the process call a function; returns the first message."""
+    def send(self, job: Job) -> None:
+        """Let the process carry out a job."""
         with suppress(OSError):  # `receive` notices a dead worker
-            self._pipe.send((function, argument))
-        return self.receive()
+            self._pipe.send(job)
 
-    def receive(self, time_limit: float | None = None) -> tuple[bool, Any]:
-        """The process's next message: whether it is the answer to a call, and the answer or report."""
+    def receive(self, time_limit: float | None = None) -> Message | Exception | None:
+        """The process's next message; None when it is ready for its first job, and after each job without an error."""
         ready = connection.wait([self._pipe, self._process.sentinel], time_limit)
         if not ready:
             raise WorkerLostError(f"the start took longer than {time_limit:g} s")
@@ -208,35 +192,33 @@ def _hide_main() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
-def serve(pipe: connection.Connection[Any, Any], folders: list[str], time_limit: float, last_words: str) -> None:
-    """The main function of a worker process, which answers calls until the other end of the pipe is closed."""
+def serve(
+    pipe: connection.Connection[Message | Exception | None, Job], folders: list[str], time_limit: float, last_words: str
+) -> None:
+    """The main function of a worker process, which carries out jobs until the other end of the pipe is closed."""
     inherit_import_folders(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_caller, daemon=True).start()
     with open(last_words, "w", encoding="utf-8") as file, suppress(EOFError, OSError):
         faulthandler.enable(file=file, all_threads=False)
         evaluate = partial(evaluate_in_time, time_limit=time_limit, last_words=file)
-        pipe.send((False, None))
+        pipe.send(None)
         while True:
-            function, argument = pipe.recv()
-            pipe.send(
-                (True, _answer_or_error(function, argument, lambda message: pipe.send((False, message)), evaluate))
-            )
+            job = pipe.recv()
+            pipe.send(_error_of(job, pipe.send, evaluate))
 
 
-def _evaluate(batch: tuple[bytes, FloatArray], report: Report, evaluate: Evaluate) -> Evaluations:
-    return evaluate(*batch)
-
-
-def _answer_or_error(function: Callable[..., Any], *arguments: Any) -> Any:
+def _error_of(job: Job, report: Report, evaluate: Evaluate) -> Exception | None:
+    """Carry out a job; returns the error that ends it."""
     try:
-        return function(*arguments)
+        carry_out_job(job, report, evaluate)
     except SafevarError as error:
         return error
     except (OSError, MemoryError) as error:
         return EnvironmentFault(f"a batch cannot be computed: {describe_error(error)}")
     except Exception:
         return RuntimeError(f"in a worker process\n{traceback.format_exc()}")  # not every exception survives the pipe
+    return None
 
 
 def _end_with_caller() -> None:

@@ -11,7 +11,6 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.campaign.pool import terminate_as_interrupt
 from safevar_sumo.cli.arguments import check_output, complete_study, file_option, jobs_option
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import find_owner, print_by_metric, read_rows
@@ -132,7 +131,6 @@ def _fit(
     try:
         with (
             local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
-            terminate_as_interrupt(),
             open_progress(True) as show_progress,
         ):
             show_progress("trials", 0, trials)

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.analysis.model_spread import value_of, with_values
-from safevar_sumo.campaign.batches import inputs_of
-from safevar_sumo.campaign.evaluation import pack_study
-from safevar_sumo.campaign.pool import Pool, wait_for_result
-from safevar_sumo.campaign.retrying import RetryingPool
+from safevar_sumo.campaign.evaluation import Task
+from safevar_sumo.campaign.identity import inputs_of
+from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
@@ -153,20 +151,17 @@ class FitSpace:
 
     def misfits_at(self, places: Sequence[FloatArray]) -> list[Misfit]:
         """The mean loss of the studies at each place, and the residuals of all of them."""
-        futures = [
-            [fit.submit(study) for fit, study in zip(self._fits, self.studies_at(place), strict=True)]
+        fits = [
+            (fit, fit.batches(study))
             for place in places
+            for fit, study in zip(self._fits, self.studies_at(place), strict=True)
         ]
-        misfits_at_places = (
-            [fit.misfit(batches) for fit, batches in zip(self._fits, batches_of_studies, strict=True)]
-            for batches_of_studies in futures
-        )
+        evaluations = iter(evaluate_batches([batch for _, batches in fits for batch in batches], self._fits[0].pool))
+        misfits = [fit.misfit(list(islice(evaluations, len(batches)))) for fit, batches in fits]
+        groups = [misfits[start : start + len(self._fits)] for start in range(0, len(misfits), len(self._fits))]
         return [
-            Misfit(
-                float(np.mean([misfit.loss for misfit in misfits])),
-                np.concatenate([misfit.residuals for misfit in misfits]),
-            )
-            for misfits in misfits_at_places
+            Misfit(float(np.mean([one.loss for one in group])), np.concatenate([one.residuals for one in group]))
+            for group in groups
         ]
 
 
@@ -176,7 +171,7 @@ class StudyFit:
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study = study
         self._losses = [ReferenceLoss(data, study) for data in references.values()]
-        self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
+        self._inputs, self.pool = inputs_of(study, pool), pool
         original = CharacteristicSet.of(study).original
         settings = [original[np.newaxis], *(data.settings for data in references.values())]
         self._ends = [0, *np.cumsum([len(rows) for rows in settings])]
@@ -185,19 +180,14 @@ class StudyFit:
         batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))
         self._batch_size = math.ceil(len(self._settings) / batches)
 
-    def submit(self, study: Study) -> list[Future[Evaluations]]:
-        """Begin to simulate the study, which may have other parameter values; returns a future for each batch of
-        settings.
-        """
-        work, size = pack_study(study, self._inputs), self._batch_size
-        return [
-            self._pool.submit(work, self._settings[start : start + size])
-            for start in range(0, len(self._settings), size)
-        ]
+    def batches(self, study: Study) -> list[Batch]:
+        """The batches that simulate the study, which may have other parameter values."""
+        work, size = Task(study=study, inputs=self._inputs).packed, self._batch_size
+        return [Batch(work, self._settings[start : start + size]) for start in range(0, len(self._settings), size)]
 
-    def misfit(self, batches: Sequence[Future[Evaluations]]) -> Misfit:
-        """The loss and the residuals, from the futures of all batches."""
-        distinct_evaluations = Evaluations.concatenate([wait_for_result(future) for future in batches])
+    def misfit(self, batches: Sequence[Evaluations]) -> Misfit:
+        """The loss and the residuals, from the evaluations of all batches."""
+        distinct_evaluations = Evaluations.concatenate(batches)
         evaluations = distinct_evaluations.take(self._row_of.ravel())
         original, *files = [evaluations.take(np.arange(start, end)) for start, end in pairwise(self._ends)]
         loss, residuals = original_misfit(original, self.study.published, self.study.fit)

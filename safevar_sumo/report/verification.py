@@ -18,9 +18,8 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.api.running import carry_out_runs, open_observer
-from safevar_sumo.campaign import all_runs, files_read_by_algorithms
-from safevar_sumo.campaign.batches import source_digests
-from safevar_sumo.campaign.evaluation import identity_of
+from safevar_sumo.campaign import all_runs
+from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, describe_error
@@ -276,8 +275,7 @@ class _Part:
             return next((_other_bytes(self._files[file], text, file) for file, text in changed), None)
         if name == "inputs":
             system = assemble(study, packed.name)
-            sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
-            now = manifest_of(study, identity_of(study, system, sources))
+            now = manifest_of(study, identity_of(study, system, pool))
             changes = [text for _, text, changes_simulations in differences(self._manifest, now) if changes_simulations]
             return ("", "; ".join(changes)) if changes else None
         if name == "study":

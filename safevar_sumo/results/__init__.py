@@ -2,7 +2,6 @@
 
 from safevar_sumo.results.journal import (
     PATIENCE as PATIENCE,
-    SPARE_POSITION as SPARE_POSITION,
     Journal as Journal,
     JournalBusyError as JournalBusyError,
     journal_head as journal_head,

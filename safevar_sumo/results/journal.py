@@ -25,8 +25,6 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.manifest import FORMAT, RUNS
 
-SPARE_POSITION = -1
-"""Position of an evaluation that the search has not requested yet, or not again after its failures were discarded."""
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 POSITION, OUTCOME, REASON, FILES_READ = "evaluation", "outcome", "reason", "files"
@@ -59,7 +57,7 @@ class JournalContent(NamedTuple):
 
     def requested_within(self, budget: int) -> tuple[list[int], Evaluations]:
         """Positions and evaluations that a run with this budget requested, in the order of its requests."""
-        positions = sorted(position for position in self.positions if 0 <= position < budget)
+        positions = sorted(position for position in self.positions if position < budget)
         return positions, self.take_positions(positions)
 
 
@@ -119,10 +117,15 @@ class Journal:
         self._write({"solutions": list(positions), "asked": asked, "budget": budget}, sync=True)
 
     def retry(self) -> None:
-        """Drop failed evaluations, and results based on them."""
+        """Drop the first failed evaluation and all that came after it."""
         self._write({"retry": True})
         self._file.seek(0)
         self.content = _content_of(_parse(self._file.read(), self.path)[0], self.path, self._head)
+
+    @property
+    def remark_on_tail(self) -> str:
+        """What the user is told about a torn tail."""
+        return f"{self.path}: the last {self.content.tail_size} bytes were torn; what they held is simulated again"
 
     def close(self) -> None:
         """Release the lock."""
@@ -296,17 +299,10 @@ def _content_of(lines: Sequence[JsonObject], path: Path, head: JsonObject) -> Jo
                 batches.append(_evaluations_of(line, characteristics))
             elif "solutions" in line:
                 results[line["budget"]] = (line["solutions"], line["asked"])
-            elif "retry" in line and batches:
-                positions, remaining_evaluations = _drop_failures(positions, Evaluations.concatenate(batches))
-                batches, results = [remaining_evaluations], {}
+            elif "retry" in line:
+                evaluations = Evaluations.concatenate(batches)
+                kept = int(np.argmax(evaluations.failed))
+                positions, batches, results = positions[:kept], [evaluations.take(range(kept))], {}
         return JournalContent(positions, Evaluations.concatenate(batches) if positions else empty, results)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(path, f"was edited: {error!r}", UNDAMAGED) from None
-
-
-def _drop_failures(positions: Sequence[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
-    """Positions and evaluations that a run keeps when its failed settings are simulated again."""
-    has_succeeded, array = ~evaluations.failed, np.array(positions)
-    first_failure = array[~has_succeeded].min()
-    kept = array[has_succeeded]
-    return np.where(kept < first_failure, kept, SPARE_POSITION).tolist(), evaluations.take(has_succeeded)

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import msgspec
 import pytest
 
-from safevar_sumo.campaign import batches as many
+from safevar_sumo.analysis import evaluator
+from safevar_sumo.campaign import batches, evaluation, identity
 from safevar_sumo.study import Study
 
 
 @pytest.fixture(autouse=True)
 def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    pack = many.pack_study
+    def packed(task: evaluation.Task) -> bytes:
+        return b"made-up" if task.study.name == "made-up" else msgspec.msgpack.encode(task)
 
-    def pack_study(study: Study, *inputs: Any, **options: Any) -> bytes:
-        return study.name.encode() if study.name == "made-up" else pack(study, *inputs, **options)
+    def choose_batch_size(study: Study, *selection: evaluation.Selection) -> tuple[int, bool]:
+        return (100, False) if study.name == "made-up" else choose(study, *selection)
 
-    read, batches = many.inputs_of, many.choose_batch_size
-    monkeypatch.setattr(
-        many,
-        "choose_batch_size",
-        lambda study, *selection: (100, False) if study.name == "made-up" else batches(study, *selection),
-    )
-    monkeypatch.setattr(many, "pack_study", pack_study)
-    monkeypatch.setattr(many, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool))
+    choose, read = batches.choose_batch_size, identity.inputs_of
+    monkeypatch.setattr(evaluation.Task, "packed", property(packed))
+    monkeypatch.setattr(batches, "choose_batch_size", choose_batch_size)
+    for module in (batches, identity, evaluator):
+        monkeypatch.setattr(
+            module, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool)
+        )

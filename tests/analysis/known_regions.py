@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.campaign.pool import Batch, Report
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study, load_study
@@ -50,25 +51,27 @@ class Plant:
         self._failing = failing or nowhere
         self.seen: set[bytes] = set()
 
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+    def carry(self, job: Batch, report: Report) -> Future[None]:
+        report(self.evaluate(job.settings))
+        future: Future[None] = Future()
+        future.set_result(None)
+        return future
+
+    def evaluate(self, settings: FloatArray) -> Evaluations:
         collides = np.asarray(self._region(settings), dtype=bool)
         fails = self._failing(settings)
         collides &= ~fails
         degree = np.where(fails, np.nan, np.where(collides, -1.0, self._degree(settings)))
         self.seen |= {row.tobytes() for row in settings}
-        future: Future[Evaluations] = Future()
-        future.set_result(
-            made_up_evaluations(
-                degree,
-                settings=settings,
-                outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
-                collision_speed=np.where(collides, 1.0, np.nan),
-                metrics={**dict.fromkeys(METRICS, np.full(len(settings), np.nan)), "safety_degree": degree},
-                f_diff=self._characteristics.largest_change(settings),
-                f_num_diff=self._characteristics.number_changed(settings),
-            )
+        return made_up_evaluations(
+            degree,
+            settings=settings,
+            outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
+            collision_speed=np.where(collides, 1.0, np.nan),
+            metrics={**dict.fromkeys(METRICS, np.full(len(settings), np.nan)), "safety_degree": degree},
+            f_diff=self._characteristics.largest_change(settings),
+            f_num_diff=self._characteristics.number_changed(settings),
         )
-        return future
 
     def close(self) -> None: ...
 

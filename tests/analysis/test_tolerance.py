@@ -140,10 +140,10 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
 
     study = made_up_study(4)
     found = [[8.5, 8.5, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]
-    evaluations = Plant(study, sliver).submit(b"", np.array(found)).result()
+    evaluations = Plant(study, sliver).evaluate(np.array(found))
     case = build_case(
         study,
-        record(Plant(study, sliver).submit(b"", np.full((1, 4), 5.0)).result(), 0),
+        record(Plant(study, sliver).evaluate(np.full((1, 4), 5.0)), 0),
         solutions_frame(tuple("abcd"), [(("rs", 0), evaluations)]),
         solutions_frame(tuple("abcd"), []),
         [("rs", 0)],

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.campaign import Campaign, RunKey, RunProgress, all_runs, run_campaign
-from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError
-from safevar_sumo.campaign.share import carry_out_share
+from safevar_sumo.campaign.pool import Job, PoolLostError, Report, WorkerLostError
+from safevar_sumo.campaign.worker import carry_out_job
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
@@ -58,28 +58,21 @@ class FormulaPool:
         self.sizes.append(len(settings))
         return evaluated(settings)
 
-    def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
-        return self._start(self.evaluate, work, settings)
-
-    def carry(self, share: Share, report: Report) -> Future[None]:
-        return self._start(carry_out_share, share, report, self.evaluate)
-
-    def _start(self, function: object, *arguments: object) -> Future:  # type: ignore[type-arg]
+    def carry(self, job: Job, report: Report) -> Future[None]:
         if self._threads:
-            return self._threads.submit(_called, function, *arguments)
-        future: Future[object] = Future()
+            return self._threads.submit(self._carry, job, report)
+        future: Future[None] = Future()
         try:
-            future.set_result(_called(function, *arguments))
+            future.set_result(self._carry(job, report))
         except Exception as error:
             future.set_exception(error)
         return future
 
-
-def _called(function: object, *arguments: object) -> object:
-    try:
-        return function(*arguments)  # type: ignore[operator]
-    except Death as death:
-        raise WorkerLostError(str(death)) from None
+    def _carry(self, job: Job, report: Report) -> None:
+        try:
+            carry_out_job(job, report, self.evaluate)
+        except Death as death:
+            raise WorkerLostError(str(death)) from None
 
 
 class EventLog:

@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from safevar_sumo.campaign.batches import source_digests
-from safevar_sumo.campaign.evaluation import evaluate_batch, identity_of, network_digests, pack_study
+from safevar_sumo.campaign.evaluation import Task, evaluate_batch, network_digests
+from safevar_sumo.campaign.identity import identity_of, source_digests
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import changed_files
 from safevar_sumo.results.manifest import IDENTITY
@@ -52,7 +52,8 @@ def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -
     study = msgspec.structs.replace(
         study, scenario=msgspec.structs.replace(study.scenario, parameters={"network": str(tmp_path / "mine")})
     )
-    work, original = pack_study(study), CharacteristicSet.of(study).original[None]
+    work = Task(study=study, inputs={"network": network_digests(assemble(study))}).packed
+    original = CharacteristicSet.of(study).original[None]
     evaluate_batch(work, original)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
     traffic.write_text(traffic.read_text() + "<!-- -->")

@@ -5,28 +5,39 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from queue import SimpleQueue
 
 import msgspec
 import numpy as np
 import psutil
 import pytest
 
-from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.local import LocalPool, local_pool
-from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError, defer_interrupts, wait_for_first, wait_for_result
-from safevar_sumo.campaign.retrying import RetryingPool, reproduction_command
+from safevar_sumo.campaign.pool import (
+    Batch,
+    Job,
+    PoolLostError,
+    Report,
+    WorkerLostError,
+    defer_interrupts,
+    evaluate_batches,
+    wait_for_next,
+)
+from safevar_sumo.campaign.worker import carry_out_job, reproduction_command
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import evaluated
+from tests.campaign.formulas import Death, evaluated
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
-SMOKE = pack_study(load_study("smoke"))
+SMOKE = Task(study=load_study("smoke")).packed
 ORIGINAL = CharacteristicSet.of(load_study("smoke")).original[np.newaxis]
 
 
@@ -40,60 +51,68 @@ def pool() -> Iterator[LocalPool]:
         yield pool
 
 
+def evaluate(pool: LocalPool, settings: np.ndarray = ORIGINAL, work: bytes = SMOKE) -> Evaluations:
+    return evaluate_batches([Batch(work, settings)], pool)[0]
+
+
+def carry(pool: LocalPool, settings: np.ndarray) -> Future[None]:
+    return pool.carry(Batch(SMOKE, settings), lambda message: None)
+
+
 @pytest.mark.slow
 def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
     with local_pool(2, 30.0) as pool:
         assert not processes()
-        for future in [pool.submit(SMOKE, ORIGINAL) for _ in range(4)]:
-            future.result(timeout=30)
+        evaluate_batches([Batch(SMOKE, ORIGINAL)] * 4, pool)
         assert len(processes()) == 2
     assert not processes()
     with pytest.raises(PoolLostError):
-        pool.submit(SMOKE, ORIGINAL)
+        evaluate(pool)
 
 
 def test_a_killed_worker_is_told_and_replaced(pool: LocalPool) -> None:
-    pool.submit(SMOKE, ORIGINAL).result(timeout=30)
-    future = pool.submit(SMOKE, np.repeat(ORIGINAL, 100_000, axis=0))
+    evaluate(pool)
+    future = carry(pool, np.repeat(ORIGINAL, 100_000, axis=0))
     time.sleep(0.1)
     os.kill(processes()[0].pid, signal.SIGKILL)
     with pytest.raises(WorkerLostError, match="exit code -9"):
         future.result(timeout=30)
-    assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
+    assert evaluate(pool).valid.all()
 
 
 def test_what_takes_too_long_is_stopped() -> None:
     with local_pool(1, 0.2) as pool:
         with pytest.raises(WorkerLostError, match=r"longer than 0\.2 s"):
-            pool.submit(SMOKE, np.repeat(ORIGINAL, 100_000, axis=0)).result(timeout=30)
+            carry(pool, np.repeat(ORIGINAL, 100_000, axis=0)).result(timeout=30)
         assert not processes(), "it would keep a core busy beside its successor"
 
 
 def test_an_error_of_the_study_arrives_as_it_is_and_a_bug_with_its_traceback(pool: LocalPool) -> None:
     wrong = SMOKE.replace(b"world_on_rails", b"world_on_roads")
     with pytest.raises(InputError, match="world_on_roads") as caught:
-        pool.submit(wrong, ORIGINAL).result(timeout=30)
+        evaluate(pool, work=wrong)
     assert "expected" in str(caught.value)
     with pytest.raises(RuntimeError, match=r"(?s)Traceback.*evaluate_batch"):
-        pool.submit(SMOKE, ORIGINAL[:, :3]).result(timeout=30)
-    assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
+        evaluate(pool, ORIGINAL[:, :3])
+    assert evaluate(pool).valid.all()
 
 
 def press() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> None:
-    before = signal.getsignal(signal.SIGINT)
+def test_ctrl_c_is_raised_where_a_message_is_waited_for_and_nowhere_else() -> None:
+    before, messages = signal.getsignal(signal.SIGINT), SimpleQueue[int]()
     with pytest.raises(KeyboardInterrupt), defer_interrupts():  # noqa: PT012
         press()
         press()
         with pytest.raises(KeyboardInterrupt):
-            wait_for_result(Future())
+            wait_for_next(messages)
         press()  # while the pool is closed, say
     assert signal.getsignal(signal.SIGINT) is before
+    messages.put(1)
     with defer_interrupts():
-        assert wait_for_first([]) == set(), "what was pressed before is forgotten"
+        assert wait_for_next(messages) == 1, "what was pressed before is forgotten"
 
 
 STUDY = load_study("sun")
@@ -110,27 +129,37 @@ def settings(number: int) -> np.ndarray:
     return rows
 
 
-class ToldPool:
-    """Fails with what `fault` answers to (settings, how often they were tried before)."""
+class Told:
+    """Fails with what `fault` answers to (settings, how often they were tried before); a worker dies of some faults."""
 
     workers = 1
 
     def __init__(self, fault: Callable[[np.ndarray, int], Exception | None]) -> None:
         self.fault = fault
         self.tried: list[int] = []
-        self._times: dict[bytes, int] = {}
+        self._times = Counter[bytes]()
 
-    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
-        before = self._times.get(settings.tobytes(), 0)
-        self._times[settings.tobytes()] = before + 1
+    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
         self.tried.append(len(settings))
-        error = self.fault(settings, before)
-        future: Future[Evaluations] = Future()
-        if error is None:
-            future.set_result(evaluated(settings))
-        else:
+        error = self.fault(settings, self._times[settings.tobytes()])
+        self._times[settings.tobytes()] += 1
+        if error is not None:
+            raise Death(str(error)) if isinstance(error, WorkerLostError) else error
+        return evaluated(settings)
+
+    def carry(self, job: Job, report: Report) -> Future[None]:
+        future: Future[None] = Future()
+        try:
+            future.set_result(carry_out_job(job, report, self.evaluate))
+        except Death as death:
+            future.set_exception(WorkerLostError(str(death)))
+        except Exception as error:
             future.set_exception(error)
         return future
+
+
+def tried(pool: Told, settings: np.ndarray, study: Study = STUDY) -> Evaluations:
+    return evaluate_batches([Batch(Task(study=study).packed, settings)], pool)[0]
 
 
 def died() -> WorkerLostError:
@@ -142,21 +171,26 @@ def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
 
 
 def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
-    pool = ToldPool(deadly(4302, 4305))
-    result = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    pool = Told(deadly(4302, 4305))
+    result = tried(pool, settings(8))
     assert np.array_equal(result.settings, settings(8))
     assert np.array_equal(result.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
     assert result.outcome[2] == Outcome.SIMULATOR_ERROR
     assert np.isnan(result.objectives[2, 0])
     assert np.array_equal(result.f_safe[result.valid], evaluated(settings(8)).f_safe[result.valid])
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
-    assert pool.tried == [8, 8] + [1] * (6 + 2 * 3), "each alone, the original, and once more"
+
+
+def test_a_setting_that_fails_is_tried_alone_and_again_after_the_original() -> None:
+    pool = Told(lambda rows, before: SimulationError("no place") if 4302 in rows[:, 0] else None)
+    assert tried(pool, settings(8)).failed.tolist() == [number == 2 for number in range(8)]
+    assert pool.tried == [8, 8] + [1] * (7 + 2 + 1), "seven once, the eighth twice, and the original"
 
 
 @pytest.mark.parametrize("fault", [SimulationError("SUMO failed: no place"), WorkerLostError("died")])
 def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault: Exception) -> None:
     with pytest.raises(EnvironmentFault, match=f"{fault}; the original vehicle cannot be simulated either"):
-        RetryingPool(ToldPool(lambda rows, before: fault), STUDY).submit(b"", settings(4)).result(timeout=5)
+        tried(Told(lambda rows, before: fault), settings(4))
 
 
 def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
@@ -167,9 +201,9 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
             else None
         )
 
-    pool = ToldPool(fault)
+    pool = Told(fault)
     with pytest.raises(UserCodeError) as caught:
-        RetryingPool(pool, WITH_USER_CODE).submit(b"", settings(50)).result(timeout=5)
+        tried(pool, settings(50), WITH_USER_CODE)
     assert "ZeroDivisionError; to reproduce it: python -m safevar_sumo simulate 'my study.toml' --set " in str(
         caught.value
     )

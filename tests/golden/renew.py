@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from safevar_sumo.campaign.evaluation import identity_of
+from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.results import CHOICES, RESULTS, load_runs
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble

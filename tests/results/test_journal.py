@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, JournalBusyError, journal_head
-from safevar_sumo.results.journal import SPARE_POSITION, JournalContent, read_journal
+from safevar_sumo.results.journal import JournalContent, read_journal
 
 BATCHES = 4
 ROWS = 3
@@ -202,13 +202,13 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
     other.communicate()
 
 
-def test_evaluations_after_a_failure_are_spare_after_a_retry(tmp_path: Path) -> None:
+def test_a_retry_drops_the_first_failure_and_all_after_it(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     write(path, batches=2)
     journal = Journal(path, HEAD)
     journal.retry()
     for content in (journal.content, read_journal(path, HEAD)):
-        assert content.positions == [0, 1, SPARE_POSITION, SPARE_POSITION], "the third and the sixth have failed"
-        assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3, 10 / 3, 11 / 3]
+        assert content.positions == [0, 1], "the third and the sixth have failed"
+        assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3]
         assert content.results == {}
     journal.close()

@@ -1,0 +1,302 @@
+"""What a worker does with its job: it evaluates a batch, or carries out a share of a study's runs: searches, simulates
+in batches over its runs, writes their journals, verifies their results.
+
+The worker may die at any moment: the next one continues from the journals. It meets again what killed the first one,
+and so it is told why the first one died: these attempts count as failed without a repetition.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+import time
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from safevar_sumo.campaign.batches import refuse_unlike_sumo
+from safevar_sumo.campaign.evaluation import Evaluate, Task, refuse_changed_files, system_of, task_of
+from safevar_sumo.campaign.pool import Job, Report, RunKey, Share, WorkerLostError
+from safevar_sumo.campaign.run import Run, make_search, random_generator_of
+from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, FloatArray, Outcome, differences
+from safevar_sumo.results import MANIFEST, PATIENCE, Journal, JournalBusyError, journal_file, journal_head
+from safevar_sumo.search import Problem
+from safevar_sumo.shipped import PROGRAM_COMMAND
+from safevar_sumo.study import Study, user_code_names
+from safevar_sumo.sumo.matrix import MAX_COPIES
+from safevar_sumo.vehicles import CharacteristicSet, region_of
+
+ATTEMPTS = 2
+"""Number of attempts for a whole batch, and for a single setting: another process may have killed the worker."""
+COMMAND_PREFIX = "; to reproduce it: "
+MAX_FAILURES_IN_A_ROW = 20
+"""Number of failing settings in a row from which on the study is at fault."""
+FAILURES = (SimulationError, WorkerLostError, EnvironmentFault)
+"""Errors after which a batch is tried again."""
+EXPECTED_RESULTS = (
+    "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself "
+    "from one call or setting to another, no mean or sum over the batch, nothing random"
+)
+
+
+def carry_out_job(job: Job, report: Report, evaluate: Evaluate) -> None:
+    """Carry out a job; `evaluate` evaluates its batches.
+
+    Raises
+    ------
+    SafevarError
+        If a journal cannot be written, the study is at fault, or a result is another one by itself or in SUMO.
+    """
+    attempts = Attempts(job, report, evaluate)
+    if isinstance(job, Share):
+        _ShareCarrier(job, report, attempts).carry_out()
+    else:
+        report(Evaluations.concatenate([*attempts.evaluate(job.work, job.settings, must_succeed=job.must_succeed)]))
+
+
+class Attempts:
+    """Evaluates the batches of a job: once more if they fail, then row by row, which finds the setting that fails.
+
+    A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome
+    `simulator-error`. Faults of the environment (disk, network files, memory) and of user code end the study, which the
+    same command resumes later; so do too many failing settings in a row.
+    """
+
+    def __init__(self, job: Job, report: Report, evaluate: Evaluate) -> None:
+        self._deaths = {setting: list(reasons) for setting, reasons in job.deaths.items()}
+        self._report, self._evaluate, self._study = report, evaluate, task_of(job.work).study
+        self._characteristics, self._failures_in_a_row = CharacteristicSet.of(self._study), 0
+
+    def evaluate(self, work: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Iterator[Evaluations]:
+        """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after
+        failures, row by row.
+
+        With `must_succeed` a failure is an error, not an outcome.
+        """
+        for _ in range(ATTEMPTS):
+            try:
+                evaluations = self._attempt(work, settings)
+            except UserCodeError as error:
+                raise self._with_command(error, self._culprit(work, settings)) from None
+            except FAILURES as error:
+                failure = error
+            else:
+                self._failures_in_a_row = 0
+                yield evaluations
+                return
+        if len(settings) > 1 and not isinstance(failure, EnvironmentFault):
+            for row in range(len(settings)):
+                yield from self.evaluate(work, settings[[row]], must_succeed=must_succeed)
+            return
+        names = user_code_names(self._study)
+        if names and isinstance(failure, WorkerLostError):
+            problem = f"{failure} at every attempt, probably in {' and '.join(names)}"
+            raise self._with_command(UserCodeError(f"study {self._study.name!r}", problem), settings)
+        if must_succeed or isinstance(failure, EnvironmentFault):
+            raise failure
+        try:
+            self._attempt(work, self._characteristics.original[np.newaxis])
+        except FAILURES as fault:
+            raise EnvironmentFault(f"{failure}; the original vehicle cannot be simulated either: {fault}") from None
+        self._failures_in_a_row += 1
+        if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
+            raise failure
+        yield self._failed_evaluation(settings, failure)
+
+    def _attempt(self, work: bytes, settings: FloatArray) -> Evaluations:
+        """Evaluate a batch, unless an earlier worker died of this attempt."""
+        setting = settings.tobytes() if len(settings) == 1 else b""
+        if self._deaths.get(setting):
+            raise WorkerLostError(self._deaths[setting].pop(0))
+        self._report(setting)
+        return self._evaluate(work, settings)
+
+    def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
+        undefined, own = np.full(1, np.nan), setting[:, : len(self._characteristics)]  # without an ADS's parameters
+        return Evaluations(
+            settings=setting,
+            outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
+            collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined),
+            f_diff=self._characteristics.largest_change(own),
+            f_num_diff=self._characteristics.number_changed(own),
+            reasons={setting[0].tobytes(): " ".join(str(error).split())},
+        )
+
+    def _culprit(self, work: bytes, settings: FloatArray) -> FloatArray:
+        """A setting on which user code fails, found by halving, shape (1, n)."""
+        while len(settings) > 1:
+            half = settings[: len(settings) // 2]
+            try:
+                self._attempt(work, half)
+            except UserCodeError:
+                settings = half
+            else:
+                settings = settings[len(half) :]
+        return settings
+
+    def _with_command(self, error: UserCodeError, setting: FloatArray) -> UserCodeError:
+        """The error, with a command that reproduces it if the error has no command yet."""
+        if COMMAND_PREFIX in error.problem:
+            return error
+        command = reproduction_command(self._study, setting[0, : len(self._characteristics)])
+        return UserCodeError(error.source, f"{error.problem}{COMMAND_PREFIX}{command}", error.legal)
+
+
+def reproduction_command(study: Study, setting: FloatArray) -> str:
+    """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was
+    reduced.
+    """
+    characteristics, origin = CharacteristicSet.of(study), study.origin
+    words = [f"{PROGRAM_COMMAND} simulate", shlex.quote(origin.called or study.name)]
+    words += ["--point", shlex.quote(origin.point)] if origin.point else []
+    words += [
+        f"--set {characteristic.name}={value!r}"
+        for characteristic, value in zip(characteristics, setting.tolist(), strict=True)
+        if value != characteristic.original
+    ]
+    words += ["--no-filter"] if (characteristics.filter(setting) != setting).any() else []
+    words += ["--beyond"] if ((setting < characteristics.lower) | (setting > characteristics.upper)).any() else []
+    return " ".join(words)
+
+
+class _ShareCarrier:
+    """Carries out a share."""
+
+    def __init__(self, share: Share, report: Report, attempts: Attempts) -> None:
+        self._share, self._report, self._attempts, self._task = share, report, attempts, task_of(share.work)
+        self._study = self._task.study
+        self._files = dict(self._task.inputs.get("sources", {}))
+        """Digests of the files that user code has read so far."""
+        self._new_files: dict[str, str] = {}
+        """Files that user code has read and that no journal holds yet."""
+
+    def carry_out(self) -> None:
+        """Carry out all runs, together as far as their searches go."""
+        if not (self._share.directory / MANIFEST).exists():
+            raise InputError(
+                "out", f"a worker does not see {self._share.directory}", "a directory on a disk that all workers share"
+            )
+        runs = list[Run]()
+        try:
+            for run in self._begin():
+                runs.append(run)
+            while runs:
+                ended = [run for run in runs if run.is_finished or run.advance()]
+                self._verify([run for run in ended if not run.is_finished])
+                for run in ended:
+                    self._report(run.finish())
+                runs = [run for run in runs if run not in ended]
+                self._simulate(runs)
+                self._report([run.progress for run in runs])
+        finally:
+            for run in runs:
+                run.journal.close()
+
+    def _begin(self) -> Iterator[Run]:
+        """Open the journals and begin the searches of all runs that no other process carries out."""
+        share, system, search = self._share, system_of(self._task), self._study.search
+        problem = Problem(
+            characteristics=system.characteristics,
+            original=share.original,
+            evaluations=search.evaluations,
+            population=search.population,
+            scoring=system.measuring.scoring,
+            region=region_of(self._study),
+        )
+        deadline = time.monotonic() + PATIENCE
+        for key in share.keys:
+            path = journal_file(share.directory, str(key))
+            try:
+                journal = Journal(path, journal_head(share.identity, str(key), system.characteristics.names), deadline)
+            except JournalBusyError:
+                self._report(key)
+                continue
+            if journal.content.tail_size:
+                self._report(journal.remark_on_tail)
+            if share.retry_failed and journal.content.evaluations.failed.any():
+                journal.retry()
+            yield Run(key, make_search(key, self._study, problem, self._note_files), journal, search.evaluations)
+
+    def _note_files(self, files: Mapping[str, str]) -> None:
+        """Note files that user code has read, which the next line of a journal then names; refuses files that have
+        changed.
+        """
+        refuse_changed_files([name for name, digest in files.items() if self._files.get(name, digest) != digest])
+        new_files = {name: digest for name, digest in files.items() if name not in self._files}
+        self._files |= new_files
+        self._new_files |= new_files
+
+    def _simulate(self, runs: Sequence[Run]) -> None:
+        """Simulate and journal the settings that the runs wait for, in equal batches."""
+        owners = [run for run in runs for _ in range(len(run.missing_settings))]
+        if not owners:
+            return
+        settings = np.concatenate([run.missing_settings for run in runs])
+        for evaluations in self._evaluate(self._share.work, settings, self._share.batch):
+            self._note_files(evaluations.files)
+            owners_of_rows, owners = owners[: len(evaluations)], owners[len(evaluations) :]
+            for run in dict.fromkeys(owners_of_rows):
+                rows = [row for row, owner in enumerate(owners_of_rows) if owner is run]
+                run.receive(evaluations.take(rows), self._new_files)
+                self._new_files = {}
+
+    def _evaluate(self, work: bytes, settings: FloatArray, size: int) -> Iterator[Evaluations]:
+        """Evaluate settings in equal batches of at most `size` settings."""
+        for batch in np.array_split(settings, math.ceil(len(settings) / size)):
+            yield from self._attempts.evaluate(work, batch)
+
+    def _verify(self, runs: Sequence[Run]) -> None:
+        """Simulate settings of ended runs again: one by one with user code loaded afresh, and in SUMO if the runs used
+        recorded scenes.
+        """
+        if user_code_names(self._study):
+            for run in runs:
+                self._verify_isolation(run)
+        if self._share.sumo_work:
+            self._verify_in_sumo(runs)
+
+    def _verify_isolation(self, run: Run) -> None:
+        """Refuse a run with an evaluation that differs from that of the same setting alone, with user code afresh."""
+        task = self._task
+        work = Task(study=task.study, inputs=task.inputs, engine=task.engine, afresh=True).packed
+        for expected in run.sample_evaluations(self._generator("recheck", run.key)):
+            (isolated,) = self._attempts.evaluate(work, expected.settings)
+            if expected.failed[0] or isolated.failed[0]:
+                continue
+            for _, difference in differences(isolated.results, expected.results):
+                problem = (
+                    f"with {' and '.join(user_code_names(task.study))} a result depends on what else is simulated: "
+                    f"{difference} in run {run.key}{COMMAND_PREFIX}"
+                    f"{reproduction_command(task.study, expected.settings[0])}"
+                )
+                raise UserCodeError(f"study {task.study.name!r}", problem, EXPECTED_RESULTS)
+
+    def _verify_in_sumo(self, runs: Sequence[Run]) -> None:
+        samples = [run.sample_for_sumo(self._generator("verify", run.key)) for run in runs]
+        if not any(map(len, samples)):
+            return
+
+        def evaluate(work: bytes) -> Evaluations:
+            return Evaluations.concatenate([*self._evaluate(work, recorded.settings, MAX_COPIES)])
+
+        recorded = Evaluations.concatenate(samples)
+        in_sumo = evaluate(self._share.sumo_work)
+        if self._share.recorded_work:  # SUMO repeats a few cells of a rating; the runs have no values of single cells
+            recorded = evaluate(self._share.recorded_work)
+        refuse_unlike_sumo(self._study, recorded, in_sumo)
+        start = 0
+        for run, sample in zip(runs, samples, strict=True):
+            failed_rows = start + np.flatnonzero(in_sumo.failed[start : start + len(sample)])
+            start += len(sample)
+            if len(failed_rows):
+                self._report(
+                    f"run {run.key}: {len(failed_rows)} of {len(sample)} settings could not be verified in SUMO: "
+                    f"{in_sumo.reason(failed_rows[0])}"
+                )
+
+    def _generator(self, purpose: str, key: RunKey) -> np.random.Generator:
+        """The random generator that draws the settings of a run to simulate again."""
+        return random_generator_of(self._study, key._replace(algorithm=f"{purpose} {key.algorithm}"))
