@@ -1,19 +1,17 @@
-"""Files of networks: kept in the user's cache folder, checked before use; and N copies of the XML of a network and its
+"""Files of networks: kept in the user's cache folder; and N copies of the XML of a network and its
 traffic, in which each id starts with the number of its copy.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
-import shutil
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from uuid import uuid4
+from tempfile import TemporaryDirectory
 
 import platformdirs
 
@@ -101,7 +99,7 @@ def write_roads(root: ElementTree.Element, n: int, file: Path, source: Path) -> 
     _write(root, blocks, file)
 
 
-def write_demand(original: ElementTree.Element, n: int, file: Path, source: Path) -> None:
+def write_demand(root: ElementTree.Element, n: int, file: Path, source: Path) -> None:
     """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file.
 
     Raises
@@ -109,9 +107,9 @@ def write_demand(original: ElementTree.Element, n: int, file: Path, source: Path
     InputError
         If an element of the `source` cannot be copied.
     """
-    texts = [(time, _marked_xml(child, DEMAND_IDS, source)) for child, time in _departures(original)]
-    copies = sorted(((time, copy, text) for copy in range(n) for time, text in texts), key=lambda entry: entry[0])
-    _write(original, [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
+    texts = [(time, _marked_xml(child, DEMAND_IDS, source)) for child, time in _departures(root)]
+    copies = sorted(((time, copy, text) for copy in range(n) for time, text in texts), key=itemgetter(0))
+    _write(root, [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element, float]]:
@@ -139,22 +137,13 @@ def parse_seconds(text: str) -> float | None:
 
 
 def _marked_xml(element: ElementTree.Element, ids: IdAttributes, source: Path) -> str:
-    return ElementTree.tostring(_mark_ids(element, ids, source), encoding="unicode")
-
-
-def _mark_ids(element: ElementTree.Element, ids: IdAttributes, source: Path) -> ElementTree.Element:
-    if element.tag not in ids:
-        raise InputError(source, f"has a {element.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
-    attributes = {
-        name: " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in value.split())
-        if name in ids.get(element.tag, ())
-        else value
-        for name, value in element.attrib.items()
-    }
-    result = ElementTree.Element(element.tag, attributes)
-    result.text, result.tail = element.text, element.tail
-    result.extend([_mark_ids(child, ids, source) for child in element])
-    return result
+    """An element, which changes, as XML with a placeholder in every id."""
+    for part in element.iter():
+        if part.tag not in ids:
+            raise InputError(source, f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
+        for name in set(ids[part.tag]) & part.attrib.keys():
+            part.set(name, " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()))
+    return ElementTree.tostring(element, encoding="unicode")
 
 
 def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None:
@@ -166,25 +155,15 @@ def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None
     file.write_text(f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}", encoding="utf-8")
 
 
-CHECKSUM_FILE = "checksum.sha256"
-
-
 def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
-    """The path of a file in the cache; see `ensure_all_cached`."""
-    return ensure_all_cached(folder, [name], build) / name
-
-
-def ensure_all_cached(folder: str, names: Sequence[str], build: Callable[[Path], None]) -> Path:
-    """The path of a folder in the cache with the named files, which are built if one is missing or damaged.
-
-    Nothing waits for the disk: the checksum also finds what a power failure has left of a file.
+    """The path of a file in a folder of the cache, which is built if it does not exist.
 
     Parameters
     ----------
     folder
         Folder in the cache; different contents need different folders.
     build
-        Function that writes the files into a given directory, always with the same bytes.
+        Function that writes the file into a given directory.
 
     Raises
     ------
@@ -192,52 +171,18 @@ def ensure_all_cached(folder: str, names: Sequence[str], build: Callable[[Path],
         If the cache cannot be written.
     """
     target = platformdirs.user_cache_path("safevar_sumo") / "networks" / folder
-    if not _is_intact(target, names):
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with _new_folder(target.parent) as new:
-                build(new)
-                (new / CHECKSUM_FILE).write_text(_checksum(new, names), encoding="ascii")
-                _move(new, target)
-        except OSError as error:
+    if (target / name).is_file():
+        return target / name
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=target.parent) as temporary:
+            new = Path(temporary, "new")
+            new.mkdir()
+            build(new)
+            with (new / name).open("rb+") as file:
+                os.fsync(file.fileno())  # so that not even a power failure leaves a part of it at its place
+            new.rename(target)
+    except OSError as error:
+        if not (target / name).is_file():  # no other process was faster
             raise EnvironmentFault(f"{target}: cannot write the cache of networks: {error.strerror or error}") from None
-    return target
-
-
-@contextmanager
-def _new_folder(parent: Path) -> Iterator[Path]:
-    """A new folder, which is removed unless it is moved: removing one takes milliseconds on some file systems, moving
-    it does not.
-    """
-    folder = parent / f"new-{uuid4().hex}"
-    folder.mkdir()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _move(folder: Path, target: Path) -> None:
-    try:
-        folder.rename(target)
-    except (
-        OSError
-    ):  # `target` exists: its files are missing or damaged, or another process was faster with the same bytes
-        target.mkdir(exist_ok=True)  # Windows moves no folder of which a file is open
-        for file in folder.iterdir():
-            os.replace(file, target / file.name)
-
-
-def _is_intact(folder: Path, names: Sequence[str]) -> bool:
-    try:
-        return (folder / CHECKSUM_FILE).read_text(encoding="ascii") == _checksum(folder, names)
-    except (OSError, UnicodeDecodeError):
-        return False
-
-
-def _checksum(folder: Path, names: Sequence[str]) -> str:
-    digest = hashlib.sha256()
-    for name in names:
-        content = (folder / name).read_bytes()
-        digest.update(f"{name} {len(content)} ".encode() + content)
-    return digest.hexdigest()
+    return target / name

@@ -13,8 +13,8 @@ import os
 import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
-from functools import cache, lru_cache, partial
+from collections.abc import Sequence
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
-from safevar_sumo.sumo.copies import ensure_all_cached, ensure_cached, parse_xml, write_demand, write_roads
+from safevar_sumo.sumo.copies import ensure_cached, parse_xml, write_demand, write_roads
 
 TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = "traffic.rou.xml", "scenario.sumocfg", "network.net.xml"
 NETWORK_ENDING, RECIPE_ENDING = ".net.xml", ".netccfg"
@@ -39,16 +39,22 @@ SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|t
 DIGEST_LENGTH = 16
 
 
+Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
+"""`XmlChanges` that can be hashed."""
+
+
 class Network(NamedTuple):
     """A network as its files are now.
 
     `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the recipe's sources, traffic
-    and options, by file name.
+    and options, by file name. A scenario's parameters change its lanes once it is built, and its traffic.
     """
 
     folder: Path
     roads_file: str
     digests: tuple[tuple[str, str], ...]
+    lane_changes: Changes = ()
+    traffic_changes: Changes = ()
 
     def path(self, name: str) -> Path:
         return self.folder / name
@@ -104,20 +110,15 @@ def options_of(file: Path) -> dict[str, str]:
 
 
 def _roads_in(folder: Path) -> str:
-    """The recipe in a folder or, without a recipe, its built network."""
-    for ending in (RECIPE_ENDING, NETWORK_ENDING):
-        names = sorted(file.name for file in folder.glob(f"*{ending}"))
-        if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
-            names = [name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")] or names
-        if len(names) > 1:
-            raise InputError(
-                folder,
-                f"has {' and '.join(names)}",
-                f"one of them, or net-file in {OPTIONS_FILE} that names one network",
-            )
-        if names:
-            return names[0]
-    raise InputError(folder, "has no network", LEGAL_FOLDERS)
+    """The recipe in a folder or, without a recipe, its built network; of several the one that SUMO's options name."""
+    names = [file.name for ending in (RECIPE_ENDING, NETWORK_ENDING) for file in sorted(folder.glob(f"*{ending}"))]
+    names = [name for name in names if name.endswith(RECIPE_ENDING)] or names
+    if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
+        names = [name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")] or names
+    if len(names) != 1:
+        problem = f"has {' and '.join(names) or 'no network'}"
+        raise InputError(folder, problem, f"{LEGAL_FOLDERS}; of several networks, net-file in {OPTIONS_FILE} names one")
+    return names[0]
 
 
 def _sources_of(roads: Path) -> list[str]:
@@ -146,21 +147,41 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
     EnvironmentFault
         If netconvert fails for another reason, or the cache cannot be written.
     """
-    size = round_up(n)
+    size, traffic_file = round_up(n), network.path(TRAFFIC_FILE)
+
+    def copy_roads(into: Path) -> None:
+        source = network.path(network.roads_file) if network.is_built else network.folder
+        write_roads(parse_xml(built_network(network)), size, into / NETWORK_FILE, source)
+
+    def copy_traffic(into: Path) -> None:
+        root = _changed(traffic_file, network.traffic_changes)
+        write_demand(root, n, into / TRAFFIC_FILE, traffic_file)
+
     roads = cache_folder_name(network, size, _road_digests(network))
-    traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE]])
+    traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)])
     return CopiedNetwork(
-        ensure_cached(roads, NETWORK_FILE, partial(_copy_roads, network, size)),
-        ensure_cached(traffic, TRAFFIC_FILE, partial(_copy_demand, network, n)),
+        ensure_cached(roads, NETWORK_FILE, copy_roads),
+        ensure_cached(traffic, TRAFFIC_FILE, copy_traffic),
         network.path(OPTIONS_FILE),
     )
 
 
 def built_network(network: Network) -> Path:
-    """The file of the original network, which netconvert or the user built; raises the errors of `copied_network`."""
-    if network.is_built:
+    """The file of the network, which netconvert or the user built, with its changes; raises the errors of
+    `copied_network`.
+    """
+    original = network._replace(lane_changes=(), traffic_changes=())
+    if not network.lane_changes and network.is_built:
         return network.path(network.roads_file)
-    return ensure_cached(cache_folder_name(network, 0, _road_digests(network)), NETWORK_FILE, partial(_build, network))
+
+    def build(into: Path) -> None:
+        if network.lane_changes:
+            content = ElementTree.tostring(_changed(built_network(original), network.lane_changes))
+            (into / NETWORK_FILE).write_bytes(content)
+        else:
+            _run_netconvert(network, into / NETWORK_FILE)
+
+    return ensure_cached(cache_folder_name(network, 0, _road_digests(network)), NETWORK_FILE, build)
 
 
 @cache
@@ -217,20 +238,11 @@ def _code_digest() -> str:
 
 
 def _road_digests(network: Network) -> list[str]:
-    return [digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)]
+    digests = [digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)]
+    return [*digests, repr(network.lane_changes)]
 
 
-def _copy_roads(network: Network, n: int, into: Path) -> None:
-    file = built_network(network)
-    write_roads(parse_xml(file), n, into / NETWORK_FILE, source=file if network.is_built else network.folder)
-
-
-def _copy_demand(network: Network, n: int, into: Path) -> None:
-    write_demand(parse_xml(network.path(TRAFFIC_FILE)), n, into / TRAFFIC_FILE, source=network.path(TRAFFIC_FILE))
-
-
-def _build(network: Network, into: Path) -> None:
-    file = into / NETWORK_FILE
+def _run_netconvert(network: Network, file: Path) -> None:
     exit_code, errors = run_program(
         network.folder, "netconvert", "-c", network.roads_file, "-o", str(file), "--no-warnings", "true"
     )
@@ -240,17 +252,6 @@ def _build(network: Network, into: Path) -> None:
         raise InputError(
             network.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from"
         )
-    _drop_header(file)
-
-
-def _drop_header(file: Path) -> None:
-    """Remove the header, which contains the time and options of the build; raise an error if the file is incomplete."""
-    try:
-        text = file.read_text(encoding="utf-8")
-        ElementTree.fromstring(text)
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise EnvironmentFault(f"{file}: netconvert left an incomplete network: {error}") from None
-    file.write_text(text[text.index("<net ") :], encoding="utf-8")
 
 
 def stage_network(scenario: Scenario) -> Network:
@@ -281,11 +282,14 @@ def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
 
 @lru_cache(maxsize=10_000)
 def _stage(scenario: Scenario, network: Network) -> Network:
-    if changes := scenario.lanes(_BuiltRoads(network)):
-        network = _variant(network, {NETWORK_FILE: _change_xml(built_network(network), changes)})
-    if changes := scenario.actors(_BuiltRoads(network)):
-        network = _variant(network, {TRAFFIC_FILE: _change_xml(network.path(TRAFFIC_FILE), changes)})
-    return network
+    network = network._replace(lane_changes=_frozen(scenario.lanes(_BuiltRoads(network))))
+    return network._replace(traffic_changes=_frozen(scenario.actors(_BuiltRoads(network))))
+
+
+def _frozen(changes: XmlChanges) -> Changes:
+    return tuple(
+        (path, None if attributes is None else tuple(attributes.items())) for path, attributes in changes.items()
+    )
 
 
 class _BuiltRoads:
@@ -295,48 +299,21 @@ class _BuiltRoads:
         self._network = network
 
     def lane(self, lane: str) -> Lane:
-        lanes = _read_lanes(self._network)
-        if lane not in lanes:
+        shapes = _lane_shapes(self._network)
+        if lane not in shapes:
             raise InputError(self._network.folder, f"there is no lane {lane!r}")
-        return lanes[lane]
+        x_and_y = (map(float, point.split(",")[:2]) for point in shapes[lane].split())
+        return lane_through(lane, [(x, y) for x, y in x_and_y])
 
 
 @lru_cache(maxsize=100)
-def _read_lanes(network: Network) -> dict[str, Lane]:
-    lanes = {}
-    for lane in ElementTree.fromstring(built_network(network).read_bytes()).iter("lane"):
-        coordinates = [
-            (float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())
-        ]
-        lanes[lane.attrib["id"]] = lane_through(lane.attrib["id"], coordinates)
-    return lanes
+def _lane_shapes(network: Network) -> dict[str, str]:
+    return {lane.attrib["id"]: lane.attrib["shape"] for lane in parse_xml(built_network(network)).iter("lane")}
 
 
-def _variant(network: Network, changed_files: Mapping[str, bytes]) -> Network:
-    """A built network with changed files, in the cache."""
-    gui_settings = options_of(network.path(OPTIONS_FILE)).get("gui-settings-file", "")
-    sources = {
-        NETWORK_FILE: built_network(network),
-        **{name: network.path(name) for name in (TRAFFIC_FILE, OPTIONS_FILE, gui_settings)},
-    }
-    contents = {name: changed_files.get(name) or file.read_bytes() for name, file in sources.items() if file.is_file()}
-    return _store_network(network.folder.name, tuple(contents.items()))
-
-
-@lru_cache(maxsize=1000)
-def _store_network(name: str, files: tuple[tuple[str, bytes], ...]) -> Network:
-    folder = f"staged-{_digest(repr(files).encode())}/{name or 'network'}"
-
-    def write(into: Path) -> None:
-        for file, content in files:
-            (into / file).write_bytes(content)
-
-    return open_network(str(ensure_all_cached(folder, [file for file, _ in files], write)))
-
-
-def _change_xml(file: Path, changes: XmlChanges) -> bytes:
+def _changed(file: Path, changes: Changes) -> ElementTree.Element:
     root = parse_xml(file)
-    for path, attributes in changes.items():
+    for path, attributes in changes:
         elements = root.findall(path)
         if not elements:
             raise InputError(file, f"has no {path}")
@@ -345,4 +322,4 @@ def _change_xml(file: Path, changes: XmlChanges) -> bytes:
                 root.remove(element)
             else:
                 element.attrib.update(attributes)
-    return ElementTree.tostring(root)
+    return root

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -69,117 +70,87 @@ def check_network(name: str, source: str) -> None:
         _check_files(network)
 
 
-def network_remarks(name: str, max_speed: float, *, sumo_drives: bool) -> list[str]:
-    """Remarks on parts of a user's network that the simulation does not use, and SUMO's warnings; none on shipped
+def network_remarks(name: str, *, sumo_drives: bool) -> list[str]:
+    """Remarks on attributes of a user's traffic that the simulation does not use, and SUMO's warnings; none on shipped
     networks.
 
-    Parameters
-    ----------
-    max_speed
-        Top speed of the original vehicle; higher speed limits have no effect [m/s].
-    sumo_drives
-        Whether SUMO's own driver influences the vehicle, as with a controller written for TraCI.
+    `sumo_drives`: SUMO's own driver influences the vehicle, as with a controller written for TraCI.
     """
     if is_shipped(name):
         return []
     network = open_network(name)
     file = network.path(TRAFFIC_FILE)
-    traffic = parse_xml(file)
     attributes = [
         f"{name} = {value}"
-        for element in traffic.findall(f"*[@id='{VUT}']")
+        for element in parse_xml(file).findall(f"*[@id='{VUT}']")
         for name, value in element.items()
         if name in SETTING_ATTRIBUTES
         or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and value != NO_EFFECT.get(name))
     ]
-    lanes = [] if sumo_drives else _lanes_of_vut(traffic, parse_xml(built_network(network)))
-    attributes += [
-        f"the speed limit of lane {lane.get('id')!r} ({float(lane.get('speed', 'inf')):g} m/s)"
-        for lane in lanes
-        if float(lane.get("speed", "inf")) < max_speed
-    ]
-    unused = (
-        f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's vehicle and ADS "
-    )
-    remarks = [f"{unused}determine how it drives"] if attributes else []
     warnings = _warnings_file(network).read_text(encoding="utf-8")
-    return [*remarks, *([f"{network.folder}: {warnings}"] if warnings else [])]
+    remarks = [f"{network.folder}: {warnings}"] if warnings else []
+    if attributes:
+        unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}"
+        remarks.insert(0, f"{unused}; the study's vehicle and ADS determine how it drives")
+    return remarks
+
+
+def _refuse(file: Path, legal: str, problems: Mapping[str, bool]) -> None:
+    """Raise an `InputError` for the first problem that is true."""
+    for problem in filter(problems.__getitem__, problems):
+        raise InputError(file, problem, legal)
 
 
 @lru_cache(maxsize=100)
 def _check_files(network: Network) -> None:
-    file = network.path(OPTIONS_FILE)
-    options = {"step-length": "1", "route-files": TRAFFIC_FILE, **options_of(file)}
-    is_illegal = {
+    options = {"step-length": "1", "route-files": TRAFFIC_FILE, **options_of(network.path(OPTIONS_FILE))}
+    problems = {
         "step-length": not SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP,
         "remote-port": "remote-port" in options,  # SUMO would wait for a client
         "route-files": options["route-files"] != TRAFFIC_FILE,
     }
-    for name in filter(is_illegal.__getitem__, is_illegal):
-        raise InputError(file, f"{name} = {options[name]!r}", LEGAL_OPTIONS)
-    _check_vut(network)
-    _refuse_random_types(network)
-    _warnings_file(network)
-    sources = [name for name, _ in network.digests]
-    for source in () if network.is_built else sorted(network.folder.glob("*.???.xml")):
-        if source.name not in sources and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", source.name):
-            raise InputError(
-                source,
-                f"is not used: {network.roads_file} does not name it",
-                f"sources that {network.roads_file} names",
-            )
-
-
-def _check_vut(network: Network) -> None:
-    """Refuse a vehicle under test with stops or a shared type, and a sloping or slippery road of this vehicle."""
+    texts = {f"{name} = {options.get(name)!r}": is_illegal for name, is_illegal in problems.items()}
+    _refuse(network.path(OPTIONS_FILE), LEGAL_OPTIONS, texts)
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>')
-    routes = traffic.findall(f"route[@id='{vut.get('route')}']")
-    is_illegal = {
+    routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
+    problems = {
         f"type = {vut.get('type')!r}": vut.get("type") != VUT or len(traffic.findall(f"*[@type='{VUT}']")) > 1,
         f"depart = {vut.get('depart')!r}": parse_seconds(vut.get("depart", "")) != 0,
-        "has a stop": any(element.find("stop") is not None for element in (vut, *vut, *routes)),
+        "has a stop": any(route.find("stop") is not None for route in routes),
     }
-    for problem in filter(is_illegal.__getitem__, is_illegal):
-        raise InputError(file, f"vehicle {VUT!r}: {problem}", LEGAL_VUT)
-    for lane in _lanes_of_vut(traffic, parse_xml(built_network(network))):
+    _refuse(file, LEGAL_VUT, {f"vehicle {VUT!r}: {problem}": is_illegal for problem, is_illegal in problems.items()})
+    _check_lanes(file, routes, parse_xml(built_network(network)))
+    _refuse_random_types(file, traffic)
+    _warnings_file(network)
+
+
+def _check_lanes(file: Path, routes: Iterable[ElementTree.Element], roads: ElementTree.Element) -> None:
+    """Refuse a sloping or slippery road of the vehicle under test."""
+    names = " ".join(route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")).split()
+    for lane in (lane for edge in roads.iter("edge") if edge.get("id") in names for lane in edge.iter("lane")):
         heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
         climb, friction = max(heights, default=0.0) - min(heights, default=0.0), float(lane.get("friction", 1))
-        if climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1:
-            problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
-            raise InputError(file, f"vehicle {VUT!r} {problem}", LEGAL_ROAD)
+        problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
+        is_illegal = climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1
+        _refuse(file, LEGAL_ROAD, {f"vehicle {VUT!r} {problem}": is_illegal})
 
 
-def _refuse_random_types(network: Network) -> None:
+def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
     """Refuse types whose drivers are random, though traffic that reacts to the vehicle may show it in no copy at
     first.
     """
-    traffic = parse_xml(network.path(TRAFFIC_FILE))
     names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {VUT}
     for kind in (kind for kind in traffic.findall("vType") if kind.get("id") in names):
         model, speed_dev = kind.get("carFollowModel", "Krauss"), kind.get("speedDev", "0.1")
         sigma = kind.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
-        if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):
-            raise InputError(
-                network.path(TRAFFIC_FILE),
-                f"vType {kind.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}",
-                f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}',
-            )
-
-
-def _lanes_of_vut(traffic: ElementTree.Element, roads: ElementTree.Element) -> list[ElementTree.Element]:
-    """The lanes of the edges that the traffic names for the vehicle under test."""
-    edges = {edge.get("id"): edge for edge in roads.iter("edge")}
-    routes = [
-        route
-        for vut in traffic.findall(f"*[@id='{VUT}']")
-        for route in (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
-    ]
-    names = " ".join(route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")).split()
-    return [lane for name in dict.fromkeys(names) if name in edges for lane in edges[name].iter("lane")]
+        problem = f"vType {kind.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}"
+        is_random = float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS)
+        legal = f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}'
+        _refuse(file, legal, {problem: bool(is_random)})
 
 
 def _warnings_file(network: Network) -> Path:
@@ -193,28 +164,12 @@ def _try_network(network: Network, into: Path) -> None:
     two copies.
     """
     legal = "options and traffic that SUMO loads without an error"
-    exit_code, messages = run_program(
-        network.folder,
-        "sumo",
-        "-c",
-        OPTIONS_FILE,
-        "-n",
-        str(built_network(network).absolute()),
-        "-r",
-        TRAFFIC_FILE,
-        "--begin",
-        "0",
-        "--end",
-        "1",
-        "--no-step-log",
-        "true",
-    )
+    files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
+    only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")
+    exit_code, messages = run_program(network.folder, "sumo", *files, *only_load)
     if exit_code != 0:
-        raise InputError(
-            network.folder,
-            f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: {messages or f'exit code {exit_code}'}",
-            legal,
-        )
+        problem = f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: {messages or f'exit code {exit_code}'}"
+        raise InputError(network.folder, problem, legal)
     try:
         actor, time = _first_difference(network)
     except (SimulationError, EnvironmentFault) as error:

@@ -178,7 +178,7 @@ class System:
         remarks = [
             remark
             for network in dict.fromkeys(point.scenario.network for point in self.points)
-            for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=uses_traci)
+            for remark in network_remarks(network, sumo_drives=uses_traci)
         ]
         remarks += self.vehicle.remarks
         for weather in {point.weather.name: point.weather for point in self.points}.values():

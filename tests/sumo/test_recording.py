@@ -69,9 +69,7 @@ def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
 def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """In an empty cache: SUMO plays the scene, the next process reads the file, and a truncated file is written
-    again.
-    """
+    """In an empty cache: SUMO plays the scene, and the next process reads the file."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
     scenario = assemble(load_study("sun")).scenario
 
@@ -80,12 +78,9 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
         return repr(record_scenes([scenario], ()))
 
     played = scene()
-    (file,) = tmp_path.glob("networks/scenes-*/scenes.msgpack")
+    assert [*tmp_path.glob("networks/scenes-*/scenes.msgpack")]
     monkeypatch.setattr(recording, "_play", None)
     assert scene() == played
-    file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(TypeError):
-        scene()
 
 
 def test_contacts_are_those_that_sumo_finds() -> None:
