@@ -29,19 +29,12 @@ from safevar_sumo.scenarios.euro_ncap import (
     Direction,
     Heading,
     SpeedProfile,
+    VehicleMover,
     change_target_lanes,
     lateral_offset,
     target_type,
 )
-from safevar_sumo.scenarios.target import (
-    EncounterConstants,
-    Target,
-    TargetMotion,
-    TargetTest,
-    Times,
-    VehicleMover,
-    value_at,
-)
+from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetMotion, TargetTest, Times, value_at
 
 ROAD_LANE = "road_0"
 START_POSITION = 50.0

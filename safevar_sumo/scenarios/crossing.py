@@ -18,24 +18,24 @@ from safevar_sumo.scenarios.euro_ncap import (
     FROM_RIGHT,
     JUNCTION,
     KMH,
+    STOP_DISTANCE,
     TESTS,
     VUT_LANE,
     BodySize,
     Direction,
     Heading,
+    PersonMover,
     SpeedProfile,
+    VehicleMover,
     lateral_offset,
 )
 from safevar_sumo.scenarios.target import (
     PARKED_GAP,
-    STOP_DISTANCE,
     EncounterConstants,
-    PersonMover,
     Target,
     TargetMotion,
     TargetTest,
     Times,
-    VehicleMover,
     value_at,
 )
 

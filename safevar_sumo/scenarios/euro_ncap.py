@@ -1,5 +1,5 @@
-"""What scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026) share: targets, ranges,
-directions.
+"""What scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026) share: their table,
+targets, directions, and how targets move in SUMO.
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -7,13 +7,23 @@ Speeds are in km/h and impact locations in per cent of the vehicle's width, as i
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios.base import Coordinates, Frame, PreCrash, XmlChanges
+from safevar_sumo.records import KMH_PER_MS, FloatArray
+from safevar_sumo.scenarios.base import (
+    CROSSING_LANE,
+    PEDESTRIAN,
+    Coordinates,
+    Frame,
+    PreCrash,
+    Roads,
+    World,
+    XmlChanges,
+)
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
@@ -224,3 +234,151 @@ def lateral_offset(location: float, width: float) -> float:
     of `width`].
     """
     return (location / 100 - 0.5) * width
+
+
+WALK_EDGES = {1.0: ("footpath", "footpath_on"), -1.0: ("footpath_on", "footpath")}
+"""Edges that a pedestrian walks on, in this order; the key is 1.0 for a walk to the left of the vehicle, -1.0 to the
+right.
+"""
+STOP_DISTANCE = 5.0
+"""Distance past the middle of the lane at which a pedestrian stops [m]."""
+
+
+class PersonMover(NamedTuple):
+    """A pedestrian who walks to the left (`sign` 1) or right (-1); `start` is the position in this direction from the
+    lane's middle, `stop` the position at which the pedestrian stops [m].
+    """
+
+    target: str
+    sign: float
+    start: float
+    profile: SpeedProfile
+    stop: float = STOP_DISTANCE
+
+    def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
+        """No changes: the pedestrian uses the network's footpath."""
+        return {}
+
+    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
+        """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
+        lane's middle [m].
+        """
+        return frame.lane_coordinates(roads.lane(CROSSING_LANE).start)[0]
+
+    def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float) -> XmlChanges:
+        """The pedestrian beside the lane, `distance` metres before the impact."""
+        edges = WALK_EDGES[self.sign]
+        for lane in (CROSSING_LANE, *(f"{edge}_0" for edge in edges)):
+            frame.crossing_position(roads, lane)
+        path, half_length = roads.lane(f"{edges[0]}_0"), BODIES[self.target].length / 2
+        ends = [self.sign * frame.lane_coordinates(point)[1] for point in (path.start, path.end)]
+        front = half_length + self.start
+        if not min(ends) <= front <= max(ends):
+            problem = f"lateral_start = {-self.start:g} m is not on the footpath"
+            expected = f"a number in [{half_length - max(ends):.2f}, {half_length - min(ends):.2f}] m"
+            raise InputError("scenario.parameters", problem, expected)
+        person = {"type": self.target, "departPos": repr(abs(front - ends[0]))}
+        walk = {"edges": " ".join(edges), "speed": repr(self.profile.speed), "arrivalPos": repr(-int(self.sign))}
+        return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
+
+    @property
+    def initial_speed(self) -> float:
+        """0: the pedestrian stands at first [m/s]."""
+        return 0.0
+
+    def positions(self, world: World) -> FloatArray:
+        """Position of the target's front in SUMO; shape (N, 2) [m]."""
+        return world.person_positions(PEDESTRIAN)
+
+    def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Position of the target's middle along the lane (None: the impact position) and to the left [m], from
+        `positions` of the front.
+        """
+        return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
+
+    def next_speed(self, sample: int, step: float) -> float:
+        """Mean speed in the coming step [m/s]."""
+        walking_distance = self.stop - self.start
+        walked, next_walked = (min(self.profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
+        return (next_walked - walked) / step
+
+    def set_speed(self, world: World, speed: float) -> None:
+        world.walk(PEDESTRIAN, speed)
+
+
+class VehicleMover(NamedTuple):
+    """A target that drives on lanes that lead in its direction; `speed_at` maps a time [s] to its speed [m/s]."""
+
+    target: str
+    direction: Direction
+    speed_at: Callable[[float], float]
+
+    def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
+        """Changes that rotate the target's lanes around their crossing with the vehicle's lane; none for a target from
+        the right.
+        """
+        if self.direction == FROM_RIGHT:
+            return {}
+        lane = roads.lane(JUNCTION_LANE)
+        (along, entry), (_, exit_) = frame.lane_coordinates(lane.start), frame.lane_coordinates(lane.end)
+        (forward, left), half = self.direction, (exit_ - entry) / 2
+        return change_target_lanes(
+            frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction
+        )
+
+    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
+        """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
+        lane's middle [m].
+        """
+        along, left = frame.lane_coordinates(roads.lane(ENTRY_LANE).end)
+        return along + (impact_left - left) * self.direction.along / self.direction.left
+
+    def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float) -> XmlChanges:
+        """The target on its lane, `distance` metres before the impact."""
+        lane, (forward, left) = roads.lane(ENTRY_LANE), self.direction
+        lane_start = self._along(frame, lane.start)
+        impact_on_path = self.impact_position(frame, roads, impact_left) * forward + impact_left * left
+        front = impact_on_path - lane_start - distance + BODIES[self.target].length / 2
+        length = self._along(frame, lane.end) - lane_start
+        if not 0 < front <= length:
+            raise InputError(
+                "scenario.parameters",
+                f"the target starts {distance:.2f} m before the impact, where it has no lane",
+                f"a start from {distance - (length - front):.2f} to {distance + front:.2f} m before it",
+            )
+        return {
+            "vType[@id='target']": target_type(self.target),
+            "vehicle[@id='target']": {
+                "type": self.target,
+                "departPos": repr(front),
+                "departSpeed": repr(self.initial_speed),
+            },
+        }
+
+    def _along(self, frame: Frame, point: tuple[float, float]) -> float:
+        """Position of a point along the target's direction [m]."""
+        along, left = frame.lane_coordinates(point)
+        return along * self.direction.along + left * self.direction.left
+
+    @property
+    def initial_speed(self) -> float:
+        """Speed at the start [m/s]."""
+        return self.speed_at(0.0)
+
+    def positions(self, world: World) -> FloatArray:
+        """Position of the target's front in SUMO; shape (N, 2) [m]."""
+        return world.vehicle_positions(TARGET)
+
+    def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Position of the target's middle along the lane and to the left [m], from `positions` of the front."""
+        half_length = BODIES[self.target].length / 2
+        return frame.along(positions) - self.direction.along * half_length, frame.left(
+            positions
+        ) - self.direction.left * half_length
+
+    def next_speed(self, sample: int, step: float) -> float:
+        """Speed at the end of the coming step [m/s]."""
+        return self.speed_at((sample + 1) * step)
+
+    def set_speed(self, world: World, speed: float) -> None:
+        world.drive(TARGET, speed)

@@ -1,18 +1,21 @@
-"""Vehicle models by name, and their characteristics."""
+"""Vehicle models by name, and their characteristics; and the calibration drive of the original vehicle, for the
+throttle and brake controller of an ADS.
+"""
 
 from collections.abc import Mapping
+from functools import cache, lru_cache, partial
 from typing import Any
 
-from safevar_sumo.vehicles.base import LEVEL, GuardedVehicle, Slope, SumoType, Vehicle, VehicleState, slope_of
-from safevar_sumo.vehicles.calibration_drive import calibration_drive
+import numpy as np
+
+from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
+from safevar_sumo.vehicles.base import LEVEL, GuardedVehicle, Sensors, Slope, SumoType, Vehicle, VehicleState, slope_of
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, guard_change
 from safevar_sumo.vehicles.fmu import FmuVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion, region_of
-from safevar_sumo.vehicles.sensors import Sensors
-from safevar_sumo.vehicles.sumo import SumoVehicle
-from safevar_sumo.vehicles.worn import WornVehicle
+from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {"carla": Carla, "lgsvl": Lgsvl, "sumo": SumoVehicle, "worn": WornVehicle}
 
@@ -37,3 +40,71 @@ __all__ = [
     "region_of",
     "slope_of",
 ]
+
+DRY_ROAD_FRICTION, STEP = 1.0, 0.1  # -, s
+SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
+LONGEST_DRIVE = 60.0  # s
+LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyres
+
+
+def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
+    """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
+    types = vehicle.sumo_type(vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP))
+    simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))
+    mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
+    return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=simulate_tables)
+
+
+def _original_values(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
+    return {characteristic.name: np.full(1, float(characteristic.original)) for characteristic in characteristics}
+
+
+@lru_cache(maxsize=4)
+def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
+    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one drive and brake lightly
+    in another.
+    """
+    prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
+    rest = vehicle.at_rest(prepared)
+
+    def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
+        """The speed after each step [m/s], until it leaves the range of the tables, and the last state."""
+        speeds = [float(state.speed[0])]  # type: ignore[attr-defined]
+        command = Command(np.full(1, throttle), np.full(1, brake))
+        for _ in range(round(LONGEST_DRIVE / STEP)):
+            state = vehicle.advance(prepared, state, command)
+            speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
+            if (throttle and speeds[-1] >= SPEEDS[-1] + 1) or (not throttle and speeds[-1] < SPEEDS[1]):
+                break
+        return speeds, state
+
+    launch, fast_state = drive(rest, throttle=1.0, brake=0.0)
+    coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
+    braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)
+    # Decelerations: time reversed.
+    coasting, braking = (_accelerations(coasting_speeds[::-1]), _accelerations(braking_speeds[::-1]))
+    tables = PedalTables(
+        speeds=SPEEDS,
+        full_throttle=_accelerations(launch),
+        coasting=coasting,
+        braking=float(np.median(braking - coasting)) / LIGHT_BRAKE,
+    )
+    for table in tables[:3]:
+        table.flags.writeable = False  # many ADSs read them
+    return tables
+
+
+def _accelerations(speeds: list[float]) -> FloatArray:
+    """Acceleration from each of `SPEEDS` to the next, in a drive that gains speed [m/s^2].
+
+    Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has acceleration 0.
+    """
+    rising_speeds = np.maximum.accumulate(np.array(speeds))
+    distinct_speeds, samples = np.unique(rising_speeds, return_index=True)
+    grid = SPEEDS[(distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)]
+    if len(grid) < 2:
+        return np.zeros(len(SPEEDS))
+    accelerations = np.diff(grid) / np.diff(np.interp(grid, distinct_speeds, samples * STEP))
+    return np.asarray(
+        accelerations[np.clip(np.arange(len(SPEEDS)) - round(grid[0] / SPEEDS[1]), 0, len(accelerations) - 1)]
+    )

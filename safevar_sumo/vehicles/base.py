@@ -1,4 +1,4 @@
-"""The contract of a vehicle model, slopes, and the guard of a user's model."""
+"""The contract of a vehicle model, slopes, sensors and delayed signals, and the guard of a user's model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from msgspec import Meta
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Guard, Legal, open_rows, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
@@ -53,6 +52,80 @@ class SumoType(NamedTuple):
     decel: FloatArray
     max_speed: FloatArray
     tau: FloatArray
+
+
+LONGEST_DELAY = 3600.0
+"""Longest delay [s]."""
+
+
+def start_history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
+    """A history for delays up to `longest_delay` [s], filled with the first sample, shape (..., N); the newest sample
+    comes first.
+
+    Raises
+    ------
+    InputError
+        If the delay is longer than any run.
+    """
+    if not longest_delay <= LONGEST_DELAY:
+        raise InputError("vehicle", f"one of its delays is {longest_delay:g} s", f"up to {LONGEST_DELAY:g} s")
+    length = int(longest_delay / step) + 2
+    return np.repeat(sample[np.newaxis], length, axis=0)
+
+
+def extend_history(past: FloatArray, sample: FloatArray) -> FloatArray:
+    """The history with a new sample at its front and the oldest one dropped."""
+    return np.concatenate([sample[np.newaxis], past[:-1]])
+
+
+def delay_signal(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
+    """The signal of each vehicle i as it was `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
+    age = delay / step
+    whole_steps = np.floor(age)
+    share = age - whole_steps
+    size = past[0].size
+    index = whole_steps.astype(np.intp) * size + np.arange(size).reshape(past.shape[1:])
+    newer, older = past.take(index), past.take(index + size)
+    with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
+        signal = newer * (1 - share) + older * share
+    return np.asarray(np.where(np.isnan(signal), newer, signal))
+
+
+class Sensors(NamedTuple):
+    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on
+    distances [-].
+
+    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to an observation.
+    """
+
+    latency: FloatArray
+    reach: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def perfect(cls, n: int) -> Sensors:
+        """Sensors without latency and with unlimited range."""
+        return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
+
+
+def sensed_observation(
+    seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray, step: float
+) -> tuple[Observation, FloatArray]:
+    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history
+    for the next call.
+    """
+    obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
+    sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
+    past = start_history(float(np.max(latency)), step, sample) if past is None else extend_history(past, sample)
+    gap, closing_speed, lateral, lateral_speed, obstacle_speed = delay_signal(past, latency, step)
+    is_detected = gap <= reach * seen.visibility
+    return seen._replace(
+        gap=np.where(is_detected, gap, np.inf),
+        closing_speed=closing_speed,
+        lateral=lateral,
+        lateral_speed=lateral_speed,
+        obstacle_speed=obstacle_speed,
+    ), past
 
 
 Prepared = Any
@@ -165,31 +238,6 @@ def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
         columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
         return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
     return steady if steady is None else np.where(is_rolling, steady, rest)
-
-
-class SensingVehicle(Vehicle):
-    """A vehicle with delayed sensors of limited range, whose pedals balance the slope at a steady speed.
-
-    Its constants have a `step` [s], the sensors' `latency` [s] and `sensor_range` [m]; its state has the history
-    `seen`.
-    """
-
-    __slots__ = ()
-
-    def sensors(self, prepared: Prepared) -> Sensors:
-        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
-
-    def sense(self, prepared: Prepared, state: State, seen: Observation) -> tuple[Observation, State]:
-        """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
-        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
-        return sensed, state._replace(seen=past)
-
-
-def pedals_on_slope(back: float | FloatArray, drive: FloatArray, brake: FloatArray) -> Command:
-    """Pedals that balance the deceleration `back` by the slope, the only resistance, given the accelerations by full
-    pedals [m/s^2].
-    """
-    return Command(*(np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / drive, -back / brake)))
 
 
 HIGHEST_SPEED = 1000.0

@@ -14,8 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.sensors import Sensors
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Sensors, Slope, SumoType, Vehicle
 
 Share = Annotated[float, Meta(gt=0, le=1)]
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles

@@ -13,8 +13,17 @@ from safevar_sumo.fmu.description import COMMON_UNITS, Unit
 from safevar_sumo.plugins import POSITIVE, Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study.schema import Parameters
-from safevar_sumo.vehicles.base import LEGAL_STATE, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
+from safevar_sumo.vehicles.base import (
+    LEGAL_STATE,
+    LEVEL,
+    SPEED_ROUNDING,
+    Characteristics,
+    Sensors,
+    Slope,
+    SumoType,
+    Vehicle,
+    sensed_observation,
+)
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
 CONSTANTS: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}

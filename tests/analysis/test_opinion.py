@@ -182,7 +182,7 @@ def test_the_original_vehicle_meets_the_same_encounter(study: str) -> None:
 GLITCHY = """
 import numpy as np
 from safevar_sumo.vehicles import LEVEL
-from safevar_sumo.vehicles.worn import WornVehicle
+from safevar_sumo.vehicles.sensing import WornVehicle
 
 
 class Made(WornVehicle, frozen=True, kw_only=True):

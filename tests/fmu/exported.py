@@ -55,7 +55,7 @@ from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
 from safevar_sumo.records import Command
 from safevar_sumo.vehicles import LEVEL
 from safevar_sumo.vehicles.base import Slope
-from safevar_sumo.vehicles.sumo import SumoVehicle
+from safevar_sumo.vehicles.sensing import SumoVehicle
 
 PARAMETERS = ("mass", "accel", "decel", "maxSpeed", "tau", "brakeDelay", "brakeGain")
 

@@ -229,7 +229,7 @@ def delegated(method: str, body: str, **arguments_of: str) -> str:
 
 def vehicle(method: str, body: str) -> str:
     return (
-        "import numpy as np\nfrom safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Mine:\n    UNITS "
+        "import numpy as np\nfrom safevar_sumo.vehicles.sensing import SumoVehicle\n\n\nclass Mine:\n    UNITS "
         "= SumoVehicle.UNITS\n\n"
         "    def __init__(self):\n        self.inner = SumoVehicle(reference_mass=1500)\n\n"
         "    def prepare(self, characteristics, road_friction, step):\n"

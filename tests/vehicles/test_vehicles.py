@@ -9,9 +9,9 @@ import pytest
 
 from safevar_sumo.records import Observation
 from safevar_sumo.vehicles import VEHICLES
+from safevar_sumo.vehicles.base import delay_signal
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
-from safevar_sumo.vehicles.sensors import delay_signal
 from tests.vehicles.runs import (
     STEP,
     SYSTEMS,

@@ -14,7 +14,7 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.base import LEVEL
-from safevar_sumo.vehicles.worn import WornVehicle
+from safevar_sumo.vehicles.sensing import WornVehicle
 
 CAR = WornVehicle()
 HEALTHY = {

@@ -26,12 +26,10 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, GuardedVehicle, Sensors, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.base import Characteristics
+from safevar_sumo.vehicles.base import Characteristics, delay_signal, extend_history, start_history
 from safevar_sumo.vehicles.carla import AIR_DENSITY, FRONTAL_AREA, WHEEL_MASS
 from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
-from safevar_sumo.vehicles.sensors import delay_signal, extend_history, start_history
-from safevar_sumo.vehicles.sumo import SumoVehicle
-from safevar_sumo.vehicles.worn import WornVehicle
+from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
 
 METRES_PER_CM = 0.01  # m
 

@@ -1,0 +1,320 @@
+"""Vehicles with delayed sensors and brakes: one with the parameters of a SUMO vType, and a car with worn tyres and
+brakes, a payload and degraded sensors.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import (
+    LEVEL,
+    Characteristics,
+    Positive,
+    Prepared,
+    Sensors,
+    Slope,
+    SumoType,
+    Vehicle,
+    delay_signal,
+    extend_history,
+    sensed_observation,
+    start_history,
+)
+
+DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
+"""Tread depths with published stopping distances [mm]; the last depth is the legal minimum in Europe."""
+DEEP_TREAD_RATIO = 1.368
+"""Stopping distance at 1.6 mm over the distance at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
+HALF_WORN_RATIO = 39.9 / 31.7
+"""Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m)
+[-].
+"""
+HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
+"""Loss of friction at 3 mm over the loss at 1.6 mm [-], as friction is proportional to 1 / stopping distance."""
+
+
+class SensingState(NamedTuple):
+    """State of N vehicles: speed [m/s], actuator positions [-], histories of the delayed signals, and acceleration by
+    the wheels [m/s^2].
+    """
+
+    speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    seen: FloatArray | None
+    brake_commands: FloatArray
+    acceleration: FloatArray
+
+
+class SensingVehicle(Vehicle):
+    """A vehicle with delayed sensors of limited range and a delayed brake.
+
+    Its constants have a `step` [s], the vehicle's `mass` [kg], the accelerations `drive` and `brake` by full pedals
+    [m/s^2], the dead time `brake_delay` of the brake [s], `max_speed` [m/s], the sensors' `latency` [s] and
+    `sensor_range` [m], and the `slope`.
+    """
+
+    __slots__ = ()
+
+    def sensors(self, prepared: Prepared) -> Sensors:
+        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
+
+    def sense(self, prepared: Prepared, state: SensingState, seen: Observation) -> tuple[Observation, SensingState]:
+        """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
+        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
+        return sensed, state._replace(seen=past)
+
+    def at_rest(self, prepared: Prepared) -> SensingState:
+        zeros = np.zeros_like(prepared.mass)
+        commands = start_history(float(np.max(prepared.brake_delay)), prepared.step, zeros)
+        return SensingState(zeros, zeros, zeros, zeros + 1, None, commands, zeros)
+
+    def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
+        """The steady state: the pedals balance the slope, the only resistance."""
+        rest, back = self.at_rest(prepared), prepared.slope.back
+        throttle, brake = (
+            np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / prepared.drive, -back / prepared.brake)
+        )
+        return SensingState(
+            speed, throttle, brake, rest.gear, None, rest.brake_commands + brake, rest.acceleration + back
+        )
+
+    def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
+        p = prepared
+        commands = extend_history(state.brake_commands, command.brake)
+        brake = delay_signal(commands, p.brake_delay, p.step)
+        acceleration = self._acceleration(p, state, command.throttle, brake)
+        highest_speed = np.maximum(p.max_speed, state.speed)
+        speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed)
+        return state._replace(
+            speed=speed,
+            acceleration=(speed - state.speed) / p.step + p.slope.back,
+            throttle=np.where(brake > 0, 0.0, command.throttle),
+            brake=brake,
+            brake_commands=commands,
+        )
+
+    @abstractmethod
+    def _acceleration(self, p: Prepared, state: SensingState, throttle: FloatArray, brake: FloatArray) -> FloatArray:
+        """Acceleration by the wheels with these positions of the pedals [m/s^2]."""
+
+
+class _PreparedSumo(NamedTuple):
+    """Constants of a run, SI, shape (N,); see `SensingVehicle`."""
+
+    step: float
+    mass: FloatArray
+    drive: FloatArray
+    brake: FloatArray
+    decel: FloatArray
+    grip: float | FloatArray
+    max_speed: FloatArray
+    actuator_lag: FloatArray
+    sensor_range: FloatArray
+    latency: FloatArray
+    brake_delay: FloatArray
+    brake_gain: FloatArray
+    slope: Slope
+
+
+class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
+
+    Parameters
+    ----------
+    reference_mass
+        Mass to which accel and decel refer [kg]; at another mass the forces stay the same.
+    tyre_friction
+        Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this coefficient times g.
+    """
+
+    UNITS = {
+        "mass": "kg",
+        "accel": "m/s^2",
+        "decel": "m/s^2",
+        "maxSpeed": "m/s",
+        "tau": "s",
+        "sensorRange": "m",
+        "reactionTime": "s",
+        "brakeDelay": "s",
+        "brakeGain": "-",
+    }
+
+    reference_mass: Annotated[float, Meta(gt=0)] = 1500.0
+    tyre_friction: Annotated[float, Meta(gt=0)] = 0.9
+
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _PreparedSumo:
+        c = characteristics
+        mass_ratio = self.reference_mass / c["mass"]
+        decel = c["decel"] * mass_ratio
+        return _PreparedSumo(
+            step=step,
+            mass=c["mass"],
+            drive=c["accel"] * mass_ratio,
+            brake=c["brakeGain"] * decel,
+            decel=decel,
+            grip=self.tyre_friction * road_friction * slope.down,
+            max_speed=c["maxSpeed"],
+            actuator_lag=c["tau"],
+            sensor_range=c["sensorRange"],
+            latency=c["reactionTime"],
+            brake_delay=c["brakeDelay"],
+            brake_gain=c["brakeGain"],
+            slope=slope,
+        )
+
+    def sumo_type(self, prepared: _PreparedSumo) -> SumoType:
+        p = prepared
+        limits = np.minimum(p.drive, p.grip), np.minimum(p.decel, p.grip)
+        return SumoType(p.mass, *limits, p.max_speed, tau=p.actuator_lag)
+
+    def _acceleration(
+        self, p: _PreparedSumo, state: SensingState, throttle: FloatArray, brake: FloatArray
+    ) -> FloatArray:
+        """The wheels follow the pedals with the actuator lag T: da/dt = (target - a) / T."""
+        target = np.where(brake > 0, -brake * p.brake_gain * p.decel, throttle * p.drive)
+        target = np.minimum(np.maximum(target, -p.grip), p.grip)
+        acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
+        # Braking ends a positive acceleration at once, without lag.
+        return np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
+
+
+class _PreparedWorn(NamedTuple):
+    """Constants of a run, SI, shape (N,); see `SensingVehicle`. `grip` is the friction coefficient; `front_load` and
+    `rear_load` are the axles' shares of the weight at rest [-].
+    """
+
+    step: float
+    mass: FloatArray
+    drive: FloatArray
+    brake: FloatArray
+    grip: FloatArray
+    max_speed: float
+    front_load: FloatArray
+    rear_load: FloatArray
+    brake_delay: FloatArray
+    sensor_range: FloatArray
+    latency: FloatArray
+    slope: Slope
+
+
+class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A car with two axles that never lock: each axle brakes up to the friction that its load allows.
+
+    Parameters
+    ----------
+    kerb_mass, kerb_centre, wheelbase, centre_height
+        The empty car: mass [kg], distance of the centre of mass from the front axle, wheelbase, height of the centre of
+        mass [m].
+    drive_force, brake_force, front_share
+        Largest forces of engine and brakes [N], and the front axle's share of the brake force [-].
+    tyre_friction
+        Friction coefficient on a dry road [-].
+    tread_loss
+        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. The default is 1 - 1 / 1.368:
+        their stopping distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes
+        for other depths.
+    max_speed
+        Top speed [m/s].
+
+    Notes
+    -----
+    The loss of friction on a wet road is linear in tread depth between published points: none from 6.7 mm on,
+    `tread_loss` at 1.6 mm, and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA
+    for Continental, from 50 mph). The line from 3 mm to 1.6 mm continues below 1.6 mm (assumption). The loss was
+    measured from 50 mph and acts at every speed (assumption; tyres lose less at lower speeds). The weather determines
+    whether a road is wet; on a dry road the tread has no effect.
+
+    Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is the smallest of F /
+    m (brake force and mass), mu g, and, for each axle, the a at which that axle reaches its limit while the other axle
+    brakes with its share. With the centre of mass at the height h and the distance x behind the front axle, and the
+    wheelbase L, the limits are mu m (g (L - x) + a h) / L at the front axle and mu m (g x - a h) / L at the rear axle.
+    On a slope, g stands for the component of gravity onto the road, and the component along the road acts in addition
+    to a. The vehicle never rolls back.
+    """
+
+    UNITS = {
+        "treadDepth": "mm",
+        "brakeTorque": "-",
+        "brakeResponse": "s",
+        "payload": "kg",
+        "payloadCentre": "m",
+        "sensorRange": "m",
+        "sensorLatency": "s",
+    }
+
+    kerb_mass: Positive = 1500.0
+    kerb_centre: Positive = 1.2
+    wheelbase: Positive = 2.7
+    centre_height: Positive = 0.55
+    drive_force: Positive = 3900.0
+    brake_force: Positive = 16500.0
+    front_share: Annotated[float, Meta(gt=0, lt=1)] = 0.7
+    tyre_friction: Positive = 0.9
+    tread_loss: Annotated[float, Meta(ge=0, lt=0.5)] = 1 - 1 / DEEP_TREAD_RATIO
+    max_speed: Positive = 55.56
+
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _PreparedWorn:
+        c = characteristics
+        mass = self.kerb_mass + c["payload"]
+        rear_load = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
+        grip_share = np.where(wet, 1 - self.tread_loss * _loss_share(np.maximum(c["treadDepth"], 0.0)), 1.0)
+        return _PreparedWorn(
+            step=step,
+            mass=mass,
+            drive=self.drive_force / mass,
+            brake=c["brakeTorque"] * (self.brake_force / mass),
+            grip=self.tyre_friction * road_friction * grip_share,
+            max_speed=self.max_speed,
+            front_load=1 - rear_load,
+            rear_load=rear_load,
+            brake_delay=c["brakeResponse"],
+            sensor_range=c["sensorRange"],
+            latency=c["sensorLatency"],
+            slope=slope,
+        )
+
+    def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
+        p, ones = prepared, np.ones_like(prepared.mass)
+        limits = np.minimum(p.drive, p.grip * p.slope.down), self._deceleration(p, ones)
+        return SumoType(p.mass, *limits, self.max_speed * ones, tau=p.brake_delay + p.step)
+
+    def _acceleration(
+        self, p: _PreparedWorn, state: SensingState, throttle: FloatArray, brake: FloatArray
+    ) -> FloatArray:
+        drive = np.minimum(throttle * p.drive, p.grip * p.slope.down)
+        return np.where(brake > 0, -self._deceleration(p, brake), drive)
+
+    def _deceleration(self, p: _PreparedWorn, pedal: FloatArray) -> FloatArray:
+        """Deceleration by the brakes of both axles together [m/s^2]."""
+        demand, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
+        rear_limit = (self.front_share * demand + p.grip * p.slope.down * p.rear_load) / (1 + lever)
+        front_limit = ((1 - self.front_share) * demand + p.grip * p.slope.down * p.front_load) / (1 - lever)
+        return np.minimum(np.minimum(demand, p.grip * p.slope.down), np.minimum(rear_limit, front_limit))
+
+
+def _loss_share(depth: FloatArray) -> FloatArray:
+    """Loss of friction on a wet road at a tread depth [mm] over the loss at 1.6 mm [-], shape (N,)."""
+    loss_to_half_worn = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
+    loss_beyond_half_worn = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)
+    return np.asarray(HALF_WORN_LOSS * loss_to_half_worn + (1 - HALF_WORN_LOSS) * loss_beyond_half_worn)
