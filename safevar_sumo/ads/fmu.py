@@ -11,7 +11,7 @@ from safevar_sumo.ads.base import Ads, Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError
 from safevar_sumo.fmu import Description, Fleet, History, Instances
 from safevar_sumo.plugins import SHARE, Guard
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import BoolArray, Command, Nominal, Observation
 from safevar_sumo.study.schema import Parameters
 
 OBSERVATION_UNITS: Mapping[str, str] = {
@@ -93,27 +93,19 @@ class FmuAds(Ads):
             )
         if not input_ports.keys() & OBSERVATION_UNITS.keys():
             raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATION_UNITS)}")
-        self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
-        constants = description.constants(parameters, [*input_ports.values()], source, "ads.parameters")
-        self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()], constants)
+        constants = description.constants(parameters, input_ports.values(), source, "ads.parameters")
+        self._instances = Instances(description, input_ports, output_ports, constants)
         self.max_vehicles = self._instances.max_vehicles
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        constants = {
-            "step": step,
-            **{
-                name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX))
-                for name in CONSTANT_UNITS
-                if name.startswith(NOMINAL_PREFIX)
-            },
-        }
+        names = (name for name in CONSTANT_UNITS if name.startswith(NOMINAL_PREFIX))
+        constants = {"step": step, **{name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX)) for name in names}}
         return _Memory(Fleet(self._instances, n, step, self._communication_step), constants, nominal)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        inputs = self._input_values(seen, memory.constants)
-        history = memory.history or self._guard.call("initialisation", memory.fleet.start, inputs)[1]
-        (values, _), history = self._guard.call("doStep", memory.fleet.advance, history, inputs)
-        outputs = dict(zip(self._outputs, values, strict=True))
+        values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **memory.constants}
+        history = memory.history or self._guard.call("initialisation", memory.fleet.start, values)[1]
+        outputs, _, history = self._guard.call("doStep", memory.fleet.advance, history, values)
         warns = None if "warns" not in outputs else outputs["warns"] > 0.5
         memory = memory._replace(history=history, warns=warns)
         if "acceleration" in outputs:
@@ -122,19 +114,12 @@ class FmuAds(Ads):
             return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(
                 trim=initial_trim
             )
-        zeros = np.zeros_like(seen.speed)
-        return Command(
-            *(
-                self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, SHARE)
-                for name in Command._fields
-            )
-        ), memory
-
-    def _input_values(self, seen: Observation, constants: Mapping[str, float]) -> FloatArray:
-        values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **constants}
-        return np.stack(
-            [np.broadcast_to(np.asarray(values[name], dtype=float), seen.speed.shape) for name in self._inputs]
-        )
+        pedals = (outputs.get(name, np.zeros_like(seen.speed)) for name in Command._fields)
+        checked = [
+            self._guard.numbers("doStep", name, pedal, seen.speed.shape, SHARE)
+            for name, pedal in zip(Command._fields, pedals, strict=True)
+        ]
+        return Command(*checked), memory
 
     def warns(self, memory: _Memory) -> BoolArray | None:
         return memory.warns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from fmpy.model_description import ModelVariable
 
 FloatArray = npt.NDArray[np.float64]
+Outputs = dict[str, FloatArray]
+"""Outputs of N vehicles by quantity, each of shape (N,)."""
 CONVERSIONS = {"String": str, "Boolean": bool, **dict.fromkeys(REAL_TYPES, float)}
 """Functions that make a number fit for variables of an FMI type; other FMI types hold whole numbers."""
 MAX_INSTANCES = 200
@@ -48,7 +50,7 @@ class Instances:
     Parameters
     ----------
     inputs, outputs
-        The FMU's ports, in the order of the values. Ports for parameters are set once, at the start.
+        The FMU's ports by quantity. Ports for parameters are set once, at the start.
     constants
         Further parameters and their values.
     """
@@ -56,11 +58,12 @@ class Instances:
     def __init__(
         self,
         description: Description,
-        inputs: Sequence[Port],
-        outputs: Sequence[Port],
+        inputs: Mapping[str, Port],
+        outputs: Mapping[str, Port],
         constants: Sequence[tuple[ModelVariable, Constant]],
     ) -> None:
-        self._description, self._inputs, self._outputs, self._constants = description, inputs, outputs, constants
+        self.inputs, self.outputs = inputs, outputs
+        self._description, self._constants = description, constants
         self._is_3 = description.model.fmiVersion.startswith("3")
         self._free, self._messages = list["FMU2Slave"](), list[str]()
         self.max_vehicles = 1 if description.is_single else MAX_INSTANCES
@@ -118,12 +121,14 @@ class Instances:
         values: FloatArray,
         work: Callable[[FMU2Slave, Sequence[float]], None],
     ) -> FloatArray:
-        columns = np.array([port.to_fmu(row) for port, row in zip(self._inputs, values, strict=True)]).T.tolist()
-        outputs = np.zeros((len(self._outputs), len(slaves)))
+        columns = np.array(
+            [port.to_fmu(row) for port, row in zip(self.inputs.values(), values, strict=True)]
+        ).T.tolist()
+        outputs = np.zeros((len(self.outputs), len(slaves)))
         try:
             for i, slave in enumerate(slaves):
                 work(slave, columns[i])
-                for row, port in enumerate(self._outputs):
+                for row, port in enumerate(self.outputs.values()):
                     read = getattr(slave, f"get{self._function(port.variable)}")
                     outputs[row, i] = read([port.variable.valueReference])[0]
         except Exception as error:  # any error of FMPy about an FMU
@@ -133,12 +138,12 @@ class Instances:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
             raise FmuError(f"{': '.join([reason, *messages])} while it {activity}") from error
         return np.stack(
-            [port.fmu_unit.to(port.outer_unit, row) for port, row in zip(self._outputs, outputs, strict=True)]
+            [port.fmu_unit.to(port.outer_unit, row) for port, row in zip(self.outputs.values(), outputs, strict=True)]
         )
 
     def _write_inputs(self, slave: FMU2Slave, column: Sequence[float], *, are_inputs: bool) -> None:
         """Set the inputs of an instance or its parameters among the ports."""
-        for port, value in zip(self._inputs, column, strict=True):
+        for port, value in zip(self.inputs.values(), column, strict=True):
             if port.is_input == are_inputs:
                 self._write(slave, port.variable, value)
 
@@ -188,35 +193,46 @@ class Fleet:
         self._last_outputs: FloatArray
         """Outputs at the last two communication points, shape (2, m, N)."""
 
-    def start(self, inputs: FloatArray) -> tuple[FloatArray, History]:
-        """Initialise the vehicles with k inputs, shape (k, N); returns the m outputs, shape (m, N), and the history."""
+    def start(self, values: Mapping[str, npt.ArrayLike]) -> tuple[Outputs, History]:
+        """Initialise the vehicles with values of the inputs; returns the outputs, shape (N,), and the history."""
+        inputs = self._inputs(values)
+        outputs, self._history = self._start(inputs), History(None, inputs, step_number=-1)
+        return self._named(outputs), self._history
+
+    def advance(self, history: History, values: Mapping[str, npt.ArrayLike]) -> tuple[Outputs, Outputs, History]:
+        """Advance by one step after `history` with values of the inputs; returns the outputs at the last communication
+        point, those interpolated to the end of the step, and the new history.
+        """
+        if self._history is not history or self._generation != self._instances.generation:
+            self._replay(history)
+        inputs, step_number = self._inputs(values), history.step_number + 1
+        self._history = None
+        self._drive(step_number, inputs)
+        self._history = History(history, inputs, step_number)
+        return self._named(self._last_outputs[1]), self._named(self._end_outputs(step_number)), self._history
+
+    def _inputs(self, values: Mapping[str, npt.ArrayLike]) -> FloatArray:
+        return np.stack(
+            [np.broadcast_to(np.asarray(values[name], dtype=float), self._n) for name in self._instances.inputs]
+        )
+
+    def _named(self, outputs: FloatArray) -> Outputs:
+        return dict(zip(self._instances.outputs, outputs, strict=True))
+
+    def _start(self, inputs: FloatArray) -> FloatArray:
         if self._generation != self._instances.generation:
             self._slaves = self._instances.lease(self._n)
             self._generation = self._instances.generation
             weakref.finalize(self, self._instances.give_back, self._slaves, self._generation)
         outputs = self._instances.start(self._slaves, inputs)
-        self._last_outputs, self._history = np.stack([outputs, outputs]), History(None, inputs, step_number=-1)
-        return outputs, self._history
-
-    def advance(self, history: History, inputs: FloatArray) -> tuple[FloatArray, History]:
-        """Advance by one step after `history` with inputs of shape (k, N); returns outputs of shape (2, m, N), and the
-        new history.
-
-        First come the outputs at the last communication point, then the outputs interpolated to the end of the step.
-        """
-        if self._history is not history or self._generation != self._instances.generation:
-            self._replay(history)
-        step_number = history.step_number + 1
-        self._history = None
-        self._drive(step_number, inputs)
-        self._history = History(history, inputs, step_number)
-        return np.stack([self._last_outputs[1], self._end_outputs(step_number)]), self._history
+        self._last_outputs = np.stack([outputs, outputs])
+        return outputs
 
     def _replay(self, history: History) -> None:
         chain = [history]
         while chain[-1].previous is not None:
             chain.append(chain[-1].previous)
-        self.start(chain.pop().inputs)
+        self._start(chain.pop().inputs)
         for link in reversed(chain):
             self._drive(link.step_number, link.inputs)
 

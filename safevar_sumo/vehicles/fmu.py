@@ -42,15 +42,15 @@ REQUIRED = {
     "sumo_type": (TYPE_UNITS, "a number in SI units; or a characteristic, or an output or parameter of the FMU"),
 }
 """Required quantities in tables of the study, and what they may be."""
+CHARACTERISTICS = "vehicle.characteristics"
 READABLE_CAUSALITIES = ("output", "calculatedParameter", "parameter", "local")
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run: inputs, characteristics, types and sensors of the vehicles, and their FMU instances."""
+    """Constants of a run: inputs, types and sensors of the vehicles, and their FMU instances."""
 
     fleet: Fleet
     inputs: Mapping[str, FloatArray]
-    characteristics: Characteristics
     types: SumoType
     sensors: Sensors
     step: float
@@ -108,13 +108,13 @@ class FmuVehicle(Vehicle):
         names = {
             each: each for each in units if each in description.variables or each not in self._sensor_entries.values()
         }
-        key = "vehicle.characteristics"
+        key = CHARACTERISTICS
         characteristics = description.ports(names, units, ("parameter",), source, key, types=REAL_TYPES)
-        self._inputs, self._characteristics = tuple(inputs), tuple(characteristics)
-        self._outputs, self._reads_type = (*outputs, *types), bool(types)
-        ports = [*inputs.values(), *characteristics.values()]
-        constants = description.constants(table["parameters"], ports, source, "vehicle.parameters")
-        self._instances = Instances(description, ports, [*outputs.values(), *types.values()], constants)
+        self._has_grade, self._has_initial_speed = "grade" in inputs, "initial_speed" in inputs
+        inputs |= {f"{key}.{name}": port for name, port in characteristics.items()}
+        constants = description.constants(table["parameters"], inputs.values(), source, "vehicle.parameters")
+        self._instances = Instances(description, inputs, outputs | types, constants)
+        self._reads_type = bool(types)
         self.max_vehicles = self._instances.max_vehicles
         if "road_friction" not in inputs:
             self.remarks = [
@@ -166,7 +166,7 @@ class FmuVehicle(Vehicle):
         wet: bool | BoolArray = False,
     ) -> _Prepared:
         n = len(next(iter(characteristics.values())))
-        if slope is not LEVEL and "grade" not in self._inputs:
+        if slope is not LEVEL and not self._has_grade:
             self._refuse_road("grade", "the road has a grade", "grade 0")
         zeros = np.zeros(n)
         inputs = {
@@ -177,11 +177,11 @@ class FmuVehicle(Vehicle):
             "grade": zeros + slope.back / slope.down,
             "step": zeros + step,
             "initial_speed": zeros,
+            **{f"{CHARACTERISTICS}.{name}": values for name, values in characteristics.items()},
         }
         fleet, outputs = Fleet(self._instances, n, step, self._communication_step), dict[str, FloatArray]()
         if self._reads_type:
-            values, _ = self._guard.call("initialisation", fleet.start, self._input_array(inputs, characteristics))
-            outputs = dict(zip(self._outputs, values, strict=True))
+            outputs, _ = self._guard.call("initialisation", fleet.start, inputs)
 
         def quantity(name: str, entry: str | float) -> FloatArray:
             """Values of a quantity, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
@@ -195,9 +195,7 @@ class FmuVehicle(Vehicle):
         types = {name: quantity(name, self._type_entries[name]) for name in TYPE_UNITS}
         checked = [self._guard.numbers("sumo_type", name, values, (n,), POSITIVE) for name, values in types.items()]
         sensors = {SENSOR_FIELDS[name]: quantity(name, entry) for name, entry in self._sensor_entries.items()}
-        return _Prepared(
-            fleet, inputs, characteristics, SumoType(*checked), Sensors.perfect(n)._replace(**sensors), step
-        )
+        return _Prepared(fleet, inputs, SumoType(*checked), Sensors.perfect(n)._replace(**sensors), step)
 
     def _refuse_road(self, name: str, reason: str, otherwise: str) -> None:
         problem = f"{self._guard.name} has no vehicle.inputs.{name}, and {reason}"
@@ -214,12 +212,12 @@ class FmuVehicle(Vehicle):
 
     def at_start(self, prepared: _Prepared, speed: FloatArray) -> _State:
         """The initial state at a speed [m/s], shape (N,)."""
-        if np.any(speed > 0) and "initial_speed" not in self._inputs:
+        if np.any(speed > 0) and not self._has_initial_speed:
             self._refuse_road("initial_speed", "the traffic puts it onto the road in motion", "departSpeed 0")
-        inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
+        inputs = {**prepared.inputs, "initial_speed": speed}
         outputs, history = self._guard.call("initialisation", prepared.fleet.start, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
-        state = self._state(outputs, outputs, released, None, history)
+        state = self._state(outputs, released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
             raise self._guard.wrong_value(
                 "initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed"
@@ -239,11 +237,9 @@ class FmuVehicle(Vehicle):
         return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        inputs = self._input_array({**prepared.inputs, **command._asdict()}, prepared.characteristics)
-        (point_outputs, step_outputs), history = self._guard.call(
-            "doStep", prepared.fleet.advance, state.history, inputs
-        )
-        next_state = self._state(point_outputs, step_outputs, command, state.seen, history)
+        inputs = {**prepared.inputs, **command._asdict()}
+        outputs, at_end, history = self._guard.call("doStep", prepared.fleet.advance, state.history, inputs)
+        next_state = self._state({**outputs, "speed": at_end["speed"]}, command, state.seen, history)
         max_speed = prepared.types.max_speed
         for i in open_rows(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
             raise self._guard.wrong_value(
@@ -251,17 +247,11 @@ class FmuVehicle(Vehicle):
             )
         return next_state
 
-    def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
-        return np.stack(
-            [*(inputs[name] for name in self._inputs), *(characteristics[name] for name in self._characteristics)]
-        )
-
     def _state(
-        self, outputs: FloatArray, end_outputs: FloatArray, command: Command, seen: FloatArray | None, history: History
+        self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History
     ) -> _State:
-        """The state by the outputs at the last communication point, and by the speed at the end of the step."""
-        n, speed = command.throttle.shape, end_outputs[self._outputs.index("speed")]
-        values = {"gear": np.ones(n), **command._asdict(), **dict(zip(self._outputs, outputs, strict=True))}
+        n, speed = command.throttle.shape, outputs["speed"]
+        values = {"gear": np.ones(n), **command._asdict(), **outputs}
         values["speed"] = np.where(np.abs(speed) < SPEED_ROUNDING, 0.0, speed)
         columns = {
             name: self._guard.numbers("doStep", name, values[name], n, legal) for name, legal in LEGAL_STATE.items()
