@@ -65,13 +65,21 @@ class Evaluator:
         Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
         `ignore_constraints` is true.
         """
-        if self.region and not ignore_constraints:
-            feasible = self.region.feasible(settings)
-            if not feasible.all():
-                groups = [self.evaluate(settings[feasible], stage), self._infeasible_evaluations(settings[~feasible])]
-                order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
-                return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
-        return self._evaluate_shown(settings, stage, self._verified)
+        is_feasible = self.region.feasible(settings)
+        if ignore_constraints or is_feasible.all():
+            return self._evaluate_shown(settings, stage, self._verified)
+        infeasible, undefined = settings[~is_feasible], np.full(np.count_nonzero(~is_feasible), np.nan)
+        not_simulated = Evaluations(
+            settings=infeasible,
+            outcome=np.full(len(infeasible), Outcome.INFEASIBLE.value, dtype="U16"),
+            collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined),
+            f_diff=self.characteristics.largest_change(infeasible),
+            f_num_diff=self.characteristics.number_changed(infeasible),
+        )
+        groups = [self._evaluate_shown(settings[is_feasible], stage, self._verified), not_simulated]
+        order = np.argsort(np.argsort(~is_feasible, kind="stable"), kind="stable")
+        return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings with the values of some parameters of the ADS beside them, shape (M, n + P), at some
@@ -106,23 +114,10 @@ class Evaluator:
         self.simulated += total
         return evaluations
 
-    def _infeasible_evaluations(self, settings: FloatArray) -> Evaluations:
-        undefined = np.full(len(settings), np.nan)
-        return Evaluations(
-            settings=settings,
-            outcome=np.full(len(settings), Outcome.INFEASIBLE.value, dtype="U16"),
-            collision_speed=undefined,
-            metrics=dict.fromkeys(METRICS, undefined),
-            f_diff=self.characteristics.largest_change(settings),
-            f_num_diff=self.characteristics.number_changed(settings),
-        )
-
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly; optionally, they also stay feasible when
         filtered.
         """
-        if not self.region:
-            return sobol_settings(self.characteristics, number, seed)
         rng, drawn = np.random.default_rng(seed), 0
 
         def draw_next(count: int) -> FloatArray:
@@ -210,12 +205,10 @@ class Evaluator:
             return self.parse_criterion(text)
         if not isinstance(source, Study) and len(source.solutions):
             return source.unsafe
-        original = self.evaluate_original() if original is None else original
-        if RATING_POINTS.name in original.metrics:
-            return Unsafe.default_among(original, original)  # a lost point: it depends on the original vehicle alone
-        return Unsafe.default_among(
-            self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain"), original
-        )
+        original = others = self.evaluate_original() if original is None else original
+        if RATING_POINTS.name not in original.metrics:  # a lost point depends on the original vehicle alone
+            others = self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain")
+        return Unsafe.default_among(others, original)
 
     def parse_criterion(self, text: str) -> Unsafe:
         """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without

@@ -55,11 +55,10 @@ class ModelSpread(NamedTuple):
         """One sentence on the band and the collisions."""
         if self.lower is None or self.upper is None:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
-        collisions = "none of them" if not self.collisions else f"{self.collisions} of them"
         return (
-            f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} "
-            "parameter sets that fit the "
-            f"published data equally well, of repeats and of the model's error); a collision with {collisions}"
+            f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets "
+            "that fit the published data equally well, of repeats and of the model's error); a collision with "
+            f"{self.collisions or 'none'} of them"
         )
 
 
@@ -74,11 +73,10 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
         If the study has no spread, or the spread names a parameter that the study lacks.
     """
     evaluations = evaluate_sets(study, settings, point)
-    lower, upper = band_of(study, evaluations)
-    collisions = np.stack([prediction.collided for prediction in evaluations]).sum(axis=0)
+    collisions = np.sum([prediction.collided for prediction in evaluations], axis=0)
     return [
-        ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(count))
-        for low, high, count in zip(lower.tolist(), upper.tolist(), collisions.tolist(), strict=True)
+        ModelSpread(len(evaluations), finite_or_none(low), finite_or_none(high), int(count))
+        for low, high, count in zip(*band_of(study, evaluations), collisions, strict=True)
     ]
 
 
@@ -109,11 +107,10 @@ def prediction_band(
     """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it
     on each side.
     """
-    lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
-    defined = np.isfinite(safety_degrees).any(axis=0)
-    lower[defined], upper[defined] = np.nanquantile(
-        safety_degrees[:, defined], [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2], axis=0
-    )
+    ends = np.full((2, safety_degrees.shape[1]), np.nan)
+    defined, shares = np.isfinite(safety_degrees).any(axis=0), [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2]
+    ends[:, defined] = np.nanquantile(safety_degrees[:, defined], shares, axis=0)
+    lower, upper = ends
     return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error
 
 
@@ -123,9 +120,9 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
         assemble(variant, study.source if k == 0 else f"{study.source}: spread: set {k}")
         for k, variant in enumerate(studies_of_sets(study))
     ]
-    return [
-        evaluate(system_at_point(system, point, source="point") if point else system, settings) for system in systems
-    ]
+    if point:
+        systems = [system_at_point(system, point, source="point") for system in systems]
+    return [evaluate(system, settings) for system in systems]
 
 
 def studies_of_sets(study: Study) -> list[Study]:
@@ -141,15 +138,9 @@ def studies_of_sets(study: Study) -> list[Study]:
             study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain"
         )
     outside_names = parameters_outside_sets(study)
-    values_of_sets = {key: values for key, values in study.spread.items() if key not in outside_names}
-    set_count = len(next(iter(study.spread.values())))
-    return [
-        study,
-        *(
-            with_values(study, {key: values[k] for key, values in values_of_sets.items()}, "spread")
-            for k in range(1, set_count)
-        ),
-    ]
+    sets = {key: values[1:] for key, values in study.spread.items() if key not in outside_names}
+    number = len(next(iter(study.spread.values()))) - 1
+    return [study, *(with_values(study, {key: sets[key][k] for key in sets}, "spread") for k in range(number))]
 
 
 def parameters_outside_sets(study: Study) -> list[str]:

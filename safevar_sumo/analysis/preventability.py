@@ -92,34 +92,33 @@ class Preventability:
         sample the interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite
         population.
         """
-        number, share = self.looked_at, self.share(PreventableBy.COMPETENT_DRIVER)
-        count = self.counts.get(PreventableBy.COMPETENT_DRIVER, 0)
-        interval = (share, share) if number == self.collisions else clopper_pearson(count, max(number, 1))
+        number, shares, interval = self.looked_at, self.shares, None
+        if number:
+            driver, count = PreventableBy.COMPETENT_DRIVER, self.counts.get(PreventableBy.COMPETENT_DRIVER, 0)
+            interval = [self.share(driver)] * 2 if number == self.collisions else [*clopper_pearson(count, number)]
         return {
-            **{by.name.lower(): self.share(by) if number else None for by in PreventableBy},
+            **{by.name.lower(): shares.get(by.name.lower()) for by in PreventableBy},
             "looked_at": number,
-            "interval_competent_driver": list(interval) if number else None,
-            "later": {"reaction": LATER_REACTION, "competent_driver": self.later / number if number else None},
+            "interval_competent_driver": interval,
+            "later": {"reaction": LATER_REACTION, "competent_driver": shares.get("later")},
         }
 
     @property
     def range_in_words(self) -> str:
         """The share that the competent driver avoids: `71 % (39 % if he needs 0.4 s longer)`."""
         later = share_in_words(self.later / max(self.looked_at, 1))
-        share = share_in_words(self.share(PreventableBy.COMPETENT_DRIVER))
-        return f"{share} ({later} if he needs {DELAY:g} s longer)"
+        return f"{share_in_words(self.share(PreventableBy.COMPETENT_DRIVER))} ({later} if he needs {DELAY:g} s longer)"
 
     def __str__(self) -> str:
         """A sentence; empty if no collision was simulated."""
         if not self.looked_at:
             return ""
-        full_braking, nobody = (
-            share_in_words(self.share(by)) for by in (PreventableBy.FULL_BRAKING, PreventableBy.NOBODY)
-        )
         sample = "" if self.looked_at == self.collisions else f", drawn at random from {self.collisions}"
         return (
             f"In the same vehicle, of {number_of(self.looked_at, 'collision')}{sample}, a competent driver avoids "
-            f"{self.range_in_words}; only full braking at the first possible moment: {full_braking}; nobody: {nobody}."
+            f"{self.range_in_words}; only full braking at the first possible moment: "
+            f"{share_in_words(self.share(PreventableBy.FULL_BRAKING))}; nobody: "
+            f"{share_in_words(self.share(PreventableBy.NOBODY))}."
         )
 
 
@@ -162,13 +161,11 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
 
     def drive(driver: str, rows: FloatArray, **parameters: float) -> Evaluations:
         ads = ModelTable(model=driver, parameters={**approach, **parameters})
-        return evaluator.for_study(replace(evaluator.study, ads=ads)).evaluate(
-            rows, "reference drivers in the same vehicle"
-        )
+        driven = evaluator.for_study(replace(evaluator.study, ads=ads))
+        return driven.evaluate(rows, "reference drivers in the same vehicle")
 
-    first, later = (
-        drive("competent_driver", settings, **parameters) for parameters in ({}, {"reaction_time": LATER_REACTION})
-    )
+    first = drive("competent_driver", settings)
+    later = drive("competent_driver", settings, reaction_time=LATER_REACTION)
     full_braking = drive("full_braking", settings[first.collided])
     category = np.full(len(settings), PreventableBy.COMPETENT_DRIVER, dtype=object)
     category[first.collided] = np.where(full_braking.collided, PreventableBy.NOBODY, PreventableBy.FULL_BRAKING)

@@ -140,7 +140,7 @@ def study_or_case(
     """
     if isinstance(source, str | Path):
         # `os.path` accepts any text, unlike paths.
-        is_directory, is_study = (os.path.isdir(source), str(source) in study_names())
+        is_directory, is_study = os.path.isdir(source), str(source) in study_names()
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
             raise InputError(
                 source, "is a study and has no solutions", "a directory that the command `study` has written"
@@ -148,12 +148,13 @@ def study_or_case(
         if results_only or (is_directory and not is_study):
             source = load(source)
         elif not (is_study or os.path.lexists(source)):
-            expected = (
-                f"a directory that the command `study` has written, {one_of(study_names())}, or the path of a "
-                "study file (TOML)"
+            names = study_names()
+            raise InputError(
+                source,
+                f"is neither a results directory, a study nor a file{did_you_mean(source, names)}",
+                f"a directory that the command `study` has written, {one_of(names)}, or the path of a study file "
+                "(TOML)",
             )
-            problem = f"is neither a results directory, a study nor a file{did_you_mean(source, study_names())}"
-            raise InputError(source, problem, expected)
     if isinstance(source, Results):
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
             warn(f"{source.directory}: {change}")
@@ -205,12 +206,11 @@ def at_point(case: Case, point: str) -> Case:
     evaluations = evaluate(system, settings)
     columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
     solutions = case.solutions.drop(columns=[name for name in case.original if name not in evaluations.metrics])
-    original = {metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics}
     return replace(
         case,
         study=study,
         scoring=scoring,
-        original=original,
+        original={metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics},
         solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
     )
 
@@ -233,14 +233,10 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
         present = manifest_of(study, identity_of(study, system, pool))
-    changes = [
-        text
-        for _, text, changes_simulations in input_differences(directory, manifest, present, study)
-        if changes_simulations
-    ]
+    changes = [text for _, text, matters in input_differences(directory, manifest, present, study) if matters]
     if changes and not as_it_is_now:
-        rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
-        named = f"{'; '.join(changes[:MAX_CHANGES_NAMED])}{rest}"
+        more = len(changes) - MAX_CHANGES_NAMED
+        named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (f" (and {more} more)" if more > 0 else "")
         raise InputError(
             directory / MANIFEST,
             f"{named}: new simulations would not match these results",

@@ -25,7 +25,8 @@ Region = Callable[[FloatArray], BoolArray]
 def made_up_study(n: int) -> Study:
     smoke = load_study("smoke")
     rows = {
-        name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER) for name in "abcdefgh"[:n]
+        name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER)
+        for name in "abcdefghijkl"[:n]
     }
     return msgspec.structs.replace(
         smoke, name="made-up", vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows)

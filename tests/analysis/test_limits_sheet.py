@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.tolerance.sheet import Failure, safe_text
+from safevar_sumo.analysis.tolerance.sheet import describe_failure, safe_text
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import load_study
@@ -31,5 +31,5 @@ def test_an_impact_at_the_limit_itself_has_no_speed(speed: float, words: str) ->
         f_diff=one,
         f_num_diff=one.astype(int),
     )
-    failure = Failure.of(collision, system.points, Unsafe(), alone=True)
-    assert failure.description == f"the car hits {system.points[0].scenario.obstacle()}{words}"
+    failure = describe_failure(collision, system.points, Unsafe())
+    assert failure["description"] == f"the car hits {system.points[0].scenario.obstacle()}{words}"

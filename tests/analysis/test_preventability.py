@@ -35,7 +35,8 @@ from safevar_sumo.analysis.preventability import (
     classify_collisions,
 )
 from safevar_sumo.analysis.research_questions.case import build_case
-from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
+from safevar_sumo.analysis.tolerance.answer import Tolerance
+from safevar_sumo.analysis.tolerance.boxes import SafeBox
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import record, solutions_frame

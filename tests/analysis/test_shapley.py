@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from itertools import permutations
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,14 @@ import pandas as pd
 import pytest
 
 from safevar_sumo import risk
-from safevar_sumo.analysis.risk import shapley
+from safevar_sumo.analysis.risk import sensitivity
 from safevar_sumo.analysis.risk.answer import Risk
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
 from tests.analysis.known_regions import Plant, made_up_study, nowhere
 from tests.in_process import run
 
-NAMES = "abcdefgh"
+NAMES = "abcdefghijkl"
 
 
 def closed_form(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -27,18 +27,18 @@ def closed_form(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     d = len(slopes)
 
     def conditional(joined: tuple[int, ...]) -> float:
-        others = [index for index in range(d) if index not in joined]
-        rest = covariance[np.ix_(joined, joined)]
-        if others:
-            mixed = covariance[np.ix_(joined, others)]
-            rest = rest - mixed @ np.linalg.inv(covariance[np.ix_(others, others)]) @ mixed.T
+        others = np.setdiff1d(np.arange(d), joined)
+        mixed = covariance[np.ix_(joined, others)]
+        rest = covariance[np.ix_(joined, joined)] - mixed @ np.linalg.inv(covariance[np.ix_(others, others)]) @ mixed.T
         return float(slopes[list(joined)] @ rest @ slopes[list(joined)]) if joined else 0.0
 
-    effects, orders = np.zeros(d), list(permutations(range(d)))
-    for order in orders:
-        for place, index in enumerate(order):
-            effects[index] += conditional(order[: place + 1]) - conditional(order[:place])
-    return effects / len(orders)
+    variances = {joined: conditional(joined) for size in range(d + 1) for joined in combinations(range(d), size)}
+    effects = np.zeros(d)
+    for joined, variance in variances.items():
+        for one in joined:
+            growth = variance - variances[tuple(other for other in joined if other != one)]
+            effects[one] += growth / (d * math.comb(d - 1, len(joined) - 1))
+    return effects
 
 
 def linear(slopes: list[float], deviations: list[float], correlations: dict[tuple[int, int], float]) -> Risk:
@@ -63,6 +63,15 @@ def linear(slopes: list[float], deviations: list[float], correlations: dict[tupl
         pytest.param(
             [1.0, -1.0, 2.0, 1.0, 0.5, 0.7], [0.5] * 6, {(0, 1): 0.5, (2, 3): -0.6, (4, 5): 0.8}, marks=pytest.mark.slow
         ),
+        *(
+            pytest.param(
+                [1.0, -1.0, 2.0, 1.5] * (d // 4),
+                [0.5] * d,
+                {(0, 1): 0.5, (2, 3): -0.6, (4, 7): 0.8},
+                marks=pytest.mark.slow,
+            )
+            for d in (8, 12)
+        ),
     ],
 )
 def test_effects_of_correlated_normal_values_are_those_of_the_closed_form(
@@ -73,17 +82,14 @@ def test_effects_of_correlated_normal_values_are_those_of_the_closed_form(
         matrix[i, j] = matrix[j, i] = value
     expected = closed_form(np.array(slopes), np.outer(deviations, deviations) * matrix)
     result = linear(slopes, deviations, correlations)
-    assert result.shapley is not None
-    assert result.sensitivity is None
-    np.testing.assert_allclose(result.shapley["effect"], expected, rtol=0.02)
-    assert result.shapley["effect"].sum() == pytest.approx(expected.sum(), rel=0.02)
-    assert result.shapley["share"].sum() == pytest.approx(1, abs=1e-12)
-    assert result.shapley_of_unsafe is not None
-    assert result.shapley_of_unsafe["share"].sum() == pytest.approx(1, abs=1e-12)
+    frame = result.to_frame().set_index(["output", "characteristic"])
+    effects = frame.loc["safety_degree", "effect"]
+    np.testing.assert_allclose(effects, expected, rtol=0.02)
+    assert effects.sum() == pytest.approx(expected.sum(), rel=0.02)
+    assert frame["share"].groupby("output").sum().to_list() == [pytest.approx(1, abs=1e-12)] * 2
     entry = result.to_dict()
     assert entry["sensitivity"] == []
-    assert [row["effect"] for row in entry["shapley"]] == result.shapley["effect"].to_list()
-    assert set(result.to_frame()["output"]) == {"safety_degree", "unsafe"}
+    assert [row["effect"] for row in entry["shapley"]] == effects.to_list()
     assert result.figure().axes
 
 
@@ -95,13 +101,11 @@ def test_a_constraint_a_characteristic_that_does_not_vary_and_an_output_that_doe
         constraints=[{"sum": {"a": 1.0, "b": 1.0}, "at_most": 10.0}],
     )
     result = risk(study, samples=200, unsafe="below=-5", pool=Plant(study, nowhere, lambda settings: settings[:, 0]))
-    assert result.shapley is not None
-    effects = result.shapley.set_index("characteristic")["effect"]
+    frame = result.to_frame().set_index(["output", "characteristic"])
     variance, alone = 100 / 18, 50 / 12  # E[(10 - b)^2] / 12 with the density (10 - b) / 50
     expected = {"a": (alone + variance) / 2, "b": (variance - alone) / 2, "c": 0.0}
-    assert effects.to_dict() == pytest.approx(expected, abs=0.02 * variance)
-    assert result.shapley_of_unsafe is not None
-    assert result.shapley_of_unsafe["share"].isna().all()
+    assert frame.loc["safety_degree", "effect"].to_dict() == pytest.approx(expected, abs=0.02 * variance)
+    assert frame.loc["unsafe", "share"].isna().all()
     words = "\n".join(part for part in result.sentences() if isinstance(part, str))
     assert "Shapley effects, which sum to 1" in words
     assert "There are no indices of the unsafe outcome" in words
@@ -115,20 +119,18 @@ def test_one_characteristic_or_none_that_varies(varying: int) -> None:
         correlations=[{"between": ["a", "b"], "value": 0.5}],
     )
     result = risk(study, samples=50, unsafe="below=5", pool=Plant(study, nowhere, lambda settings: settings[:, 0]))
-    assert result.shapley is not None
-    shares = result.shapley["share"]
+    shares = result.to_frame()["share"][:2]
     assert shares.to_list() == pytest.approx([1.0, 0.0]) if varying else shares.isna().all()
 
 
 def test_independent_characteristics_have_sobol_indices_and_no_key_of_their_own() -> None:
     result = linear([1.0, 1.0], [0.5, 1.0], {})
     assert "shapley" not in result.to_dict()
-    assert result.shapley is None
 
 
 @pytest.mark.slow
 def test_the_command_draws_them_and_repeats_them_to_the_bit(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shapley, "PERMUTATIONS", 128)
+    monkeypatch.setattr(sensitivity, "PERMUTATIONS", 128)
     typed = ("risk", "rain_realistic", "--samples", "200", "--json")
     one, two = (run(*typed, "--jobs", jobs, "--plot", "it.png").stdout for jobs in ("1", "2"))
     assert one == two

@@ -110,12 +110,12 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     result = of(2, two_islands, pairs=True, failing=lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75))
     first = result.alone[0]
     assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
-    assert first.not_simulated == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
+    assert first.intervals("not_simulated") == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
     assert first.unsafe == [
         (pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)),
         (pytest.approx(9, abs=1e-4), 10.0),
     ]
-    assert first.to_dict()["not_simulated"] == first.not_simulated
+    assert first.to_dict()["not_simulated"] == first.intervals("not_simulated")
     assert result.pairs is not None
     assert result.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
     assert result.pairs[0].unsafe_share == pytest.approx(1.25 / 9, abs=0.06)
@@ -282,7 +282,8 @@ def box_of(n: int, region: Region, limits: dict[str, Limit], known: Sequence[Seq
     evaluator = Evaluator(study, Plant(study, region))
     columns, criterion = list(range(n)), Unsafe()
     scans = scan(evaluator, columns, criterion)
-    unsafe_settings = compute._unsafe_settings(evaluator, scans, [])
+    ends = [{one.characteristic.name: end} for one in scans for interval in one.unsafe for end in interval]
+    unsafe_settings = compute.settings_of(evaluator.characteristics, ends)
     rows = np.array(known, dtype=float).reshape(-1, n)
     return find_joint_limits(evaluator, columns, criterion, limits, scans, unsafe_settings, rows)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
 
 VERDICTS = {"only_a_unsafe": "only A unsafe", "only_b_unsafe": "only B unsafe", "both": "both unsafe", "": "both safe"}
 """Verdicts on a setting, by the key of their number in the JSON; the last has none."""
+COLOURS = {"": GREY, "both": SKY_BLUE, "only_a_unsafe": BLUE, "only_b_unsafe": VERMILION}
 SOURCES = {"a": "solutions of A", "b": "solutions of B", "sample": "common sample"}
 
 
@@ -38,8 +38,6 @@ class Side:
 
     Attributes
     ----------
-    evaluations
-        Of the compared settings.
     limits
         Scans of each characteristic alone, in the study's order.
     points
@@ -48,10 +46,17 @@ class Side:
 
     study: Study
     original: Evaluations
-    evaluations: Evaluations
     limits: list[OneAtATimeScan]
     points: float | None
     no_verdict: str
+
+    @property
+    def original_facts(self) -> JsonObject:
+        return {
+            "outcome": str(self.original.outcome[0]),
+            SAFETY_DEGREE: finite_or_none(self.original.f_safe[0]),
+            "values": {one.characteristic.name: one.characteristic.original for one in self.limits},
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,9 +65,8 @@ class SystemComparison:
 
     Attributes
     ----------
-    settings
-        One row for each setting: its values, its `source` (a key of `SOURCES`), and of solutions `algorithm`, `run`
-        and `solution`.
+    frame
+        One row for each setting that both systems could simulate: see `to_frame`.
     p, a12
         The signed-rank test of the safety degree (of the points, if rated), paired by `test_unit`, and the probability
         that it is greater in A than in B (Vargha and Delaney); None without pairs.
@@ -73,7 +77,7 @@ class SystemComparison:
     a: Side
     b: Side
     unsafe: Unsafe
-    settings: pd.DataFrame
+    frame: pd.DataFrame
     p: float | None
     a12: float | None
     test_unit: str
@@ -96,30 +100,24 @@ class SystemComparison:
         of_b = {one.characteristic.name: one for one in self.b.limits}
         return [(one, of_b[one.characteristic.name]) for one in self.a.limits]
 
-    @cached_property
-    def _frame(self) -> pd.DataFrame:
-        columns: JsonObject = {}
-        for name, side in (("a", self.a), ("b", self.b)):
-            columns[f"outcome_{name}"] = side.evaluations.outcome
-            columns[f"{SAFETY_DEGREE}_{name}"] = side.evaluations.f_safe
-            columns[f"unsafe_{name}"] = self.unsafe.of(side.evaluations)
-        is_valid = self.a.evaluations.valid & self.b.evaluations.valid
-        return self.settings.assign(**columns)[is_valid].reset_index(drop=True)
-
     def to_frame(self) -> pd.DataFrame:
         """One row for each setting that both systems could simulate.
 
-        Columns: those of `settings`, and for each system, with the suffix `_a` or `_b`, `outcome`, `safety_degree` [m,
-        or -m/s] and `unsafe`.
+        Columns: its values, its `source` (a key of `SOURCES`), of solutions `algorithm`, `run` and `solution`, and for
+        each system, with the suffix `_a` or `_b`, `outcome`, `safety_degree` [m, or -m/s] and `unsafe`.
         """
-        return self._frame.copy()
+        return self.frame.copy()
+
+    def _verdicts(self, frame: pd.DataFrame) -> dict[str, pd.Series[bool]]:
+        """The rows of each verdict, in the order of `VERDICTS`."""
+        a, b = frame["unsafe_a"], frame["unsafe_b"]
+        return dict(zip(VERDICTS, (a & ~b, b & ~a, a & b, ~a & ~b), strict=True))
 
     def counts(self, source: str = "") -> dict[str, int]:
         """Number of different settings by verdict, in the order of `VERDICTS`; of one source, or of all."""
-        frame = self._frame[self._frame["source"] == source] if source else self._frame
+        frame = self.frame[self.frame["source"] == source] if source else self.frame
         frame = frame.drop_duplicates(list(self.study.vehicle.characteristics))
-        a, b = frame["unsafe_a"].astype(bool), frame["unsafe_b"].astype(bool)
-        return {name: int(where.sum()) for name, where in zip(VERDICTS, (a & ~b, b & ~a, a & b, ~a & ~b), strict=True)}
+        return {name: int(rows.sum()) for name, rows in self._verdicts(frame).items()}
 
     def to_dict(self) -> JsonObject:
         """The JSON of `compare`."""
@@ -139,7 +137,7 @@ class SystemComparison:
             ],
         }
         if self.original_differences:
-            answer["originals"] = {name: _original_facts(side) for name, side in (("a", self.a), ("b", self.b))}
+            answer["originals"] = {"a": self.a.original_facts, "b": self.b.original_facts}
         if self.a.points is not None:
             answer["rating"] = {"a": self.a.points, "b": self.b.points}
         if self.weather is not None:
@@ -149,14 +147,14 @@ class SystemComparison:
     @property
     def original_differences(self) -> list[str]:
         """How the original vehicles differ: in their values, and in what they do; empty if they do not."""
-        texts = []
-        for a, b in ((one.characteristic, other.characteristic) for one, other in self._limits):
-            if a.original != b.original:
-                texts.append(f"{a.name} {a.text(a.original)} in A, {b.text(b.original)}{b.suffix} in B")
-        a_facts, b_facts = ({**_original_facts(side), "values": None} for side in (self.a, self.b))
-        if a_facts != b_facts:
-            ends = (f"{facts['outcome']}, SD {two_decimals(facts[SAFETY_DEGREE])}" for facts in (a_facts, b_facts))
-            texts.append(" in A, ".join(ends) + " in B")
+        texts = [
+            f"{a.name} {a.text(a.original)} in A, {b.text(b.original)}{b.suffix} in B"
+            for a, b in ((one.characteristic, other.characteristic) for one, other in self._limits)
+            if a.original != b.original
+        ]
+        ends = [(facts["outcome"], facts[SAFETY_DEGREE]) for facts in (self.a.original_facts, self.b.original_facts)]
+        if ends[0] != ends[1]:
+            texts.append(" in A, ".join(f"{outcome}, SD {two_decimals(degree)}" for outcome, degree in ends) + " in B")
         return texts
 
     _repr_html_ = answer_as_html
@@ -185,21 +183,18 @@ class SystemComparison:
                 table.add_row(words, str(number), *map(str, of_source.values()))
         yield table
         yield self._test_in_words()
-        frame = self.limits_frame()
-        limits = WholeTable(
-            frame.columns[0], right=frame.columns[1:], title="Limits of each alone, all others as in the original"
-        )
-        for row in frame.itertuples(index=False):
-            limits.add_row(*map(str, row))
-        yield limits
+        yield _as_table(self.limits_frame(), "Limits of each alone, all others as in the original")
         if self.a.points is not None and self.b.points is not None:
             yield f"Rating of the original vehicles: {self.a.points:.2f} points in A, {self.b.points:.2f} in B."
         if self.weather is not None:
-            yield self._weather_in_words(self.weather)
+            names = self.weather[["setting", "other"]].iloc[0].to_list()
+            heads = [f"{quantity} {name}" for quantity in ("%", "rank", "increase", "decrease") for name in names]
+            frame = self.weather.drop(columns=["setting", "other", "difference"]).set_axis(
+                ["characteristic", *heads], axis=1
+            )
+            yield _as_table(frame, "What critical solutions change, as in tables")
         yield meanings(one.characteristic for one in self.a.limits)
-        failed = len(self.settings) - len(self._frame)
-        failures = (f"{number_of(failed, 'setting')} left out, which one of the systems could not simulate",)
-        yield from (f"note: {remark}." for remark in (*self.remarks, *(failures if failed else ())))
+        yield from (f"note: {remark}." for remark in self.remarks)
 
     def limits_frame(self) -> pd.DataFrame:
         """The limits side by side, as texts."""
@@ -214,53 +209,36 @@ class SystemComparison:
         return pd.DataFrame(rows, columns=["characteristic", "original A", "original B", "safe in A", "safe in B"])
 
     def _test_in_words(self) -> str:
-        quantity = "safety degree" if self.a.points is None else "rating points"
-        pairs = number_of(self.test_size, self.test_unit)
         if self.p is None or self.a12 is None:
             return "There is no pair of results to test."
+        quantity = "Safety degree" if self.a.points is None else "Rating points"
         of_what = ", each with the mean of its solutions" if self.test_unit == "run" else " of the sample"
         return (
-            f"{quantity.capitalize()}, paired over {pairs}{of_what}: p = {self.p:.2g} (signed ranks; "
-            f"{'' if self.p < ALPHA else 'not '}significant at {ALPHA:g}), A12 = {self.a12:.2f} "
+            f"{quantity}, paired over {number_of(self.test_size, self.test_unit)}{of_what}: p = {self.p:.2g} (signed "
+            f"ranks; {'' if self.p < ALPHA else 'not '}significant at {ALPHA:g}), A12 = {self.a12:.2f} "
             f"({magnitude_of(self.a12)}; above 0.5: greater in A)."
         )
 
-    def _weather_in_words(self, weather: pd.DataFrame) -> Table:
-        """The same numbers as `tables --rq weather`."""
-        names = weather[["setting", "other"]].iloc[0].to_list()
-        heads = [f"{quantity} {name}" for quantity in ("%", "rank", "increase", "decrease") for name in names]
-        table = WholeTable("characteristic", right=heads, title="What critical solutions change, as in tables")
-        for row in weather.drop(columns=["setting", "other", "difference"]).itertuples(index=False):
-            table.add_row(str(row[0]), *("-" if pd.isna(value) else f"{value:.4g}" for value in row[1:]))
-        return table
-
     def figure(self) -> Figure:
         """The safety degree of every setting in B over that in A, and each characteristic's limits side by side."""
-        title = f"A: {self.a.study.name}; B: {self.b.study.name} (unsafe: {self.unsafe})"
-        height = 2.4 + 0.28 * len(self.a.limits)
-        figure, ((points, bars),) = new_figure(title, rows=1, columns=2, size=(7.2, height))
-        frame = self._frame
-        a, b = (frame[f"unsafe_{side}"].to_numpy(dtype=bool) for side in "ab")
-        for mask, colour, label in zip(
-            (~a & ~b, a & b, a & ~b, b & ~a),
-            (GREY, SKY_BLUE, BLUE, VERMILION),
-            [VERDICTS[key] for key in ("", "both", "only_a_unsafe", "only_b_unsafe")],
-            strict=True,
-        ):
-            x, y = (frame[f"{SAFETY_DEGREE}_{side}"][mask] for side in "ab")
-            points.scatter(x, y, s=4, color=colour, label=label, linewidths=0, rasterized=True)
+        title, number = f"A: {self.a.study.name}; B: {self.b.study.name} (unsafe: {self.unsafe})", len(self.a.limits)
+        figure, ((points, bars),) = new_figure(title, rows=1, columns=2, size=(7.2, 2.4 + 0.28 * number))
+        verdicts = self._verdicts(self.frame)
+        for key, colour in COLOURS.items():
+            x, y = (self.frame[f"{SAFETY_DEGREE}_{side}"][verdicts[key]] for side in "ab")
+            points.scatter(x, y, s=4, color=colour, label=VERDICTS[key], linewidths=0, rasterized=True)
         points.axline((0, 0), slope=1, color="black", linewidth=0.6)
         points.set(xlabel="safety degree in A [m, below 0: -m/s]", ylabel="safety degree in B [m, below 0: -m/s]")
         points.legend(fontsize=FONT_SIZE - 1, markerscale=2)
-        limits = self._limits[::-1]
-        for row, both in enumerate(limits):
-            lower, width = both[0].characteristic.lower, both[0].characteristic.upper - both[0].characteristic.lower
-            for side, one, colour, shift in zip("AB", both, (BLUE, VERMILION), (0.2, -0.2), strict=True):
-                low, high = ((end - lower) / width for end in one.safe or (lower, lower))
-                label = f"safe in {side}" if row == 0 else ""
-                bars.barh(row + shift, high - low, left=low, height=0.36, color=colour, label=label)
-        names = [escape_dollars(one.characteristic.name) for one, _ in limits]
-        bars.set_yticks(np.arange(len(names)), names)
+        limits, places = self._limits[::-1], np.arange(number)
+        domains = [one.characteristic for one, _ in limits]
+        for k, colour, shift in ((0, BLUE, 0.2), (1, VERMILION, -0.2)):
+            ends = [both[k].safe or (domain.lower, domain.lower) for both, domain in zip(limits, domains, strict=True)]
+            low, high = np.array(
+                [np.subtract(end, one.lower) / (one.upper - one.lower) for end, one in zip(ends, domains, strict=True)]
+            ).T
+            bars.barh(places + shift, high - low, left=low, height=0.36, color=colour, label=f"safe in {'AB'[k]}")
+        bars.set_yticks(places, [escape_dollars(one.name) for one in domains])
         bars.set(xlabel="share of A's domain [-]")
         bars.grid(visible=False, axis="y")
         figure.legend(
@@ -269,10 +247,9 @@ class SystemComparison:
         return figure
 
 
-def _original_facts(side: Side) -> JsonObject:
-    names = side.study.vehicle.characteristics
-    return {
-        "outcome": str(side.original.outcome[0]),
-        SAFETY_DEGREE: finite_or_none(side.original.f_safe[0]),
-        "values": {name: row.original for name, row in names.items()},
-    }
+def _as_table(frame: pd.DataFrame, title: str) -> WholeTable:
+    """A frame as a table for the terminal; a number has four digits, and "-" stands for none."""
+    table = WholeTable(frame.columns[0], right=frame.columns[1:], title=title)
+    for row in frame.itertuples(index=False):
+        table.add_row(*(one if isinstance(one, str) else "-" if pd.isna(one) else f"{one:.4g}" for one in row))
+    return table

@@ -41,19 +41,18 @@ def compare_systems(
         If an original vehicle cannot be simulated.
     """
     subjects, evaluators = (subject, other), (evaluator, evaluator.for_study(study_in(other)))
-    sets = [one.characteristics for one in evaluators]
-    names = list(sets[0].names)
     _require_same_characteristics(*(one.study for one in evaluators))
-    orders = [[names.index(name) for name in one.names] for one in sets]
+    names = list(evaluator.characteristics.names)
+    orders = [[names.index(name) for name in one.characteristics.names] for one in evaluators]
     lower, upper = _common_domain(evaluators, orders)
-    solutions = [
-        _solutions_of(source, one, names) for source, one in zip("ab", subjects, strict=True) if isinstance(one, Case)
-    ]
     sample = pd.DataFrame(_common_sample(evaluators, orders, lower, upper, options.samples), columns=names)
-    settings = pd.concat([*solutions, sample.assign(source=SAMPLE)], ignore_index=True)
-    outside = ~((settings[names] >= lower) & (settings[names] <= upper)).all(axis=1)
-    settings = settings[~outside].reset_index(drop=True)
-    values = settings[names].to_numpy(dtype=float)
+    settings = [
+        _solutions_of(side, one, names) for side, one in zip("ab", subjects, strict=True) if isinstance(one, Case)
+    ]
+    frame = pd.concat([*settings, sample.assign(source=SAMPLE)], ignore_index=True)
+    inside = ((frame[names] >= lower) & (frame[names] <= upper)).all(axis=1)
+    outside, frame = int(np.count_nonzero(~inside)), frame[inside].reset_index(drop=True)
+    values = frame[names].to_numpy(dtype=float)
     evaluations = [
         one.evaluate(values[:, order], f"settings in {side}")
         for one, order, side in zip(evaluators, orders, "AB", strict=True)
@@ -61,39 +60,47 @@ def compare_systems(
     originals = [one.evaluate_original() for one in evaluators]
     unsafe = _criterion(options.unsafe, evaluators, evaluations, originals)
     both_rated = all(is_rated(one.study) for one in evaluators)
-    p, a12, unit, number = _test(settings, evaluations, RATING_POINTS.name if both_rated else SAFETY_DEGREE)
-    columns = list(range(len(names)))
+    is_valid = np.logical_and.reduce([one.valid for one in evaluations])
+    for side, one in zip("ab", evaluations, strict=True):
+        frame[f"outcome_{side}"] = one.outcome
+        frame[f"{SAFETY_DEGREE}_{side}"] = one.f_safe
+        frame[f"unsafe_{side}"] = unsafe.of(one)
+    quantities = [one.column(RATING_POINTS.name if both_rated else SAFETY_DEGREE) for one in evaluations]
+    p, a12, unit, number = _test(frame.assign(**dict(zip("ab", quantities, strict=True)))[is_valid])
     sides = [
         Side(
             study=one.study,
             original=original,
-            evaluations=evaluated,
-            limits=scan(one, columns, unsafe),
+            limits=scan(one, range(len(names)), unsafe),
             points=rate(one, {}).original.points if both_rated else None,
             no_verdict=one.no_verdict,
         )
-        for one, original, evaluated in zip(evaluators, originals, evaluations, strict=True)
+        for one, original in zip(evaluators, originals, strict=True)
     ]
-    left_out = number_of(int(outside.sum()), "solution")
+    remarks = {
+        f"{number_of(outside, 'solution')} outside the other system's domain left out": outside,
+        f"{number_of(failed := int(np.count_nonzero(~is_valid)), 'setting')} left out, which one of the systems could "
+        "not simulate": failed,
+    }
     return SystemComparison(
         a=sides[0],
         b=sides[1],
         unsafe=unsafe,
-        settings=settings,
+        frame=frame[is_valid].reset_index(drop=True),
         p=p,
         a12=a12,
         test_unit=unit,
         test_size=number,
         weather=_weather_table(subjects),
-        remarks=(f"{left_out} outside the other system's domain left out",) if outside.any() else (),
+        remarks=tuple(remark for remark, count in remarks.items() if count),
     )
 
 
 def _common_domain(evaluators: tuple[Evaluator, Evaluator], orders: list[list[int]]) -> tuple[FloatArray, FloatArray]:
     """The ends of the domain that both systems have, in the order of the first one's characteristics."""
-    pairs = [(one.characteristics, order) for one, order in zip(evaluators, orders, strict=True)]
-    lower = np.max([one.lower[np.argsort(order)] for one, order in pairs], axis=0)
-    upper = np.min([one.upper[np.argsort(order)] for one, order in pairs], axis=0)
+    sets = [(one.characteristics, np.argsort(order)) for one, order in zip(evaluators, orders, strict=True)]
+    lower = np.max([one.lower[order] for one, order in sets], axis=0)
+    upper = np.min([one.upper[order] for one, order in sets], axis=0)
     if (lower > upper).any():
         name = evaluators[0].characteristics.names[int(np.argmax(lower > upper))]
         raise InputError(
@@ -159,22 +166,17 @@ def _criterion(
     return Unsafe.default_among(Evaluations.concatenate([*evaluations, originals[1]]), original)
 
 
-def _test(
-    settings: pd.DataFrame, evaluations: list[Evaluations], column: str
-) -> tuple[float | None, float | None, str, int]:
-    """The paired test and A12 of a metric, with the paired unit and its number: each run's mean over its solutions, or
-    each setting of the sample if there are fewer runs than the test needs.
+def _test(frame: pd.DataFrame) -> tuple[float | None, float | None, str, int]:
+    """The paired test and A12 of the columns `a` and `b`, with the paired unit and its number: each run's mean over its
+    solutions, or each setting of the sample if there are fewer runs than the test needs.
     """
-    frame = settings[[name for name in RUN_COLUMNS if name in settings]].assign(
-        **{side: one.column(column) for side, one in zip("ab", evaluations, strict=True)}
-    )
-    frame = frame[np.logical_and.reduce([one.valid for one in evaluations])].dropna(subset=["a", "b"])
+    frame = frame.dropna(subset=["a", "b"])
     pairs, unit = frame[frame["source"] == SAMPLE][["a", "b"]], "setting"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[["a", "b"]].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs, unit = means, "run"
-    a, b = pairs["a"].to_numpy(dtype=float), pairs["b"].to_numpy(dtype=float)
+    a, b = pairs.to_numpy(dtype=float).T
     return signed_rank_test(a - b, 0.0).p_value, compare_samples(a, b).effect_size, unit, len(pairs)
 
 

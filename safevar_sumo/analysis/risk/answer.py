@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -28,17 +27,22 @@ if TYPE_CHECKING:
 
 FLEET_VEHICLES = 1000
 """Number of vehicles of the fleet in examples."""
-INDICES = ("first_order", "total")
-"""Sobol indices."""
-SHARE = ("share",)
-"""Shapley effects as shares of the variance."""
+SOBOL, SHAPLEY = ("first_order", "total"), ("share",)
+"""Columns of Sobol indices, and of Shapley effects as shares of the variance."""
+UNSAFE = "unsafe"
+"""Name of the second output, beside the safety degree."""
 BARS = {
     "total": ("total: with all others", GREY, 0.2),
     "first_order": ("alone", BLUE, -0.2),
     "share": ("Shapley effect", BLUE, 0.0),
 }
 """Label, colour and place of each index in the figure."""
-ERROR_STYLE = {"elinewidth": 0.8, "ecolor": "black"}
+
+
+def effect_columns(indices: tuple[str, ...]) -> list[str]:
+    """The columns of `Risk.effects` for Sobol indices or Shapley effects."""
+    first = ["output", "characteristic", *(["effect"] if indices == SHAPLEY else [])]
+    return [*first, *(f"{name}{end}" for name in indices for end in ("", "_lower", "_upper"))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +51,10 @@ class Estimate:
 
     Attributes
     ----------
-    failures, errors
-        Number of unsafe vehicles, and of vehicles that could not be simulated.
+    samples, failures, errors
+        Number of simulated vehicles, of unsafe ones among them, and of vehicles that could not be simulated.
     method
         "monte_carlo", "subset_simulation" or "cross_entropy".
-    simulations
-        Number of simulations for the estimate, without the simulations for the sensitivities.
     coefficient_of_variation
         Standard error divided by the probability; NaN if no vehicle was unsafe.
     design_point
@@ -64,9 +66,9 @@ class Estimate:
     probability: float
     coefficient_of_variation: float
     interval: Interval
+    samples: int
     failures: int
     errors: int
-    simulations: int
     method: str
     design_point: dict[str, float] | None = None
     remark: str = ""
@@ -74,69 +76,57 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Risk(Estimate):
-    """Probability of an unsafe outcome, and Sobol indices.
+    """Probability of an unsafe outcome, and what decides it.
 
     Attributes
     ----------
-    samples
-        Number of simulated vehicles.
-    sensitivity, sensitivity_of_unsafe
-        The two frames of `compute_sensitivities`; None if characteristics are correlated or bound by constraints,
-        because Sobol indices are then undefined.
-    shapley, shapley_of_unsafe
-        In that case the two frames of `compute_shapley_effects`, unless a method for rare failures is required.
+    simulations
+        Number of simulations for the estimate, without those for the effects.
+    effects
+        Sobol indices or, if characteristics are correlated or bound by constraints, Shapley effects: see `to_frame`.
     """
 
     study: Study
     unsafe: Unsafe
-    samples: int
+    simulations: int
     confidence: float
-    sensitivity: pd.DataFrame | None = None
-    sensitivity_of_unsafe: pd.DataFrame | None = None
-    shapley: pd.DataFrame | None = None
-    shapley_of_unsafe: pd.DataFrame | None = None
+    effects: pd.DataFrame
     no_verdict: str = ""
-
-    @property
-    def is_share_of_domain(self) -> bool:
-        """Whether the probability is a share of the domain, because the study does not say how vehicles vary."""
-        return not self.study.variation
 
     def of_fleet(self, vehicles: int) -> float:
         """Probability that at least one of N = `vehicles` vehicles that vary independently is unsafe, 1 - (1 - p)^N."""
         return float(-np.expm1(vehicles * np.log1p(-self.probability))) if self.probability < 1 else 1.0
 
     @property
-    def _what_decides(self) -> tuple[tuple[str, ...], list[pd.DataFrame]]:
-        """The names of the indices, and the two frames that hold them; no frame without indices."""
-        of_sobol, of_shapley = (self.sensitivity, self.sensitivity_of_unsafe), (self.shapley, self.shapley_of_unsafe)
-        indices, both = (INDICES, of_sobol) if self.shapley is None else (SHARE, of_shapley)
-        return indices, [frame for frame in both if frame is not None]
+    def _indices(self) -> tuple[str, ...]:
+        """The columns with the indices of a characteristic; the last one ranks the characteristics."""
+        return SHAPLEY if "share" in self.effects else SOBOL
+
+    def _effects_on(self, output: str) -> pd.DataFrame:
+        return self.effects[self.effects["output"] == output].set_index("characteristic")
 
     def to_dict(self) -> JsonObject:
-        """The JSON of `risk`."""
-        rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")
+        """The JSON of `risk`; `shapley` only where Sobol indices are undefined."""
+        numbers = [*(["effect"] if self._indices == SHAPLEY else []), *self._indices]
+        rows = [
+            {
+                "characteristic": name,
+                **{number: finite_or_none(row[number]) for number in numbers},
+                **{
+                    f"{index}_interval": [finite_or_none(row[f"{index}_{end}"]) for end in ("lower", "upper")]
+                    for index in self._indices
+                },
+            }
+            for name, row in self._effects_on(SAFETY_DEGREE).iterrows()
+        ]
         return {
             "study": self.study.name,
             **driven_entry(self.no_verdict),
             "unsafe": str(self.unsafe),
-            "samples": self.samples,
-            "failures": self.failures,
-            "probability": self.probability,
+            **{name: getattr(self, name) for name in ("samples", "failures", "probability")},
             "interval": list(self.interval),
             "confidence": self.confidence,
-            "sensitivity": [
-                {
-                    "characteristic": row["characteristic"],
-                    **{name: finite_or_none(row[name]) for name in INDICES},
-                    **{
-                        f"{name}_interval": [finite_or_none(row[f"{name}_{end}"]) for end in ("lower", "upper")]
-                        for name in INDICES
-                    },
-                }
-                for row in rows
-            ],
-            **self._shapley_entry(),
+            **({"sensitivity": rows} if self._indices == SOBOL else {"sensitivity": [], "shapley": rows}),
             "method": self.method,
             "simulations": self.simulations,
             "coefficient_of_variation": finite_or_none(self.coefficient_of_variation),
@@ -144,36 +134,16 @@ class Risk(Estimate):
             "remark": self.remark,
         }
 
-    def _shapley_entry(self) -> JsonObject:
-        """The entry `shapley` of the JSON, only where Sobol indices are undefined."""
-        if self.shapley is None:
-            return {}
-        rows = [
-            {
-                "characteristic": row["characteristic"],
-                "effect": finite_or_none(row["effect"]),
-                "share": finite_or_none(row["share"]),
-                "share_interval": [finite_or_none(row[f"share_{end}"]) for end in ("lower", "upper")],
-            }
-            for row in self.shapley.to_dict("records")
-        ]
-        return {"shapley": rows}
-
     def to_frame(self) -> pd.DataFrame:
-        """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if
-        there is none.
+        """What decides: one row for each output (safety_degree or unsafe) and characteristic; empty if a method for
+        rare failures was required.
 
-        Columns: `output` (safety_degree or unsafe), and the columns of `compute_sensitivities` or, if Sobol indices
-        are undefined, of `compute_shapley_effects`.
+        Columns: `output`, `characteristic`, and Sobol indices, `first_order` and `total`, or Shapley effects, `effect`
+        [the output's unit squared; they sum to its variance] and `share` [of the variance]. Each index has the ends of
+        its interval, such as `total_lower` and `total_upper`. NaN where nothing varies, or too few settings are unsafe
+        (or safe).
         """
-        indices, frames = self._what_decides
-        columns = [
-            *("output", "characteristic", *(["effect"] if indices == SHARE else [])),
-            *(f"{name}{end}" for name in indices for end in ("", "_lower", "_upper")),
-        ]
-        outputs = (SAFETY_DEGREE, "unsafe")
-        tables = [frame.assign(output=name) for name, frame in zip(outputs, frames, strict=False)]
-        return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
+        return self.effects.copy()
 
     _repr_html_ = answer_as_html
 
@@ -183,26 +153,21 @@ class Risk(Estimate):
 
     def sentences(self) -> Iterator[str | Table]:
         """The probability with its interval, how vehicles vary, and which characteristics decide."""
-        low, high = self.interval
-        characteristics = CharacteristicSet.of(self.study)
+        (low, high), percent = self.interval, f"{100 * self.confidence:g} %"
+        characteristics, is_share = CharacteristicSet.of(self.study), not self.study.variation
         sampling = "" if self.method == "monte_carlo" else f", drawn by {self.method.replace('_', ' ')}"
         yield f"Unsafe: {self.unsafe.description}. {self.failures} of {self.samples} vehicles{sampling}."
-        label = "Share of the domain that is unsafe:" if self.is_share_of_domain else "Probability"
-        yield (
-            f"{label} {self.probability:.4g}, with {100 * self.confidence:g} % confidence from {low:.4g} to {high:.4g}."
-        )
+        label = "Share of the domain that is unsafe:" if is_share else "Probability"
+        yield f"{label} {self.probability:.4g}, with {percent} confidence from {low:.4g} to {high:.4g}."
         if self.remark:
             yield f"note: {self.remark}."
-        if self.design_point is not None:
-            values = ", ".join(
-                f"{one.name} = {one.text(self.design_point[one.name])}{one.suffix}" for one in characteristics
-            )
+        if point := self.design_point:
+            values = ", ".join(f"{one.name} = {one.text(point[one.name])}{one.suffix}" for one in characteristics)
             yield f"The most probable failure: {values}."
-        if self.is_share_of_domain:
+        if is_share:
             yield (
-                "warning: this is not a probability in the field: the study has no [variation] table for how "
-                "real vehicles "
-                "vary."
+                "warning: this is not a probability in the field: the study has no [variation] table for how real "
+                "vehicles vary."
             )
         elif 0 < self.probability < RARE_BELOW:
             of_fleet = self.of_fleet(FLEET_VEHICLES)
@@ -212,23 +177,21 @@ class Risk(Estimate):
             )
         yield _how_vehicles_vary(self.study)
         yield from constraints_in_words(self.study)
-        indices, frames = self._what_decides
-        if not frames:
+        if self.effects.empty:
             return
-        heads = ("SD alone", "SD in all", "unsafe alone", "unsafe in all") if indices == INDICES else ("SD", "unsafe")
+        is_sobol, outputs = self._indices == SOBOL, [self._effects_on(name) for name in (SAFETY_DEGREE, UNSAFE)]
+        heads = ("SD alone", "SD in all", "unsafe alone", "unsafe in all") if is_sobol else ("SD", "unsafe")
         table = WholeTable("characteristic", right=heads, title="What decides: share of the variance")
-        outputs = [frame.set_index("characteristic") for frame in frames]
-        for name in outputs[0].sort_values(indices[-1], ascending=False, kind="stable").index:
+        for name in outputs[0].sort_values(self._indices[-1], ascending=False, kind="stable").index:
             rows = [output.loc[name] for output in outputs]
-            table.add_row(name, *(_index_in_words(row, index) for row in rows for index in indices))
+            table.add_row(name, *(_index_in_words(row, index) for row in rows for index in self._indices))
         yield table
-        if outputs[1][indices[-1]].isna().all():
+        if outputs[1][self._indices[-1]].isna().all():
             yield "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe."
         yield meanings(characteristics)
-        kind = "Sobol indices, first order and total" if indices == INDICES else "Shapley effects, which sum to 1"
         yield (
-            f"{kind}, with half of their {100 * self.confidence:g} % intervals: estimates, "
-            "which may exceed 1 or fall below 0 by their error."
+            f"{'Sobol indices, first order and total' if is_sobol else 'Shapley effects, which sum to 1'}, with half "
+            f"of their {percent} intervals: estimates, which may exceed 1 or fall below 0 by their error."
         )
 
     def figure(self) -> Figure:
@@ -240,25 +203,24 @@ class Risk(Estimate):
         InputError
             If there are none, because a method for rare failures was required.
         """
-        indices, both = self._what_decides
-        if not both:
+        if self.effects.empty:
             raise InputError(
                 "method", "there are no sensitivity indices with a method for rare failures", "auto or monte_carlo"
             )
-        order = both[0].sort_values(indices[-1], kind="stable")["characteristic"]
+        order = self._effects_on(SAFETY_DEGREE).sort_values(self._indices[-1], kind="stable").index
         title = f"{self.study.name}: what decides ({100 * self.confidence:g} % intervals)"
         figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(order), 4)), sharey=True)
-        frames = dict(zip(("safety degree", f"unsafe ({self.unsafe})"), both, strict=True))
-        names = [escape_dollars(name) for name in order]
-        for axis, (output, frame) in zip(axes, frames.items(), strict=True):
-            rows = frame.set_index("characteristic").loc[order]
-            for index in reversed(indices):
+        titles = {SAFETY_DEGREE: "safety degree", UNSAFE: f"unsafe ({self.unsafe})"}
+        for axis, (output, subtitle) in zip(axes, titles.items(), strict=True):
+            rows = self._effects_on(output).loc[order]
+            for index in reversed(self._indices):
                 label, colour, shift = BARS[index]
                 error = (rows[f"{index}_upper"] - rows[index]).clip(lower=0)
-                places = np.arange(len(names)) + shift
-                axis.barh(places, rows[index], height=0.36, color=colour, label=label, xerr=error, error_kw=ERROR_STYLE)
-            axis.set_yticks(np.arange(len(names)), names)
-            axis.set_title(escape_dollars(output), fontsize=FONT_SIZE)
+                style = {"elinewidth": 0.8, "ecolor": "black"}
+                places = np.arange(len(order)) + shift
+                axis.barh(places, rows[index], height=0.36, color=colour, label=label, xerr=error, error_kw=style)
+            axis.set_yticks(np.arange(len(order)), map(escape_dollars, order))
+            axis.set_title(escape_dollars(subtitle), fontsize=FONT_SIZE)
             axis.set(xlabel="share of the variance [-]", xlim=(0, 1))
             axis.grid(visible=False, axis="y")
         handles, labels = axes[0].get_legend_handles_labels()
@@ -267,9 +229,9 @@ class Risk(Estimate):
 
 
 def _index_in_words(row: pd.Series[float], index: str) -> str:
-    """A Sobol index with half of its interval."""
+    """An index with half of its interval."""
     half = (row[f"{index}_upper"] - row[f"{index}_lower"]) / 2
-    return "-" if math.isnan(row[index]) else f"{row[index]:.2f} ±{half:.2f}"
+    return "-" if pd.isna(row[index]) else f"{row[index]:.2f} ±{half:.2f}"
 
 
 def _how_vehicles_vary(study: Study) -> str:

@@ -54,8 +54,6 @@ PLATEAU = "the response is a plateau before failures, which methods for rare fai
 SEARCH_SETTINGS = 100
 """Number of settings around the design point in each round of its search."""
 SEARCH_ROUNDS = 4
-SettingsFunction = Callable[[FloatArray], FloatArray]
-"""Turns points of standard normal space into settings."""
 
 
 class RareMethodError(Exception):
@@ -63,32 +61,30 @@ class RareMethodError(Exception):
 
 
 class Response:
-    """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe; counts simulations,
-    and keeps the failure nearest to the origin, shape (1, n), or (0, n) if there is none yet.
+    """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe.
+
+    It counts `samples` that could be simulated, `failures` among them and `errors`, and keeps the failure nearest to
+    the origin, shape (1, n), or (0, n) if there is none yet. `settings_of` turns points into settings.
     """
 
-    def __init__(self, evaluator: Evaluator, settings_of: SettingsFunction, unsafe: Unsafe) -> None:
-        self._evaluator = evaluator
-        self._unsafe = unsafe
-        self.settings_of = settings_of
-        self.names = evaluator.characteristics.names
+    def __init__(self, evaluator: Evaluator, settings_of: Callable[[FloatArray], FloatArray], unsafe: Unsafe) -> None:
+        self.evaluator, self.settings_of, self._unsafe = evaluator, settings_of, unsafe
         self.dimensions = len(evaluator.characteristics)
-        self.simulations = self.errors = self.failure_count = 0
+        self.samples = self.failures = self.errors = 0
         self.nearest_failure = np.zeros((0, self.dimensions))
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
         array = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
-        return self.record(array, self._evaluator.evaluate(self.settings_of(array), "rare failures"))
+        return self.record(array, self.evaluator.evaluate(self.settings_of(array), "rare failures"))
 
     def record(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
         """Count known evaluations of points, remember the nearest failure among the points, and return the response."""
-        is_unsafe = self._unsafe.of(evaluations)
-        margin = self._unsafe.margin(evaluations)
+        is_unsafe, margin = self._unsafe.of(evaluations), self._unsafe.margin(evaluations)
         response = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE_RESPONSE)
-        self.simulations += len(points)
+        self.samples += int(np.count_nonzero(evaluations.valid))
         self.errors += int(np.count_nonzero(~evaluations.valid))
-        self.failure_count += int(np.count_nonzero(is_unsafe))
+        self.failures += int(np.count_nonzero(is_unsafe))
         failures = np.concatenate([self.nearest_failure, points[is_unsafe]])
         self.nearest_failure = failures[np.argsort(np.linalg.norm(failures, axis=1), kind="stable")[:1]]
         return np.where(is_unsafe, np.minimum(response, -MIN_RESPONSE), np.maximum(response, MIN_RESPONSE))
@@ -119,13 +115,8 @@ def is_plateau(responses: FloatArray) -> bool:
     return bool(np.count_nonzero(lowest == lowest[-1]) >= PLATEAU_SHARE * len(lowest) or lowest[-1] >= SAFE_RESPONSE)
 
 
-def estimate_rare(response: Response, method: str, confidence: float, seed: int) -> Estimate:
-    """Estimate the probability that a response is below 0.
-
-    Parameters
-    ----------
-    method
-        "subset_simulation" or "cross_entropy".
+def estimate_rare(response: Response, method: str, confidence: float) -> Estimate:
+    """Estimate the probability that a response is below 0, by "subset_simulation" or "cross_entropy".
 
     Raises
     ------
@@ -133,21 +124,17 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
         If the response does not show which vehicles are nearer to failure, or cross-entropy sampling loses all
         failures.
     """
-    estimate_once = _run_subset_simulation if method == "subset_simulation" else _run_cross_entropy
-    estimates: list[tuple[float, float]] = []
-    while len(estimates) < REPEATS or (
-        len(estimates) < VERY_RARE_REPEATS
-        and method == "subset_simulation"
-        and np.mean([probability for probability, _ in estimates[:REPEATS]]) < VERY_RARE_BELOW
-    ):
+    seed, estimates = response.evaluator.study.search.seed, list[tuple[float, float]]()
+    repeats, is_subset = REPEATS, method == "subset_simulation"
+    while len(estimates) < repeats:
+        estimate_once = _run_subset_simulation if is_subset else _run_cross_entropy
         estimates.append(estimate_once(response, (seed + 7919 * len(estimates)) % 2**31))
+        if len(estimates) == REPEATS and is_subset and np.mean(estimates, axis=0)[0] < VERY_RARE_BELOW:
+            repeats = VERY_RARE_REPEATS
     probabilities, coefficients = np.array(estimates).T
     mean = float(np.mean(probabilities))
-    repeats = len(estimates)
-    failures, errors = response.failure_count, response.errors  # without those around the design point
-    coefficient_of_variation = math.nan
-    interval = (0.0, MIN_PROBABILITY)
-    design_point = None
+    failures, errors = response.failures, response.errors  # without those around the design point
+    coefficient_of_variation, interval, design_point = math.nan, (0.0, MIN_PROBABILITY), None
     remark = "no failure was found: either there is none, or the response does not lead to it"
     if mean > 0:
         observed = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
@@ -158,14 +145,14 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
         interval = (mean / factor, min(mean * factor, 1.0))
         remark = ""
         (setting,) = response.settings_of(_find_design_point(response, np.random.default_rng(seed))).tolist()
-        design_point = dict(zip(response.names, setting, strict=True))
+        design_point = dict(zip(response.evaluator.characteristics.names, setting, strict=True))
     return Estimate(
         probability=max(mean, 0.0),
         coefficient_of_variation=coefficient_of_variation,
         interval=interval,
+        samples=response.samples + response.errors - errors,
         failures=failures,
         errors=errors,
-        simulations=response.simulations,
         method=method,
         design_point=design_point,
         remark=remark,

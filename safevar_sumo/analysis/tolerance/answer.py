@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.table import Table
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.answer import situation_in_words
 from safevar_sumo.analysis.figures import (
     BLUE,
@@ -20,8 +19,10 @@ from safevar_sumo.analysis.figures import (
     escape_dollars,
     new_panels,
 )
+from safevar_sumo.analysis.tolerance.boxes import SafeBox
+from safevar_sumo.analysis.tolerance.joint import JointLimits
 from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
-from safevar_sumo.analysis.tolerance.sheet import Ends, Failure, LimitRow, LimitsSheet
+from safevar_sumo.analysis.tolerance.sheet import LimitRow, LimitsSheet, describe_failure
 from safevar_sumo.analysis.tolerance.trade import Trade
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
@@ -31,34 +32,13 @@ from safevar_sumo.study import SAFETY_DEGREE, Limit, Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, answer_as_html, constraints_in_words, meanings
-from safevar_sumo.vehicles import Characteristic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from safevar_sumo.analysis.tolerance.joint import JointLimits
-
 MAX_PAIRS = 12
 """Maximum number of pairs in the table."""
-
-
-class SafeBox(NamedTuple):
-    """A box around the original, `factor` times as wide as the domain; no setting of a random sample in it is unsafe.
-
-    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed`
-    of the `samples` settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested.
-    Only `characteristics` vary; the others keep their original values. If no box is safe, because the original or a
-    setting arbitrarily near to it is unsafe, `factor` is 0 and the bound is 1.
-    """
-
-    factor: float = 0.0
-    confidence: float = CONFIDENCE
-    samples: int = 0
-    failed: int = 0
-    attempts: int = 0
-    unsafe_at_most: float = 1.0
-    characteristics: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,26 +66,18 @@ class Tolerance:
     @property
     def sheet(self) -> LimitsSheet:
         """The limits sheet."""
-        rows, original = [], self.original.settings
-        points = assemble(self.study).points
+        rows, factor, points = [], self.joint.factor, assemble(self.study).points
         for scan, one in ((scan, scan.characteristic) for scan in self.alone):
-            together: Ends = (None, None)
-            if self.together is not None:
-                together = self.together.box[one.name]
-            elif self.joint.factor:
-                below, above = one.original - one.lower, one.upper - one.original
-                together = one.original - self.joint.factor * below, one.original + self.joint.factor * above
+            widths = one.original - one.lower, one.upper - one.original
             run = self.first_failures.get(one.name)
+            together = (one.original - factor * widths[0], one.original + factor * widths[1]) if factor else None
             rows.append(
                 LimitRow(
-                    characteristic=one,
-                    alone=scan.safe or (None, None),
-                    together=together,
+                    scan=scan,
+                    together=together if self.together is None else self.together.box[one.name],
                     specified=self.limits.get(one.name),
                     together_is_safe=self.together is None or self.together.kept,
-                    first_failure=None
-                    if run is None
-                    else Failure.of(run, points, self.unsafe, alone=int((run.settings != original).sum()) == 1),
+                    first_failure=None if run is None else describe_failure(run, points, self.unsafe),
                 )
             )
         return LimitsSheet(self.study.name, rows)
@@ -128,13 +100,9 @@ class Tolerance:
             return "The original vehicle itself is unsafe."
         if names := [scan.characteristic.name for scan in self.alone if scan.unsafe]:
             return f"Unsafe alone, all others as in the original: {', '.join(names)}."
-        if self.unsafe_pairs:
-            pairs = ", ".join(" with ".join(pair.characteristics) for pair in self.unsafe_pairs)
-            return (
-                f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of "
-                f"{len(self.pairs or [])} pairs: "
-                f"{pairs}."
-            )
+        if pairs := [" with ".join(pair.characteristics) for pair in self.unsafe_pairs]:
+            number = f"{len(pairs)} of {len(self.pairs or [])} pairs"
+            return f"No single characteristic makes it unsafe, but {number}: {', '.join(pairs)}."
         return f"No single characteristic {'makes' if self.pairs is None else 'and no pair makes'} it unsafe."
 
     def to_frame(self) -> pd.DataFrame:
@@ -143,30 +111,20 @@ class Tolerance:
         Columns: `characteristic`, `unit`, `original`, `lower` and `upper` of the domain, `safe_from`, `safe_to` [unit],
         `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe` and `not_simulated`, lists of intervals.
         """
-        return pd.DataFrame(
-            [
-                {
-                    **{name: getattr(one, name) for name in ("unit", "original", "lower", "upper")},
-                    **dict(zip(("safe_from", "safe_to"), scan.safe or (None, None), strict=True)),
-                    **dict(zip(("margin_from", "margin_to"), scan.margins, strict=True)),
-                    "unsafe": scan.unsafe,
-                    "not_simulated": scan.not_simulated,
-                }
-                for scan, one in ((scan, scan.characteristic) for scan in self.alone)
-            ],
-            index=pd.Index([scan.characteristic.name for scan in self.alone], name="characteristic"),
-        ).reset_index()
+        columns = ["characteristic", "unit", "original", "lower", "upper"]
+        columns += ["safe_from", "safe_to", "margin_from", "margin_to", "unsafe", "not_simulated"]
+        rows = [
+            (
+                *(one.name, one.unit, one.original, one.lower, one.upper),
+                *(*(scan.safe or (None, None)), *scan.margins, scan.unsafe, scan.intervals("not_simulated")),
+            )
+            for scan, one in ((scan, scan.characteristic) for scan in self.alone)
+        ]
+        return pd.DataFrame(rows, columns=columns)
 
     def to_dict(self) -> JsonObject | list[JsonObject]:
         """The JSON of `tolerance`; with limits a list that ends with the limits' records, and at last the trade-off."""
-        record, trade = self._to_record(), {} if self.trade is None else {"trade": self.trade.to_dict()}
-        if not self.limits:
-            return {**record, **trade}
-        joint = {"joint": None} if self.together is None else self.together.to_dict()
-        return [record, *self.sheet.to_dict(), joint, *([trade] if trade else [])]
-
-    def _to_record(self) -> JsonObject:
-        return {
+        record = {
             "study": self.study.name,
             **driven_entry(self.no_verdict),
             "unsafe": str(self.unsafe),
@@ -174,6 +132,11 @@ class Tolerance:
             "pairs": [pair._asdict() for pair in self.pairs or []],
             "joint": self.joint._asdict(),
         }
+        trade = {} if self.trade is None else {"trade": self.trade.to_dict()}
+        if not self.limits:
+            return {**record, **trade}
+        joint = {"joint": None} if self.together is None else self.together.to_dict()
+        return [record, *(row.to_dict() for row in self.sheet.rows), joint, *([trade] if trade else [])]
 
     _repr_html_ = answer_as_html
 
@@ -190,12 +153,19 @@ class Tolerance:
         yield "* the end of the domain: values beyond it were not simulated."
         yield meanings(scan.characteristic for scan in self.alone)
         yield from _across_fits_in_words(self.alone)
+        yield from self._pairs_in_words()
+        yield from self.sheet.parts()
+        if is_rated(self.study):
+            yield from map(_losses_in_words, self.alone)
+        else:
+            yield self._box_in_words() if self.together is None else self.together.in_words
+        if self.trade is not None:
+            yield self.trade.table() if self.trade.curve else f"{self.trade.title}."
+
+    def _pairs_in_words(self) -> Iterator[str | Table]:
         worst = sorted(self.unsafe_pairs, key=lambda pair: -pair.unsafe_share)
-        table = WholeTable(
-            "pair",
-            right=("unsafe share", "nearest unsafe setting"),
-            title=f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}",
-        )
+        title = f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}"
+        table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"), title=title)
         for pair in worst[:MAX_PAIRS]:
             nearest = ", ".join(f"{name} {value:.5g}" for name, value in (pair.nearest or {}).items())
             lost = pair.not_simulated_share
@@ -204,46 +174,20 @@ class Tolerance:
         yield table
         if len(worst) > MAX_PAIRS:
             yield f"... and {len(worst) - MAX_PAIRS} more (--json has all)."
-        yield self.sheet.table()
-        yield "\n".join(self.sheet.sentences())
-        if is_rated(self.study):
-            yield from map(_losses_in_words, self.alone)
-        else:
-            yield self._box_in_words() if self.together is None else self._together_in_words()
-        if self.trade is not None:
-            yield self.trade.table() if self.trade.curve else f"{self.trade.title}."
 
     def _box_in_words(self) -> str:
-        box = self.joint
-        subset = len(box.characteristics) < len(self.study.vehicle.characteristics)
-        subject = (
-            f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
-        )
+        box, subject = self.joint, "All together"
+        if len(box.characteristics) < len(self.study.vehicle.characteristics):
+            subject = f"{', '.join(box.characteristics)} together, the others as in the original"
         if not box.factor:
             return f"{subject}: no box around the original is safe."
-        failed = (
-            f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
-        )
-        which = f"all settings in the box{' that satisfy the constraints' if self.study.constraints else ''}"
+        failed = f", and {box.failed} could not be simulated" if box.failed else ""
+        which = f"settings in the box{' that satisfy the constraints' if self.study.constraints else ''} are unsafe"
         return (
             f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its "
             f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
-            f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of {which} are unsafe"
-            f"{' or cannot be simulated' if box.failed else ''}."
-        )
-
-    def _together_in_words(self) -> str:
-        assert self.together is not None
-        box = self.together
-        confidence = f"with {100 * CONFIDENCE:.0f} % confidence at most {100 * box.at_most:.2f} %"
-        if not box.kept:
-            return (
-                f"The limits are not kept: {box.unsafe} of {box.samples} settings drawn at random within them, all "
-                f"other characteristics as in the original, are unsafe; {confidence} of all are."
-            )
-        return (
-            "With the specified limits, the limits with all others at theirs are the largest box by volume that was "
-            f"found. None of {box.samples} settings drawn at random in it is unsafe; {confidence} of all are."
+            f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of all {which}"
+            f"{' or cannot be simulated' if failed else ''}."
         )
 
     def figure(self) -> Figure:
@@ -265,33 +209,23 @@ class Tolerance:
         return figure
 
 
-def _scan_table(scans: list[OneAtATimeScan]) -> WholeTable:
+def _scan_table(scans: Sequence[OneAtATimeScan]) -> WholeTable:
     states = {"unsafe": "unsafe", "not_simulated": "could not be simulated", "infeasible": "violates a constraint"}
     shown = [state for state in states if state == "unsafe" or any(scan.intervals(state) for scan in scans)]
-    table = WholeTable(
-        "characteristic",
-        title="Each alone, all others as in the original",
-        right=("original", "safe from", "to", "SD at the ends", *map(states.__getitem__, shown)),
-    )
-    for scan in scans:
-        one = scan.characteristic
-        limits = ["nowhere"] * 2 if scan.safe is None else [_limit_in_words(one, value) for value in scan.safe]
-        margins = "-" if scan.safe is None else " / ".join(map(two_decimals, scan.margins))
-        intervals = (", ".join(f"{low:.5g} to {high:.5g}" for low, high in scan.intervals(state)) for state in shown)
-        table.add_row(
-            f"{one.name} [{one.unit}]",
-            f"{one.original:g}",
-            *limits,
-            margins,
-            *(text or "nowhere" for text in intervals),
-        )
+    heads = ("original", "safe from", "to", "SD at the ends", *(states[state] for state in shown))
+    table = WholeTable("characteristic", title="Each alone, all others as in the original", right=heads)
+    for scan, one in ((scan, scan.characteristic) for scan in scans):
+        cells = ["nowhere", "nowhere", "-"]
+        if scan.safe is not None:
+            cells = [
+                f"{value:.5g} ({(value - one.original) / abs(one.original):+.1%})"
+                f"{'*' if value in (one.lower, one.upper) else ''}"
+                for value in scan.safe
+            ]
+            cells.append(" / ".join(map(two_decimals, scan.margins)))
+        cells += [", ".join(f"{low:.5g} to {high:.5g}" for low, high in scan.intervals(state)) for state in shown]
+        table.add_row(f"{one.name} [{one.unit}]", f"{one.original:g}", *(cell or "nowhere" for cell in cells))
     return table
-
-
-def _limit_in_words(characteristic: Characteristic, value: float) -> str:
-    """A value with its change from the original, and a star if it is an end of the domain."""
-    at_end = "*" if value in (characteristic.lower, characteristic.upper) else ""
-    return f"{value:.5g} ({(value - characteristic.original) / abs(characteristic.original):+.1%}){at_end}"
 
 
 def _across_fits_in_words(scans: Sequence[OneAtATimeScan]) -> Iterator[str]:
@@ -305,24 +239,22 @@ def _across_fits_in_words(scans: Sequence[OneAtATimeScan]) -> Iterator[str]:
         ]
     if sets:
         fits = f"With {sets} vehicle models that fit the published data about as well,"
-        yield f"{fits} {'; '.join(moving) if moving else 'all safe intervals are the same'}."
+        yield f"{fits} {'; '.join(moving) or 'all safe intervals are the same'}."
 
 
 def _losses_in_words(scan: OneAtATimeScan) -> str:
     """A sentence on the values at which a characteristic alone costs points."""
-    characteristic, any_loss, whole_point = scan.characteristic, scan.first_loss(), scan.first_loss(WHOLE_POINT_LOSS)
+    name, suffix = scan.characteristic.name, scan.characteristic.suffix
+    any_loss, whole_point = scan.first_loss(), scan.first_loss(WHOLE_POINT_LOSS)
     if any_loss is None:
-        return f"{characteristic.name}: costs no points anywhere in its domain."
+        return f"{name}: costs no points anywhere in its domain."
     first = (
-        "it never costs a whole point"
-        if whole_point is None
-        else f"the first point is lost at {whole_point:.5g}{characteristic.suffix}"
+        f"the first point is lost at {whole_point:.5g}{suffix}"
+        if whole_point is not None
+        else "it never costs a whole point"
     )
-    return (
-        f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on; {first}; the "
-        "minimum is "
-        f"{min((scan.points or {}).values()):.2f} points."
-    )
+    least = f"the minimum is {min((scan.points or {}).values()):.2f} points"
+    return f"{name}: points are lost from {any_loss:.5g}{suffix} on; {first}; {least}."
 
 
 def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:

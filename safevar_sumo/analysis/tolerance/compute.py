@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -10,16 +10,17 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
-from safevar_sumo.analysis.tolerance.boxes import find_safe_box, random_settings
+from safevar_sumo.analysis.tolerance.answer import Tolerance
+from safevar_sumo.analysis.tolerance.boxes import SafeBox, find_safe_box, random_settings
 from safevar_sumo.analysis.tolerance.joint import JointLimits, find_joint_limits
-from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan_pairs, scan_with_sets
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan_pairs, scan_with_sets
 from safevar_sumo.analysis.tolerance.trade import find_trade
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Limit, Study, limits_of
+from safevar_sumo.vehicles import CharacteristicSet
 
 
 def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: Evaluator) -> Tolerance:
@@ -54,7 +55,9 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
     pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
     box, together = SafeBox(), None
     if needs_box:
-        found, known = _unsafe_settings(evaluator, scans, pairs or []), _known_settings(source, columns, unsafe)
+        changes = [{one.characteristic.name: end} for one in scans for interval in one.unsafe for end in interval]
+        changes += [pair.nearest for pair in pairs or [] if pair.nearest]
+        found, known = settings_of(evaluator.characteristics, changes), _known_settings(source, columns, unsafe)
         box = find_safe_box(evaluator, columns, unsafe, found, known)
         if limits:
             together = find_joint_limits(evaluator, columns, unsafe, limits, scans, found, known)
@@ -91,12 +94,17 @@ def _check_names(source: str, chosen: Sequence[str], names: Sequence[str]) -> No
 def _limits_of(study: Study, options: ToleranceOptions, columns: Sequence[int]) -> dict[str, Limit]:
     """The limits of the characteristics that vary."""
     rows = study.vehicle.characteristics
-    varied = [list(rows)[column] for column in columns]
-    for name in limits_of(options.limits, rows):
+    varied, typed = [list(rows)[column] for column in columns], limits_of(options.limits, rows)
+    for name in typed:
         if name not in varied:
             raise unknown_name("--limits", f"{name} does not vary with these --characteristics", name, varied)
-    limits = limits_of(options.limits, rows, study.limits)
-    return {name: limits[name] for name in varied if name in limits}
+    return {name: limit for name, limit in limits_of(options.limits, rows, study.limits).items() if name in varied}
+
+
+def settings_of(characteristics: CharacteristicSet, changes: Sequence[Mapping[str, float]]) -> FloatArray:
+    """The K settings with these values of some characteristics, all others as in the original; shape (K, n)."""
+    original = dict(zip(characteristics.names, characteristics.original, strict=True))
+    return pd.DataFrame(changes, columns=list(original), dtype=float).fillna(original).to_numpy()
 
 
 def _first_failures(
@@ -105,28 +113,15 @@ def _first_failures(
     """What fails first beyond the limits of each characteristic: alone or, where nothing does, with the others at their
     limits.
     """
-    settings: dict[str, FloatArray] = {}
-    for one in scans:
+    beyond = {} if together is None else dict(together.beyond)
+    for one in (scan for scan in scans if scan.unsafe):
         name, original = one.characteristic.name, one.characteristic.original
-        column = evaluator.characteristics.names.index(name)
-        ends = [end for interval in one.unsafe for end in interval]
-        if ends:
-            settings[name] = evaluator.characteristics.original.copy()
-            settings[name][column] = min(ends, key=lambda end: (abs(end - original), end))
-        elif together is not None and name in together.beyond:
-            settings[name] = together.beyond[name]
-    if not settings:
+        nearest = min(np.ravel(one.unsafe).tolist(), key=lambda end: (abs(end - original), end))
+        (beyond[name],) = settings_of(evaluator.characteristics, [{name: nearest}])
+    if not beyond:
         return {}
-    evaluations = evaluator.evaluate(np.array(list(settings.values())), "what fails first")
-    return {name: evaluations.take([row]) for row, name in enumerate(settings)}
-
-
-def _unsafe_settings(evaluator: Evaluator, scans: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
-    """The K unsafe settings of scans and pairs, shape (K, n)."""
-    changes = [{scan.characteristic.name: end} for scan in scans for interval in scan.unsafe for end in interval]
-    changes += [pair.nearest for pair in pairs if pair.nearest]
-    original = dict(zip(evaluator.characteristics.names, evaluator.characteristics.original, strict=True))
-    return pd.DataFrame(changes, columns=list(original), dtype=float).fillna(original).to_numpy()
+    evaluations = evaluator.evaluate(np.array(list(beyond.values())), "what fails first")
+    return {name: evaluations.take([row]) for row, name in enumerate(beyond)}
 
 
 def _known_settings(source: Study | Case, columns: Sequence[int], unsafe: Unsafe) -> FloatArray:

@@ -78,11 +78,6 @@ class OneAtATimeScan:
         return self.intervals("unsafe")
 
     @property
-    def not_simulated(self) -> list[Interval]:
-        """All intervals that could not be simulated."""
-        return self.intervals("not_simulated")
-
-    @property
     def margins(self) -> list[float | None]:
         """Safety degrees at the ends of the safe interval [m]."""
         degrees = self.profile.set_index("value")[SAFETY_DEGREE]
@@ -122,7 +117,7 @@ class OneAtATimeScan:
             "original": self.characteristic.original,
             "safe": self.safe,
             "unsafe": self.unsafe,
-            "not_simulated": self.not_simulated,
+            "not_simulated": self.intervals("not_simulated"),
             **({"infeasible": infeasible} if infeasible else {}),
             **({} if self.across_fits is None else {"across_fits": self.across_fits._asdict()}),
         }
@@ -155,18 +150,15 @@ def scan(
 def scan_with_sets(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, fits: int) -> list[OneAtATimeScan]:
     """Scan with the study's own parameters, and with its other sets, whose safe intervals give ranges of the ends."""
     own, *others = [scan(one, columns, unsafe) for one in evaluator.for_sets(fits) or [evaluator]]
-    return [
-        replace(one, across_fits=_ends_across_fits([one, *same])) if others else one
-        for one, *same in zip(own, *others, strict=True)
-    ]
-
-
-def _ends_across_fits(scans: Sequence[OneAtATimeScan]) -> EndsAcrossFits | None:
-    intervals = [one.safe for one in scans if one.safe is not None]
-    if not intervals:
-        return None
-    low, high = zip(*intervals, strict=True)
-    return EndsAcrossFits(len(intervals), ((min(low), max(low)), (min(high), max(high))))
+    scans = []
+    for one, *same in zip(own, *others, strict=True):
+        ends = [each.safe for each in (one, *same) if each.safe is not None]
+        if others and ends:
+            lows, highs = zip(*ends, strict=True)
+            across = EndsAcrossFits(len(ends), ((min(lows), max(lows)), (min(highs), max(highs))))
+            one = replace(one, across_fits=across)
+        scans.append(one)
+    return scans
 
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:

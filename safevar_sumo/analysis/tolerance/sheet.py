@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.evaluator import Interval
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.tables import LATEX_NEEDS, Table, markdown_table, render_latex
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, JsonObject
 from safevar_sumo.scenarios import Point, distance_in_words
@@ -22,139 +25,154 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Ends = tuple[float | None, float | None]
-"""A lower and an upper limit; None where there is none."""
 NONE = "-"
 
 
-class Failure(NamedTuple):
-    """What fails first beyond a limit: the test point ("" without a matrix), the outcome, and both in words."""
-
-    point: str
-    outcome: str
-    description: str
-    alone: bool
-
-    @classmethod
-    def of(cls, run: Evaluations, points: Sequence[Point], unsafe: Unsafe, alone: bool) -> Failure:
-        """The failure of one unsafe evaluation, at its worst point; `alone` says that one characteristic is changed."""
-        point = points[0] if run.worst_points is None else points[int(run.worst_points[0])]
-        scenario, degree = point.scenario, float(run.f_safe[0])
-        speed = "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
-        if unsafe.points is not None:
-            return cls("", str(run.outcome[0]), f"the car {unsafe.in_words}", alone)
-        if run.collided[0]:
-            impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
-            impact = "" if speed or impact_speed < 1 else f" with {impact_speed:.2g} km/h"
-            text = f"the car hits {scenario.obstacle()}{speed or impact}"
-        else:
-            text = f"the car keeps only {distance_in_words(scenario, degree)} from {scenario.obstacle()}{speed}"
-        return cls(point.name, str(run.outcome[0]), text, alone)
+def describe_failure(run: Evaluations, points: Sequence[Point], unsafe: Unsafe) -> dict[str, str]:
+    """An unsafe evaluation at its worst point: the point ("" without a matrix), the outcome, and both in words."""
+    point = points[0] if run.worst_points is None else points[int(run.worst_points[0])]
+    scenario, degree = point.scenario, float(run.f_safe[0])
+    name, speed = point.name, "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
+    if unsafe.points is not None:
+        name, text = "", f"the car {unsafe.in_words}"
+    elif run.collided[0]:
+        impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
+        impact = "" if speed or impact_speed < 1 else f" with {impact_speed:.2g} km/h"
+        text = f"the car hits {scenario.obstacle()}{speed or impact}"
+    else:
+        text = f"the car keeps only {distance_in_words(scenario, degree)} from {scenario.obstacle()}{speed}"
+    return {"point": name, "outcome": str(run.outcome[0]), "description": text}
 
 
 @dataclass(frozen=True, kw_only=True)
 class LimitRow:
-    """One characteristic: how far it may go `alone`, and `together` with all others at their limits.
+    """One characteristic: how far it may go alone, by its `scan`, and `together` with all others at their limits.
 
-    `specified` is the user's limit, None without one; `kept` whether the car is safe within it, alone and together;
-    `margin` the way from it to the limit alone [unit].
+    `specified` is the user's limit, None without one; `together_is_safe` says whether all of these can be reached
+    together. `first_failure` is what fails first beyond the limit, alone or else with the others at their limits.
     """
 
-    characteristic: Characteristic
-    alone: Ends
-    together: Ends
+    scan: OneAtATimeScan
+    together: Interval | None
     specified: Limit | None
     together_is_safe: bool
-    first_failure: Failure | None
+    first_failure: dict[str, str] | None
+
+    @property
+    def characteristic(self) -> Characteristic:
+        return self.scan.characteristic
 
     @property
     def margin(self) -> float | None:
-        limit, (low, high) = self.specified, self.alone
-        if limit is None or low is None or high is None:
+        """The way from the specified limit to the limit alone [unit]."""
+        if self.specified is None or self.scan.safe is None:
             return None
+        (low, high), limit = self.scan.safe, self.specified
         ways = [] if limit.at_least is None else [limit.at_least - low]
         return min(ways if limit.at_most is None else [*ways, high - limit.at_most])
 
     @property
     def kept(self) -> bool:
-        alone_is_safe = self.alone[0] is not None and (self.margin is None or self.margin >= 0)
+        """Whether the car is safe within the specified limit, alone and together."""
+        alone_is_safe = self.scan.safe is not None and (self.margin is None or self.margin >= 0)
         return self.specified is None or (alone_is_safe and self.together_is_safe)
 
     def to_dict(self) -> JsonObject:
         """A record of `tolerance --limits --json`."""
-        limit, one, failure = self.specified or Limit(), self.characteristic, self.first_failure
-        named = None if failure is None else {key: getattr(failure, key) for key in ("point", "outcome", "description")}
+        limit, one = self.specified or Limit(), self.characteristic
         return {
             "limit": {
                 "characteristic": one.name,
                 "unit": one.unit,
                 "original": one.original,
-                "alone": list(self.alone),
-                "together": list(self.together),
+                "alone": list(self.scan.safe or (None, None)),
+                "together": list(self.together or (None, None)),
                 "specified": {"low": limit.at_least, "high": limit.at_most, "source": limit.source},
                 "kept": self.kept,
                 "margin": self.margin,
-                "first_failure": named,
+                "first_failure": self.first_failure,
             }
         }
 
-    def texts(self, ends: Ends) -> tuple[str, str]:
+    def texts(self, ends: Interval) -> tuple[str, str]:
         """Two limits as text, rounded to the safe side; "" where the domain ends."""
-        one = self.characteristic
-        low, high = ends
+        one, (low, high) = self.characteristic, ends
         return (
-            "" if low is None or low <= one.lower else safe_text(one, low, upwards=True),
-            "" if high is None or high >= one.upper else safe_text(one, high, upwards=False),
+            "" if low <= one.lower else safe_text(one, low, upwards=True),
+            "" if high >= one.upper else safe_text(one, high, upwards=False),
         )
 
-    def in_words(self, ends: Ends) -> str:
-        """Two limits in words: `from 2.32 mm`, `1 to 2 s`, `no limit found`."""
-        low, high = self.texts(ends)
-        if None in ends:
+    def in_words(self, ends: Interval | None) -> str:
+        """Two limits in words: `from 2.32 mm`, `1 to 2 s`, `whole domain`."""
+        if ends is None:
             return "nowhere safe"
-        if low and high:
-            return f"{low} to {high}{self.characteristic.suffix}"
-        suffix = self.characteristic.suffix
-        return f"from {low}{suffix}" if low else f"up to {high}{suffix}" if high else "whole domain"
+        low, high = self.texts(ends)
+        text = f"{low} to {high}" if low and high else f"from {low}" if low else f"up to {high}" if high else ""
+        return f"{text}{self.characteristic.suffix}" if text else "whole domain"
+
+    @property
+    def specified_in_words(self) -> str:
+        """The specified limit with its source."""
+        if self.specified is None:
+            return NONE
+        sides = (("from", self.specified.at_least), ("up to", self.specified.at_most))
+        text = " ".join(f"{word} {value:g}" for word, value in sides if value is not None)
+        source = f" ({self.specified.source})" if self.specified.source else ""
+        return f"{text}{self.characteristic.suffix}{source}"
 
     @property
     def verdict(self) -> str:
         """Whether the specified limit is kept, and the margin in words."""
         if self.specified is None:
             return NONE
-        if self.margin is None or self.margin < 0:
-            return "outside" if self.margin is None else f"outside by {-self.margin:.3g}{self.characteristic.suffix}"
-        if not self.together_is_safe:
-            return "inside alone, not together"
-        return f"inside, margin {self.margin:.3g}{self.characteristic.suffix}"
+        if self.margin is None:
+            return "outside"
+        margin = f"{abs(self.margin):.3g}{self.characteristic.suffix}"
+        if self.margin < 0:
+            return f"outside by {margin}"
+        return f"inside, margin {margin}" if self.together_is_safe else "inside alone, not together"
 
     @property
     def sentence(self) -> str:
         """A sentence for a maintenance manual."""
-        one, failure = self.characteristic, self.first_failure
-        name = one.short_name[:1].upper() + one.short_name[1:]
-        if None in self.alone:
+        one, failure, alone = self.characteristic, self.first_failure, bool(self.scan.unsafe)
+        name, ends = one.short_name[:1].upper() + one.short_name[1:], self.scan.safe if alone else self.together
+        if self.scan.safe is None:
             return f"{name}: the car is unsafe as new."
-        if failure is None:
+        if failure is None or ends is None:
             return f"{name}: nothing in {one.lower:g} to {one.upper:g}{one.suffix} is unsafe alone."
-        low, high = self.texts(self.alone if failure.alone else self.together)
-        keep = " and ".join(
-            f"{word} {text}{one.suffix}" for word, text in (("at least", low), ("at most", high)) if text
-        )
-        others = "" if failure.alone else " with the other characteristics at their limits,"
-        return f"{name}: keep {keep or f'{one.original:g}{one.suffix}'}; beyond,{others} {failure.description}."
+        words = zip(("at least", "at most"), self.texts(ends), strict=True)
+        keep = " and ".join(f"{word} {text}{one.suffix}" for word, text in words if text)
+        others = "" if alone else " with the other characteristics at their limits,"
+        return f"{name}: keep {keep or f'{one.original:g}{one.suffix}'}; beyond,{others} {failure['description']}."
+
+    def draw(self, axis: Axes, height: float) -> None:
+        """Draw bars over the domain from 0 to 1, with the values at their ends."""
+        one, specified = self.characteristic, self.specified or Limit()
+        domain = (one.lower, one.upper)
+        axis.plot([0, 1], [height] * 2, color="0.8", linewidth=1, zorder=1)
+        for ends, offset, width, alpha in ((self.scan.safe, 0.2, 11, 0.35), (self.together, -0.36, 5, 1.0)):
+            if ends is None:
+                continue
+            places = np.interp(ends, domain, (0, 1))
+            axis.plot(places, [height] * 2, color=BLUE, linewidth=width, alpha=alpha, solid_capstyle="butt", zorder=2)
+            for text, place, side in zip(self.texts(ends), places, ("left", "right"), strict=True):
+                if text and (offset > 0 or ends != self.scan.safe):
+                    label = f"{text}{as_formula(one.suffix)}"
+                    axis.text(place, height + offset, label, ha=side, fontsize=FONT_SIZE - 1.5)
+        for value in (specified.at_least, specified.at_most):
+            place = np.interp(math.nan if value is None else value, domain, (0, 1))
+            axis.plot([place] * 2, [height - 0.3, height + 0.3], color=VERMILION, linewidth=1.5, zorder=3)
+        axis.plot(np.interp(one.original, domain, (0, 1)), height, marker="o", color="black", markersize=4, zorder=4)
 
 
 def safe_text(characteristic: Characteristic, value: float, *, upwards: bool) -> str:
     """A limit as text, rounded upwards or downwards; never beyond the original."""
-    digits = len(characteristic.text(value).partition(".")[2])
-    scaled, original = value * 10**digits, characteristic.original
+    digits, original = len(characteristic.text(value).partition(".")[2]), characteristic.original
+    scaled = value * 10**digits
     rounded = (math.ceil(scaled - 1e-6) if upwards else math.floor(scaled + 1e-6)) / 10**digits
-    return (
-        f"{original:g}"
-        if (rounded > original >= value if upwards else rounded < original <= value)
-        else f"{rounded:.{digits}f}"
-    )
+    is_beyond = rounded > original >= value if upwards else rounded < original <= value
+    return f"{original:g}" if is_beyond else f"{rounded:.{digits}f}"
 
 
 @dataclass(frozen=True)
@@ -172,27 +190,14 @@ class LimitsSheet:
                     "characteristic": row.characteristic.short_name,
                     "part": row.characteristic.counterpart or NONE,
                     "new": f"{row.characteristic.original:g}{row.characteristic.suffix}",
-                    "limit alone": row.in_words(row.alone),
+                    "limit alone": row.in_words(row.scan.safe),
                     "limit with all others at theirs": row.in_words(row.together),
-                    "specified": self._specified(row),
+                    "specified": row.specified_in_words,
                     "kept": row.verdict,
-                    "fails first": NONE if row.first_failure is None else row.first_failure.description,
+                    "fails first": row.first_failure["description"] if row.first_failure else NONE,
                 }
                 for row in self.rows
             ]
-        )
-
-    @staticmethod
-    def _specified(row: LimitRow) -> str:
-        limit = row.specified
-        if limit is None:
-            return NONE
-        source = f" ({limit.source})" if limit.source else ""
-        sides = (("from", limit.at_least), ("up to", limit.at_most))
-        return (
-            " ".join(f"{word} {value:g}" for word, value in sides if value is not None)
-            + row.characteristic.suffix
-            + source
         )
 
     def render(self, format_name: str) -> str:
@@ -205,12 +210,10 @@ class LimitsSheet:
         table = Table(f"Limits: {self.subject}", frame.set_index("characteristic"))
         return f"{LATEX_NEEDS}\n{render_latex(table, 'limits')}"
 
-    def to_dict(self) -> list[JsonObject]:
-        """The records of `tolerance --limits --json`, one for each characteristic."""
-        return [row.to_dict() for row in self.rows]
-
-    def table(self) -> WholeTable:
-        """The sheet as a table for the terminal; columns without any entry are left out."""
+    def parts(self) -> Iterator[WholeTable | str]:
+        """The sheet as a table for the terminal, without columns that have no entry, and a sentence for each
+        characteristic.
+        """
         frame = self.to_frame().drop(columns=["part", "fails first"])
         frame = frame[[name for name in frame if (frame[name] != NONE).any()]]
         heads = {"limit alone": "alone", "limit with all others at theirs": "all at limits"}
@@ -218,52 +221,22 @@ class LimitsSheet:
         table = WholeTable(*frame.rename(columns=heads).columns, title=title)
         for cells in frame.itertuples(index=False):
             table.add_row(*cells)
-        return table
-
-    def sentences(self) -> Iterator[str]:
-        """A sentence for each characteristic, for a maintenance manual."""
-        yield from (row.sentence for row in self.rows)
+        yield table
+        yield "\n".join(row.sentence for row in self.rows)
 
     def figure(self) -> Figure:
         """A bar for each characteristic from the original to its limits, with their values."""
-        height = 0.9 + 0.55 * len(self.rows)
-        figure, axes = new_figure(f"{self.subject}: limits, rounded to the safe side", 1, 1, (7.2, height))
-        axis = axes[0, 0]
+        number = len(self.rows)
+        title = f"{self.subject}: limits, rounded to the safe side"
+        figure, ((axis,),) = new_figure(title, 1, 1, (7.2, 0.9 + 0.55 * number))
         for position, row in enumerate(self.rows):
-            _draw_row(axis, -position, row)
-        axis.set_yticks([-i for i in range(len(self.rows))])
-        axis.set_yticklabels([escape_dollars(row.characteristic.short_name) for row in self.rows], fontsize=FONT_SIZE)
-        axis.set_xlim(-0.02, 1.02)
-        axis.set_ylim(0.5 - len(self.rows), 0.5)
-        axis.set_xticks([])
+            row.draw(axis, -position)
+        names = [escape_dollars(row.characteristic.short_name) for row in self.rows]
+        axis.set_yticks([-position for position in range(number)], names, fontsize=FONT_SIZE)
+        axis.set(xlim=(-0.02, 1.02), ylim=(0.5 - number, 0.5), xticks=[])
         axis.set_xlabel(
             "domain from its lower to its upper end; dot: new; line: specified;\n"
             "light: safe alone; dark: safe with all others at theirs",
             fontsize=FONT_SIZE - 1,
         )
         return figure
-
-
-def _draw_row(axis: Axes, height: float, row: LimitRow) -> None:
-    """The bars of one characteristic, over its domain from 0 to 1, with the values at their ends."""
-    one = row.characteristic
-
-    def place(value: float) -> float:
-        return (value - one.lower) / (one.upper - one.lower)
-
-    axis.plot([0, 1], [height, height], color="0.8", linewidth=1, zorder=1)
-    for (low, high), style in ((row.alone, {"linewidth": 11, "alpha": 0.35}), (row.together, {"linewidth": 5})):
-        if low is not None and high is not None:
-            axis.plot([place(low), place(high)], [height, height], color=BLUE, solid_capstyle="butt", zorder=2, **style)
-    for ends, offset in ((row.alone, 0.2), (row.together, -0.36)):
-        if None in ends or (ends == row.together and row.together == row.alone):
-            continue
-        for text, value, side in zip(row.texts(ends), ends, ("left", "right"), strict=True):
-            if text and value is not None:
-                axis.text(
-                    place(value), height + offset, f"{text}{as_formula(one.suffix)}", ha=side, fontsize=FONT_SIZE - 1.5
-                )
-    for limit in () if row.specified is None else (row.specified.at_least, row.specified.at_most):
-        if limit is not None:
-            axis.plot([place(limit)] * 2, [height - 0.3, height + 0.3], color=VERMILION, linewidth=1.5, zorder=3)
-    axis.plot(place(one.original), height, marker="o", color="black", markersize=4, zorder=4)

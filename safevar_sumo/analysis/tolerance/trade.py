@@ -53,11 +53,8 @@ class Trade:
     def title(self) -> str:
         """What the curve shows, and where all other characteristics are."""
         at_limits = f"{', '.join(self.fixed)} at the specified limits, all " if self.fixed else ""
-        nowhere = "" if self.curve else ": nowhere safe"
-        return (
-            f"How far {self.second.name} may go at values of {self.first.name}, {at_limits}others as in the "
-            f"original{nowhere}"
-        )
+        others = f"{at_limits}others as in the original{'' if self.curve else ': nowhere safe'}"
+        return f"How far {self.second.name} may go at values of {self.first.name}, {others}"
 
     def table(self) -> WholeTable:
         """The curve as a table for the terminal, limits rounded to the safe side."""
@@ -67,30 +64,22 @@ class Trade:
         for value, ends in self.curve.items():
             texts = ["nowhere"] * 2
             if ends is not None:
-                texts = [
-                    safe_text(second, end, upwards=upwards) for end, upwards in zip(ends, (True, False), strict=True)
-                ]
-                texts = [
-                    f"{text}*" if end in (second.lower, second.upper) else text
-                    for text, end in zip(texts, ends, strict=True)
-                ]
+                stars = ["*" if end in (second.lower, second.upper) else "" for end in ends]
+                texts = [safe_text(second, ends[k], upwards=k == 0) + stars[k] for k in (0, 1)]
             table.add_row(safe_text(first, value, upwards=value < first.original), *texts)
         return table
 
     def figure(self, subject: str) -> Figure:
         """The safe values of the second characteristic over those of the first."""
-        figure, axes = new_figure(f"{subject}: {self.second.name} at values of {self.first.name}", 1, 1, (4.6, 3.4))
-        axis, found = axes[0, 0], {value: ends for value, ends in self.curve.items() if ends is not None}
+        first, second = self.first, self.second
+        figure, ((axis,),) = new_figure(f"{subject}: {second.name} at values of {first.name}", 1, 1, (4.6, 3.4))
+        found = {value: ends for value, ends in self.curve.items() if ends is not None}
         lows, highs = np.array(list(found.values())).reshape(-1, 2).T
         axis.vlines(list(found), lows, highs, color=BLUE, linewidth=5, alpha=0.5)
         axis.plot(list(found), lows, "_", list(found), highs, "_", color=BLUE, clip_on=False)
-        axis.plot(self.first.original, self.second.original, "o", color="black", markersize=5, clip_on=False)
-        for one, limit, label in (
-            (self.first, axis.set_xlim, axis.set_xlabel),
-            (self.second, axis.set_ylim, axis.set_ylabel),
-        ):
-            limit(one.lower, one.upper)
-            label(f"{escape_dollars(one.name)} [{as_formula(one.unit)}]")
+        axis.plot(first.original, second.original, "o", color="black", markersize=5, clip_on=False)
+        labels = [f"{escape_dollars(one.name)} [{as_formula(one.unit)}]" for one in (first, second)]
+        axis.set(xlim=(first.lower, first.upper), ylim=(second.lower, second.upper), xlabel=labels[0], ylabel=labels[1])
         figure.supxlabel("dot: the original vehicle; bars: safe", fontsize=FONT_SIZE)
         return figure
 
@@ -102,33 +91,26 @@ def find_trade(evaluator: Evaluator, names: Sequence[str], unsafe: Unsafe, limit
     characteristics = evaluator.characteristics
     first, second = (characteristics.names.index(name) for name in names)
     fixed = {name: limit for name, limit in limits.items() if name not in names}
-    sides = [[value for value in (one.at_least, one.at_most) if value is not None] for one in fixed.values()]
-    others = np.tile(characteristics.original, (1, 1))
-    for values in product(*sides) if fixed else ():
-        others = np.concatenate([others, characteristics.original[np.newaxis]])
-        others[-1, [characteristics.names.index(name) for name in fixed]] = values
+    corners = list(
+        product(*(filter(lambda end: end is not None, (one.at_least, one.at_most)) for one in fixed.values()))
+    )
+    others = np.tile(characteristics.original, (1 + len(corners), 1))
+    others[1:, [characteristics.names.index(name) for name in fixed]] = corners
 
     def safe_intervals(column: int, settings: FloatArray) -> list[Interval | None]:
         """The interval of a characteristic that is safe with each of the `others`, for K settings of another one."""
-        scans = scan(evaluator, [column] * len(settings), unsafe, settings)
-        safe = [one.safe for one in scans]
-        groups = [safe[start : start + len(others)] for start in range(0, len(safe), len(others))]
-        return [_common(group) for group in groups]
+        safe = [one.safe for one in scan(evaluator, [column] * len(settings), unsafe, settings)]
+        intervals: list[Interval | None] = []
+        for start in range(0, len(safe), len(others)):
+            found = [ends for ends in safe[start : start + len(others)] if ends is not None]
+            lows, highs = zip(*found, strict=True) if len(found) == len(others) else ((), ())
+            intervals.append((max(lows), min(highs)) if lows else None)
+        return intervals
 
     (ends,) = safe_intervals(first, others)
-    values = (
-        [] if ends is None else np.union1d(np.linspace(*ends, TRADE_VALUES), characteristics.original[first]).tolist()
-    )
+    values = [] if ends is None else np.union1d(np.linspace(*ends, TRADE_VALUES), others[0, first]).tolist()
     settings = np.tile(others, (len(values), 1))
     settings[:, first] = np.repeat(values, len(others))
     curve = dict(zip(values, safe_intervals(second, settings) if values else [], strict=True))
     members = characteristics.members
     return Trade(first=members[first], second=members[second], fixed=fixed, curve=curve)
-
-
-def _common(intervals: Sequence[Interval | None]) -> Interval | None:
-    """What all intervals have in common; None if one of them is None."""
-    found = [ends for ends in intervals if ends is not None]
-    if len(found) < len(intervals):
-        return None
-    return max(low for low, _ in found), min(high for _, high in found)
