@@ -219,9 +219,9 @@ class Guard(NamedTuple):
         except (OSError, TypeError):
             return ""
 
-    def elements(self, method: str, value: UserValue, expected: str, count: int = 2) -> tuple[Any, ...]:
-        """The elements of a result that must be a tuple or list of `count` elements."""
-        if not isinstance(value, tuple | list) or len(value) != count:
+    def elements(self, method: str, value: UserValue, expected: str) -> tuple[Any, ...]:
+        """The elements of a result that must be a tuple or list of two."""
+        if not isinstance(value, tuple | list) or len(value) != 2:
             raise self._wrong_result(_short_text(value), method, expected)
         return tuple(value)
 

@@ -205,33 +205,34 @@ def test_every_characteristic_is_tested_to_act(model: str) -> None:
     assert set(ACTS[model]) | SENSED.get(model, set()) == set(SYSTEMS[model].characteristics.names)
 
 
-def sensed_gaps(name: str) -> np.ndarray:
-    """Gap that a vehicle reports while an obstacle comes nearer at 10 m/s; shape (T, 5)."""
-    vehicle, population = SYSTEMS["sumo"].vehicle, ends("sumo", name)
-    values = dict(zip(SYSTEMS["sumo"].characteristics.names, np.ascontiguousarray(population.T), strict=True))
-    prepared = vehicle.prepare(values, 1.0, STEP)
-    state, gaps, nothing = vehicle.at_rest(prepared), [], np.zeros(5)
-    for k in range(240):
-        gap = np.full(5, 130.0 - 10 * k * STEP)
-        seen, state = vehicle.sense(
-            prepared, state, Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0)
-        )
-        gaps.append(seen.gap)
-    return np.stack(gaps)
-
-
 def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
     past = np.array([[5.0], [np.inf], [np.inf]])  # newest first
     assert delay_signal(past, np.array([0.0]), 0.1).tolist() == [5.0]
     assert delay_signal(past, np.array([0.1]), 0.1).tolist() == [np.inf]
 
 
-def test_a_sensor_sees_nothing_beyond_its_range() -> None:
-    detected = np.where(np.isfinite(sensed_gaps("sensorRange")), sensed_gaps("sensorRange"), 0).max(axis=0)
-    assert np.allclose(detected, np.linspace(20, 120, 5), atol=0.6)
+def sensed_gaps(model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Five values of a characteristic, and the gaps that such vehicles report while an obstacle comes nearer at 10 m/s;
+    shape (T, 5).
+    """
+    vehicle, population, names = SYSTEMS[model].vehicle, ends(model, name), SYSTEMS[model].characteristics.names
+    prepared = vehicle.prepare(dict(zip(names, np.ascontiguousarray(population.T), strict=True)), 1.0, STEP)
+    state, gaps, nothing = vehicle.at_rest(prepared), [], np.zeros(5)
+    for k in range(240):
+        gap = np.full(5, 130.0 - 10 * k * STEP)
+        observation = Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0)
+        seen, state = vehicle.sense(prepared, state, observation)
+        gaps.append(seen.gap)
+    return population[:, names.index(name)], np.stack(gaps)
 
 
-def test_a_slow_sensor_reports_the_past() -> None:
-    gaps = sensed_gaps("reactionTime")[200]
-    now = 130.0 - 10 * 200 * STEP
-    assert np.allclose(gaps, now + 10 * np.linspace(0.1, 0.8, 5))
+@pytest.mark.parametrize("model", ["sumo", "worn"])
+def test_a_sensor_sees_nothing_beyond_its_range(model: str) -> None:
+    reach, gaps = sensed_gaps(model, "sensorRange")
+    assert np.allclose(np.where(np.isfinite(gaps), gaps, 0).max(axis=0), reach, atol=0.6)
+
+
+@pytest.mark.parametrize(("model", "name"), [("sumo", "reactionTime"), ("worn", "sensorLatency")])
+def test_a_slow_sensor_reports_the_past(model: str, name: str) -> None:
+    latency, gaps = sensed_gaps(model, name)
+    assert np.allclose(gaps[200], 130.0 - 10 * 200 * STEP + 10 * latency)

@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import GRAVITY, Command, Observation
+from safevar_sumo.records import GRAVITY, Command
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -126,19 +126,6 @@ def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(wea
         assemble(study), np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]])
     ).metrics["ave_dece"]
     assert (worn < 0.9 * new) == is_wet
-
-
-def test_dirty_sensors_see_late_and_not_far() -> None:
-    p, seen = prepared(1.0, sensorRange=30.0, sensorLatency=0.2), []
-    state, one = CAR.at_rest(p), np.ones(1)
-    for k in range(200):
-        result, state = CAR.sense(
-            p, state, Observation(k * 0.05, one, (60 - 0.5 * k) * one, 10 * one, 0 * one, 0 * one, 1.0)
-        )
-        seen.append(float(result.gap[0]))
-    assert np.isinf(seen[:64]).all()
-    assert seen[64] == pytest.approx(60 - 0.5 * 60)
-    assert seen[100] == pytest.approx(60 - 0.5 * 96)
 
 
 SUN = CharacteristicSet.of(load_study("sun"))
