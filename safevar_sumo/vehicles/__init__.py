@@ -67,13 +67,13 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
     rest = vehicle.at_rest(prepared)
 
-    def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
+    def drive(state: VehicleState, throttle: float, brake: float) -> tuple[list[float], VehicleState]:
         """The speed after each step [m/s], until it leaves the range of the tables, and the last state."""
-        speeds = [float(state.speed[0])]  # type: ignore[attr-defined]
+        speeds = [float(state.speed[0])]
         command = Command(np.full(1, throttle), np.full(1, brake))
         for _ in range(round(LONGEST_DRIVE / STEP)):
             state = vehicle.advance(prepared, state, command)
-            speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
+            speeds.append(float(state.speed[0]))
             if (throttle and speeds[-1] >= SPEEDS[-1] + 1) or (not throttle and speeds[-1] < SPEEDS[1]):
                 break
         return speeds, state
