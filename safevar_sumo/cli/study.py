@@ -201,7 +201,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     from safevar_sumo.analysis.research_questions.case import build_case
 
     # Loads more slowly than all other modules.
-    from safevar_sumo.analysis.research_questions.over_runs import summary_lines
+    from safevar_sumo.analysis.research_questions.comparisons import summary_lines
 
     names = study.vehicle.characteristics
     solutions = solutions_frame(names, campaign.solutions.items())

@@ -109,7 +109,7 @@ def measure_agreement(
     """Compare evaluations of the reference's settings with the reference, row by row, and the original vehicle with the
     study's values.
     """
-    pairs = {name: _defined_pairs(values, evaluations.metrics[name]) for name, values in reference.metrics.items()}
+    pairs = {name: defined_pairs(values, evaluations.metrics[name]) for name, values in reference.metrics.items()}
     errors = {name: _mean(np.abs(here - there)) for name, (there, here) in pairs.items()}
     both_collide, differ = reference.collided & evaluations.collided, reference.collided != evaluations.collided
     counts = {
@@ -156,7 +156,7 @@ def measure_agreement(
     )
 
 
-def _defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The values of rows that are defined on both sides."""
     rows = ~np.isnan(values) & ~np.isnan(other_values)
     return values[rows], other_values[rows]
@@ -218,7 +218,7 @@ def plot_agreement(
 def _draw_scatter(axis: Axes, reference: FloatArray, here: FloatArray, is_collision: BoolArray, label: str) -> None:
     """Draw simulated over reference values; those that collide on either side in another colour."""
     axis.scatter(reference, here, s=6, alpha=0.4, c=np.where(is_collision, VERMILION, BLUE), linewidths=0)
-    x, y = _defined_pairs(reference, here)
+    x, y = defined_pairs(reference, here)
     axis.axline((float(x[0]), float(x[0])) if x.size else (0, 0), slope=1, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
     axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT_SIZE)

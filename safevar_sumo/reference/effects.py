@@ -34,57 +34,28 @@ class Effect(NamedTuple):
     here: float | None
     agrees: bool | None
 
-    @classmethod
-    def of(cls, reference: float | None, here: float | None) -> Effect:
-        """The effect, with `agrees` from both values."""
-        if reference is None or here is None:
-            return cls(reference, here, None)
-        return cls(
-            reference, here, abs(here - reference) <= max(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * abs(reference))
-        )
 
-
-class Regression(NamedTuple):
-    """Linear regression of any values on all n characteristics of fixed settings.
-
-    `shares` are the changes of the settings as shares of the domains, shape (rows, n). `varies` is true for the k
-    characteristics that the settings vary, shape (n,). `slope_matrix`, shape (k, rows), times the values gives the k
-    slopes; None for too few rows.
+def linear_effects(characteristics: CharacteristicSet, settings: FloatArray, values: FloatArray) -> FloatArray:
+    """Change of `values`, shape (rows,), over each whole domain, shape (n,), in their unit, by linear regression on all
+    characteristics that the settings, shape (rows, n), vary; NaN if undefined.
     """
-
-    shares: FloatArray
-    varies: BoolArray
-    slope_matrix: FloatArray | None
-
-    @classmethod
-    def over(cls, settings: FloatArray, characteristics: CharacteristicSet) -> Regression:
-        """The regression for settings, shape (rows, n)."""
-        return cls._of_shares((settings - characteristics.original) / (characteristics.upper - characteristics.lower))
-
-    @classmethod
-    def _of_shares(cls, shares: FloatArray) -> Regression:
-        varies = np.asarray(np.ptp(shares, axis=0) > 0) if len(shares) else np.zeros(shares.shape[1], dtype=bool)
-        design = np.column_stack([np.ones(len(shares)), shares[:, varies]])
-        has_enough_rows = len(shares) >= ROWS_PER_COEFFICIENT * design.shape[1]
-        return cls(shares, varies, np.linalg.pinv(design)[1:] if has_enough_rows else None)
-
-    def effects(self, values: FloatArray) -> FloatArray:
-        """Change of `values`, shape (rows,), over each whole domain, shape (n,), in their unit; NaN if undefined."""
-        defined = np.isfinite(values)
-        if not defined.all():
-            return Regression._of_shares(self.shares[defined]).effects(values[defined])
-        effects = np.full(len(self.varies), np.nan)
-        if self.slope_matrix is not None:
-            effects[self.varies] = self.slope_matrix @ values
-        return effects
+    defined, effects = np.isfinite(values), np.full(settings.shape[1], np.nan)
+    shares = (settings[defined] - characteristics.original) / (characteristics.upper - characteristics.lower)
+    varies = (shares != shares[:1]).any(axis=0)
+    design = np.column_stack([np.ones(len(shares)), shares[:, varies]])
+    if len(shares) >= ROWS_PER_COEFFICIENT * design.shape[1]:
+        effects[varies] = np.linalg.pinv(design)[1:] @ values[defined]
+    return effects
 
 
 def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: CharacteristicSet) -> dict[str, Effect]:
     """The effect of each characteristic on the safety degree, in the order of the study."""
-    regression = Regression.over(data.settings, characteristics)
-    published, here = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
+    sides = data.metrics[SAFETY_DEGREE], evaluations.f_safe
+    published, here = (linear_effects(characteristics, data.settings, values) for values in sides)
+    agrees = np.abs(here - published) <= np.maximum(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * np.abs(published))
+    is_defined = np.isfinite(published + here)
     return {
-        name: Effect.of(finite_or_none(published[i]), finite_or_none(here[i]))
+        name: Effect(finite_or_none(published[i]), finite_or_none(here[i]), bool(agrees[i]) if is_defined[i] else None)
         for i, name in enumerate(characteristics.names)
     }
 

@@ -19,8 +19,8 @@ from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.agreement import measure_agreement
-from safevar_sumo.reference.effects import Regression
+from safevar_sumo.reference.agreement import defined_pairs, rank_correlation
+from safevar_sumo.reference.effects import linear_effects
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.search import Misfit
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
@@ -235,24 +235,25 @@ class ReferenceLoss:
         self._deviations = {
             name: float(np.std(values)) for name, values in defined_values.items() if values.size and np.ptp(values) > 0
         }
-        self._regression = Regression.over(data.settings, CharacteristicSet.of(study))
-        self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
+        self._characteristics = CharacteristicSet.of(study)
+        self._effects = self._effects_of(data.metrics[SAFETY_DEGREE])
+
+    def _effects_of(self, values: FloatArray) -> FloatArray:
+        return linear_effects(self._characteristics, self._data.settings, values)
 
     def of(self, evaluations: Evaluations) -> float:
         """The loss, from evaluations of the settings of the reference."""
         fit, loss = self._study.fit, 0.0
-        # no result of the original is read below
-        result = measure_agreement(self._data, evaluations, self._study, original=evaluations)
         for name, deviation in self._deviations.items():
             unit = self._study.repeatability.get(name) or deviation
-            rho, error = result.spearman[name], result.mean_absolute_error[name]
-            loss += fit.weights[name] * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
+            there, here = defined_pairs(self._data.metrics[name], evaluations.metrics[name])
+            error = float(np.mean(np.abs(here - there))) if here.size else np.inf
+            loss += fit.weights[name] * (fit.rank * (1 - (rank_correlation(there, here) or 0.0)) + error / unit)
             if name == SAFETY_DEGREE and fit.effects:
-                differences = np.nan_to_num(self._regression.effects(evaluations.f_safe) - self._effects)
+                differences = np.nan_to_num(self._effects_of(evaluations.f_safe) - self._effects)
                 loss += fit.effects * float(np.mean(np.abs(differences))) / unit
-        collisions = result.collisions
-        one_sided = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-        return min(loss, MAX_LOSS) + fit.collisions * one_sided / max(result.rows, 1)
+        one_sided = np.count_nonzero(self._data.collided != evaluations.collided)
+        return min(loss, MAX_LOSS) + fit.collisions * one_sided / max(len(evaluations), 1)
 
     def residuals(self, evaluations: Evaluations) -> FloatArray:
         """Differences from the reference in standard deviations of their noise; their squares are weighted by metric.

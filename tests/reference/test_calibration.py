@@ -12,7 +12,7 @@ from scipy.special import logit
 from safevar_sumo.analysis.model_spread import value_of, with_values
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.calibration import Calibration, FitSubject, Profiles, calibrate
-from safevar_sumo.reference.effects import Regression, error_beyond_spread
+from safevar_sumo.reference.effects import error_beyond_spread, linear_effects
 from safevar_sumo.reference.fit_space import FitSpace, FittedParameter, ReferenceLoss
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.search import Misfit, SearchRace, invert
@@ -114,8 +114,8 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     settings[:, 3] = characteristics.original[3]
     slopes = np.where(np.arange(12) == 3, np.nan, np.arange(12) - 5.0)  # one does not vary
     response = 1.0 + ((settings - characteristics.original) / width) @ np.nan_to_num(slopes)
-    assert Regression.over(settings, characteristics).effects(response) == pytest.approx(slopes, nan_ok=True)
-    assert np.isnan(Regression.over(settings[:20], characteristics).effects(np.ones(20))).all(), "too few rows"
+    assert linear_effects(characteristics, settings, response) == pytest.approx(slopes, nan_ok=True)
+    assert np.isnan(linear_effects(characteristics, settings[:20], np.ones(20))).all(), "too few rows"
 
 
 def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(data: ReferenceData) -> None:

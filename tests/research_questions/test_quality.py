@@ -14,7 +14,6 @@ from hypothesis import given, strategies as st
 
 from safevar_sumo.analysis.research_questions.statistics import (
     EXACT_TEST,
-    TwoSampleTest,
     compare_samples,
     compute_attainment,
     compute_convergence,
@@ -23,28 +22,15 @@ from safevar_sumo.analysis.research_questions.statistics import (
     critical_difference,
     defined_minimised_values,
     hypervolume,
-    igd,
-    igd_plus,
     magnitude_of,
     nondominated_points,
     normalised,
     reference_front,
     signed_rank_test,
 )
-from safevar_sumo.errors import InputError
 from tests.research_questions.made_up import made_up, row
 
 FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
-
-
-def test_igd_is_the_mean_distance_to_the_nearest_point_and_igd_plus_counts_only_what_is_worse() -> None:
-    rng = np.random.default_rng(5)
-    front, reference = rng.normal(size=(7, 3)), rng.normal(size=(11, 3))
-    differences = front[None] - reference[:, None]
-    assert igd(front, reference) == pytest.approx(np.linalg.norm(differences, axis=2).min(axis=1).mean())
-    worse = np.linalg.norm(np.maximum(differences, 0), axis=2)
-    assert igd_plus(front, reference) == pytest.approx(worse.min(axis=1).mean())
-    assert igd_plus(FRONT - 1, FRONT) == 0
 
 
 def test_hypervolume_of_boxes() -> None:
@@ -111,7 +97,6 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[fl
     there, back = compare_samples(x, y), compare_samples(y, x)
     assert there.effect_size == pytest.approx(won / (len(x) * len(y)))
     assert back.reversed_if(True).effect_size == pytest.approx(there.effect_size)
-    assert there.p_value is not None
     assert 0 <= there.p_value <= 1
     assert back.p_value == pytest.approx(there.p_value)
 
@@ -124,9 +109,9 @@ def test_exact_p_of_separated_samples_is_two_orders_of_all(size: int) -> None:
 
 
 def test_an_empty_sample_is_undefined_not_zero_and_nan_is_refused() -> None:
-    assert compare_samples([], [1.0, 2]) == TwoSampleTest(None, None, None, 0, 2, None)
-    assert signed_rank_test([1.0, 2.0], math.nan).p_value is None
-    with pytest.raises(InputError, match="NaN"):
+    assert compare_samples([], [1.0, 2])[:5] == pytest.approx((math.nan, math.nan, None, 0, 2), nan_ok=True)
+    assert math.isnan(signed_rank_test([1.0, 2.0], math.nan).p_value)
+    with pytest.raises(ValueError, match="nan"):
         compare_samples([1.0, math.nan], [1.0])
 
 
@@ -160,8 +145,8 @@ def test_magnitudes_are_kitchenhams(effect: float, name: str) -> None:
 
 
 def test_holms_correction_of_a_worked_example() -> None:
-    corrected = correct_by_holm([0.01, None, 0.04, 0.03, 0.005])
-    assert [p and round(p, 12) for p in corrected] == [0.03, None, 0.06, 0.06, 0.02]
+    corrected = correct_by_holm([0.01, math.nan, 0.04, 0.03, 0.005])
+    assert corrected == pytest.approx([0.03, math.nan, 0.06, 0.06, 0.02], nan_ok=True)
 
 
 @pytest.mark.parametrize(("algorithms", "runs", "published"), [(4, 14, 1.25), (5, 30, 1.11)])

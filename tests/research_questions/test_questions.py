@@ -29,8 +29,8 @@ from safevar_sumo.analysis.research_questions.comparisons import (
     rq1_runs,
     rq2,
     rq2_runs,
+    summary_lines,
 )
-from safevar_sumo.analysis.research_questions.over_runs import significance_change_line, summary_lines
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples, correct_by_holm
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import MetricsTable
@@ -97,7 +97,7 @@ def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
     chosen = only(frame, metric="safety_degree", algorithm="spea2")
     assert (chosen["p_value"], chosen["effect_size"], expected.effect_size) == (expected.p_value, 1, 1)
     assert (chosen["n1"], chosen["n2"]) == (RUNS, RUNS - 1)
-    assert frame["p_holm"].tolist() == correct_by_holm(frame["p_value"].tolist())
+    assert frame["p_holm"].tolist() == correct_by_holm(frame["p_value"]).tolist()
 
 
 def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
@@ -110,7 +110,7 @@ def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
     assert part.loc["spea2", "mean_rank"] == 1
     assert part["mean_rank"].sum() == pytest.approx(6)
     by_metric = frame.drop_duplicates("metric")
-    assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"].tolist())
+    assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"]).tolist()
 
 
 def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
@@ -128,7 +128,6 @@ def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
     two = made_up(*(row(name, run=run) for name in ("nsga2", "rs") for run in range(2)))
     notes = "".join(answer_questions([two], "rq2-runs")[0].notes)
     assert "too few runs for all 7 tests of RQ2 (5 are needed)" in notes
-    assert "pooled" not in notes, "no test can be significant"
 
 
 def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
@@ -148,7 +147,6 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert paper["p_value"] < 1e-30
     assert (runs["n1"], runs["n2"], runs["effect_size"]) == (8, 8, 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64)
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    assert re.search(r"\d+ of \d+ tests are no longer significant: .*; RQ2 RS .*SD", significance_change_line(case))
     original = only(rq1_runs(case), algorithm="nsga2", metric="safety_degree")
     assert original["p_value"] == 2 * 2 / 2**8, "all signed ranks but the smallest are negative"
     assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)

@@ -12,7 +12,7 @@ from safevar_sumo.analysis.compare.answer import Side, SystemComparison
 from safevar_sumo.analysis.evaluator import MAX_REJECTIONS, Evaluator, sobol_points
 from safevar_sumo.analysis.rating.compute import rate
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.changes import compare_weathers, find_weather_pairs
+from safevar_sumo.analysis.research_questions.changes import compare_weathers
 from safevar_sumo.analysis.research_questions.statistics import compare_samples, fewest_runs, signed_rank_test
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance.scans import scan
@@ -20,7 +20,7 @@ from safevar_sumo.analysis.words import number_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import SAFETY_DEGREE, Study
 
@@ -177,13 +177,14 @@ def _test(frame: pd.DataFrame) -> tuple[float | None, float | None, str, int]:
         if len(means) >= fewest_runs("RQ1"):
             pairs, unit = means, "run"
     a, b = pairs.to_numpy(dtype=float).T
-    return signed_rank_test(a - b, 0.0).p_value, compare_samples(a, b).effect_size, unit, len(pairs)
+    p, a12 = signed_rank_test(a - b, 0.0).p_value, compare_samples(a, b).effect_size
+    return finite_or_none(p), finite_or_none(a12), unit, len(pairs)
 
 
 def _weather_table(subjects: tuple[Study | Case, Study | Case]) -> pd.DataFrame | None:
     """The table `weather` of the research questions, if the systems differ in the weather alone."""
     cases = [one for one in subjects if isinstance(one, Case)]
     try:
-        return compare_weathers(*find_weather_pairs(cases)[0]) if len(cases) == 2 else None
+        return compare_weathers(*cases) if len(cases) == 2 else None
     except UnanswerableError:
         return None

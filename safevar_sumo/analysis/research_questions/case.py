@@ -157,11 +157,6 @@ def solutions_for_metric(solutions: pd.DataFrame, metric: MetricFacts) -> pd.Dat
     return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
 
-def defined_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
-    """The solutions that count for a metric and have a value of it."""
-    return solutions_for_metric(solutions, metric).dropna(subset=[metric.name])
-
-
 def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
     """Whether solutions are collisions."""
     return solutions["outcome"] == str(Outcome.COLLISION)

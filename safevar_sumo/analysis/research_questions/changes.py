@@ -8,8 +8,7 @@ no run. In the frames, the columns `setting` and `other` hold the names of cases
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import permutations
-from typing import Any
+from itertools import permutations, product
 
 import msgspec
 import numpy as np
@@ -21,10 +20,16 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
+WEATHER_COLUMNS = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other"]
+WEATHER_COLUMNS += ["increase", "increase_other", "decrease", "decrease_other"]
 COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
 """Number of the most frequent combinations that are shown."""
+
+
+SAFETY_SCALES = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
+"""Metrics of the original vehicle that changes of safety are a share of."""
 
 
 def critical_solutions(case: Case) -> pd.DataFrame:
@@ -60,12 +65,11 @@ def _means_by_change_count(
 
     Columns setting, the `labels` of the keys, j ("1".."n", "any"), `name`, n.
     """
-    change_counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1)
-    rows = list[tuple[Any, ...]]()
-    for key, column in values:
-        for j in (*change_numbers(case), ANY):
-            sample = column[~np.isnan(column) & ((j == ANY) | (change_counts.astype(str) == j))]
-            rows.append((case.name, *key, j, np.mean(sample) if sample.size else np.nan, sample.size))
+    change_counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
+    rows = list[tuple[str | float, ...]]()
+    for (key, column), j in product(values, (*change_numbers(case), ANY)):
+        sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
+        rows.append((case.name, *key, j, np.mean(sample) if sample.size else np.nan, sample.size))
     return pd.DataFrame(rows, columns=["setting", *labels, "j", name, "n"])
 
 
@@ -89,8 +93,8 @@ def rq32(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
-    changed = changes_of(case, critical_solutions(case)) != 0
-    values = {(name,): column.astype(float) for name, column in zip(case.characteristics.names, changed.T, strict=True)}
+    shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
+    values = {(name,): column for name, column in zip(case.characteristics.names, shares.T, strict=True)}
     frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(columns="n")
     frame["percent"] *= 100
     ranks = frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
@@ -127,19 +131,18 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     - TET [s], TIT [s^2]: mean increase over solutions without collision;
     - aveDece: mean decrease over all solutions [m/s^2].
     """
-    solutions, original = critical_solutions(case), case.original
+    solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
-    sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
+    sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in SAFETY_SCALES.values())
     values = {
-        ("avgSD_mD",): np.where(has_collided, np.nan, original[SAFETY_DEGREE] - sd),
+        ("avgSD_mD",): np.where(has_collided, np.nan, case.original[SAFETY_DEGREE] - sd),
         ("avgSD_cS",): np.where(has_collided, -sd, np.nan),
-        ("TET",): np.where(has_collided, np.nan, tet - original["tet"]),
-        ("TIT",): np.where(has_collided, np.nan, tit - original["tit"]),
-        ("aveDece",): original["ave_dece"] - dece,
+        ("TET",): np.where(has_collided, np.nan, tet - case.original["tet"]),
+        ("TIT",): np.where(has_collided, np.nan, tit - case.original["tit"]),
+        ("aveDece",): case.original["ave_dece"] - dece,
     }
-    scales = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
-    scale = frame["quantity"].map({quantity: abs(original[name]) or np.nan for quantity, name in scales.items()})
+    scale = frame["quantity"].map(SAFETY_SCALES).map(case.original).abs().replace(0.0, np.nan)
     frame.insert(4, "percent", 100 * frame["value"] / scale)
     return frame
 
@@ -154,17 +157,10 @@ def count_collisions(case: Case) -> pd.DataFrame:
         If no run is finished.
     """
     case.require_solutions()
-    by_algorithm = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
-    counts = by_algorithm.agg(["size", "sum"]).reindex(list(case.algorithms), fill_value=0)
-    return pd.DataFrame(
-        {
-            "setting": case.name,
-            "algorithm": case.algorithms,
-            "solutions": counts["size"].to_numpy(),
-            "collisions": counts["sum"].to_numpy(),
-            "share": (counts["sum"] / counts["size"]).to_numpy(),
-        }
-    )
+    collisions = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
+    counts = collisions.agg(solutions="size", collisions="sum").reindex(list(case.algorithms), fill_value=0)
+    counts = counts.assign(share=counts["collisions"] / counts["solutions"]).rename_axis("algorithm").reset_index()
+    return pd.DataFrame({"setting": case.name, **counts})
 
 
 def frequent_combinations(case: Case) -> pd.DataFrame:
@@ -201,7 +197,7 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     pairs = [
         (clearer, other)
         for clearer, other in permutations(cases, 2)
-        if not _differences(clearer, other) and _clearness(clearer) > _clearness(other)
+        if _clearness(clearer) > _clearness(other) and not _differences(clearer, other)
     ]
     if not pairs:
         problem = "two cases are needed that differ in the weather alone"
@@ -214,24 +210,30 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     return pairs
 
 
-def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
-    """One weather against another, characteristic by characteristic, over the critical solutions.
+def compare_weathers(*cases: Case) -> pd.DataFrame:
+    """The weathers of the pairs of `find_weather_pairs`, characteristic by characteristic, over the critical solutions.
 
     The column setting names the clearer weather's case. Columns without the suffix "_other" belong to this case.
     Columns: setting, other, characteristic; percent, percent_other (of the critical solutions that change it);
     difference (percent_other - percent); rank, rank_other; increase, increase_other, decrease, decrease_other (mean
     signed change in the characteristic's unit).
     """
-    tables = []
-    for case in (clearer, other):
-        shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
-        deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
-        tables.append(shares.set_index("characteristic")[["percent", "rank"]].join(deltas))
-    ours, theirs = tables
-    columns = [suffixed for name in ("percent", "rank", "increase", "decrease") for suffixed in (name, f"{name}_other")]
-    table = ours.join(theirs.add_suffix("_other"))[columns].reset_index()
-    table.insert(3, "difference", table["percent_other"] - table["percent"])
-    return pd.DataFrame({"setting": clearer.name, "other": other.name, **table})
+    tables = [
+        _changes_of_any_number(clearer)
+        .merge(_changes_of_any_number(other), "left", "characteristic", suffixes=("", "_other"))
+        .rename(columns={"setting_other": "other"})
+        for clearer, other in find_weather_pairs(cases)
+    ]
+    table = pd.concat(tables, ignore_index=True)
+    table["difference"] = table["percent_other"] - table["percent"]
+    return table[WEATHER_COLUMNS]
+
+
+def _changes_of_any_number(case: Case) -> pd.DataFrame:
+    """Columns setting, characteristic, percent, rank, increase, decrease, over all critical solutions."""
+    shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
+    deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
+    return shares.drop(columns="j").join(deltas, "characteristic")
 
 
 def _clearness(case: Case) -> tuple[float, float, float]:

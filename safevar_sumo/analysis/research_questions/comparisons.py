@@ -4,128 +4,150 @@ The paper pools the solutions of all runs and compares them with a second sample
 once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
 small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests.
 
-In the frames, the column `setting` holds the case's name, and `method` the name of the test; undefined values are None.
+In the frames, the column `setting` holds the case's name, and `method` the name of the test; undefined values are NaN.
+Functions of a case raise `UnanswerableError` if no run is finished, if an algorithm that they compare is missing, and
+over runs if the solutions belong to no run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from itertools import combinations
+from collections.abc import Iterable, Mapping
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
-import scipy
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, defined_solutions
+from safevar_sumo.analysis.research_questions.case import (
+    ALGORITHM_TITLES,
+    NSGA2,
+    Case,
+    UnanswerableError,
+    solutions_for_metric,
+)
 from safevar_sumo.analysis.research_questions.statistics import (
+    ALPHA,
     INDICATOR_TITLES,
     MORE_IS_BETTER,
-    TwoSampleTest,
     compare_samples,
     compute_indicators,
     correct_by_holm,
     critical_difference,
+    fewest_runs,
     friedman_test,
     signed_rank_test,
 )
-from safevar_sumo.analysis.words import number_of
+from safevar_sumo.analysis.words import number_of, two_decimals
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import JsonObject
 
 TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original"]
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS]
-RUNS_COLUMNS = {
-    "RQ1": [
-        *("setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"),
-        *("mean", "original"),
-    ],
-    "RQ2": ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS],
-}
-"""Columns of RQ1 and RQ2 over runs."""
+RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
+RQ1_RUNS_COLUMNS += ["mean", "original"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS]
 PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", *TEST_COLUMNS]
 RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm"]
 RANK_COLUMNS += ["critical_difference"]
 
-SampleFunction = Callable[[Case, str, MetricFacts], "pd.Series[float]"]
-"""Returns an algorithm's values of a metric."""
-Samples = Mapping[str, tuple[bool, Mapping[str, "pd.Series[float]"]]]
-"""For each indicator and metric: whether larger values speak for an algorithm (a better front, or more unsafe
-solutions), and each algorithm's values.
-"""
-
-
-def pooled_values(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
-    """A metric's defined values over the solutions that count for it."""
-    return defined_solutions(case.solutions_of(algorithm), metric)[metric.name].astype(float)
-
-
-def run_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
-    """The mean of a metric's defined values in each finished run that has some, by the run's number."""
-    case.runs_of(algorithm)  # raises if there are none
-    solutions = defined_solutions(case.solutions_of(algorithm), metric)
-    by_run = solutions.groupby("run")[metric.name]
-    return pd.Series({run: float(np.mean(values.to_numpy(dtype=float))) for run, values in by_run}, dtype=float)
+MORE_UNSAFE = "below 0.5: the runs are more unsafe than the original vehicle"
+Samples = Mapping[tuple[str, str], "pd.Series[float]"]
+"""Values by algorithm and name of a metric or quality indicator."""
 
 
 def rq1(case: Case) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated once for each solution, metric by metric.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions
-    are more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value.
-
-    Raises
-    ------
-    UnanswerableError
-        If no run is finished.
+    `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are more unsafe; `mean` is
+    the mean over the algorithm's solutions, `original` the original vehicle's value.
     """
-    rows = _rows_against_original(case, pooled_values, _against_repeated_original)
-    return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
-
-
-def _against_repeated_original(sample: pd.Series[float], original: float) -> TwoSampleTest:
-    return compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original))
-
-
-def _rows_against_original(
-    case: Case, sample_of: SampleFunction, test: Callable[[pd.Series[float], float], TwoSampleTest]
-) -> list[JsonObject]:
-    case.require_solutions()
-    rows = []
-    for algorithm in case.algorithms:
-        for metric in case.scoring.metrics:
-            sample = sample_of(case, algorithm, metric)
-            original = case.original[metric.name]
-            # Below 0.5: the algorithm's solutions are more unsafe than the original.
-            result = test(sample, original).reversed_if(metric.more_is_unsafe)
-            rows.append(
-                {
-                    "setting": case.name,
-                    "algorithm": algorithm,
-                    "metric": metric.name,
-                    **result._asdict(),
-                    "runs": result.n1,
-                    "mean": float(np.mean(sample.to_numpy())) if sample.size else None,
-                    "original": None if np.isnan(original) else original,
-                }
-            )
-    return rows
+    return pd.DataFrame(_test_original(case), columns=RQ1_COLUMNS)
 
 
 def rq2(case: Case) -> pd.DataFrame:
     """NSGA-II against every other algorithm: its runs' indicators, then its pooled solutions' metrics.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that NSGA-II is better: a better
-    front, more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Indicators of imported solutions,
-    which belong to no run, are None.
-
-    Raises
-    ------
-    UnanswerableError
-        If NSGA-II is missing, or there is no other algorithm.
+    `effect_size` is A12, oriented so that higher values mean that NSGA-II is better: a better front, more unsafe
+    solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Indicators of imported solutions, which belong to no
+    run, are undefined.
     """
-    rows = _rows_of_pairs(case, nsga2_pairs(case), _samples(case, pooled_values))
-    return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
+    return pd.DataFrame(_test_pairs(case, nsga2_pairs(case)), columns=RQ2_COLUMNS)
+
+
+def rq1_runs(case: Case) -> pd.DataFrame:
+    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
+
+    `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal ones
+    (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is
+    `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
+    """
+    tests = compare_over_runs(case)
+    return tests[tests.index == "RQ1"][RQ1_RUNS_COLUMNS]
+
+
+def rq2_runs(case: Case) -> pd.DataFrame:
+    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics'
+    means over solutions.
+
+    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
+    """
+    tests = compare_over_runs(case)
+    nsga2_pairs(case)  # raises if RQ2 has no answer
+    return tests[tests.index == "RQ2"][RQ2_RUNS_COLUMNS]
+
+
+def compare_over_runs(case: Case) -> pd.DataFrame:
+    """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2.
+
+    `enough` is whether there are enough runs for the test to be significant.
+    """
+    rows = {"RQ1": _test_original(case, over_runs=True)}
+    if NSGA2 in case.algorithms and len(case.algorithms) > 1:
+        rows["RQ2"] = _test_pairs(case, nsga2_pairs(case), over_runs=True)
+    tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
+    enough = tests["runs"] >= tests.index.map(fewest_runs)
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=enough)
+
+
+def compare_pairs(case: Case) -> pd.DataFrame:
+    """Compare every pair of algorithms by Mann-Whitney U, with one value per run: each indicator, and each metric's
+    mean over solutions.
+
+    `effect_size` is A12, oriented so that higher values mean that `algorithm` is better than `other`: a better front,
+    more unsafe solutions. `p_holm` is `p_value` corrected by Holm's method for all pairs and metrics of this case.
+    """
+    _require_algorithms(case, 2)
+    tests = pd.DataFrame(_test_pairs(case, combinations(case.algorithms, 2), over_runs=True))
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]))[PAIR_COLUMNS]
+
+
+def rank_algorithms(case: Case) -> pd.DataFrame:
+    """Mean ranks of three algorithms or more over runs, metric by metric, with Friedman's test.
+
+    Runs with the same number form a block; a block in which an algorithm has no value is left out. Rank 1 is the best,
+    `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of this case.
+    Mean ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test at 0.01; Demsar
+    2006).
+    """
+    _require_algorithms(case, 3)
+    samples, frames = _samples(case, over_runs=True), list[pd.DataFrame]()
+    for metric, more_is_better in _directions(case).items():
+        blocks = pd.DataFrame({name: samples.get((name, metric)) for name in case.algorithms}, dtype=float).dropna()
+        ranks = blocks.rank(axis=1, ascending=not more_is_better)
+        frame = pd.DataFrame({"mean_rank": ranks.mean(), "median": blocks.median()}).reset_index(names="algorithm")
+        statistic, p = friedman_test(blocks.to_numpy())
+        frames.append(
+            frame.assign(
+                metric=metric,
+                runs=len(blocks),
+                statistic=statistic,
+                p_value=p,
+                critical_difference=critical_difference(len(frame), len(blocks)),
+            )
+        )
+    p_holm = correct_by_holm(frame["p_value"].iloc[0] for frame in frames)
+    table = pd.concat([frame.assign(p_holm=p) for frame, p in zip(frames, p_holm, strict=True)], ignore_index=True)
+    return table.assign(setting=case.name)[RANK_COLUMNS]
 
 
 def nsga2_pairs(case: Case) -> list[tuple[str, str]]:
@@ -141,174 +163,101 @@ def nsga2_pairs(case: Case) -> list[tuple[str, str]]:
     return pairs
 
 
-def _samples(case: Case, sample_of: SampleFunction) -> Samples:
-    """The values of every indicator, which are empty for solutions that belong to no run, and of every metric."""
-    indicators = pd.DataFrame()
-    if case.has_runs and len(case.solutions):
-        indicators = compute_indicators(case)
-    empty = pd.Series(dtype=float)
-    by_algorithm = {str(name): rows.droplevel("algorithm") for name, rows in indicators.groupby(level=0)}
-    return {
-        **{
-            name: (
-                more_is_better,
-                {
-                    algorithm: by_algorithm[algorithm][name] if algorithm in by_algorithm else empty
-                    for algorithm in case.algorithms
-                },
-            )
-            for name, more_is_better in MORE_IS_BETTER.items()
-        },
-        **{
-            metric.name: (
-                metric.more_is_unsafe,
-                {algorithm: sample_of(case, algorithm, metric) for algorithm in case.algorithms},
-            )
-            for metric in case.scoring.metrics
-        },
-    }
-
-
-def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[JsonObject]:
-    """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`; frames take the
-    column that they list.
-    """
-    return [
-        {
-            "setting": case.name,
-            "algorithm": first,
-            "other": second,
-            "baseline": second,
-            "metric": metric,
-            # Above 0.5: the first algorithm is better.
-            **compare_samples(values[first], values[second]).reversed_if(not more_is_better)._asdict(),
-        }
-        for first, second in pairs
-        for metric, (more_is_better, values) in samples.items()
-    ]
-
-
-def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
-    """The frames of `rq1_runs` and `rq2_runs` by question, RQ1 and RQ2; RQ2 is missing if it has no answer.
-
-    Raises
-    ------
-    UnanswerableError
-        If the solutions belong to no run, or no run is finished.
-    """
-    rows = {"RQ1": _rows_against_original(case, run_means, signed_rank_test)}
-    if NSGA2 in case.algorithms and len(case.algorithms) > 1:
-        rows["RQ2"] = _rows_of_pairs(case, nsga2_pairs(case), _samples(case, run_means))
-    _add_holm([row for rows_of_question in rows.values() for row in rows_of_question])
-    return {name: pd.DataFrame(rows[name], columns=RUNS_COLUMNS[name], dtype=object) for name in rows}
-
-
-def _add_holm(rows: list[JsonObject]) -> list[JsonObject]:
-    """Add `p_holm` to the rows, corrected as one family."""
-    for row, p in zip(rows, correct_by_holm([row["p_value"] for row in rows]), strict=True):
-        row["p_holm"] = p
-    return rows
-
-
-def rq1_runs(case: Case) -> pd.DataFrame:
-    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
-
-    Columns: `RUNS_COLUMNS["RQ1"]`. `effect_size` is the share of runs whose mean is safer than the original's value,
-    plus half the share of equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of
-    the run means. `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
-
-    Raises
-    ------
-    UnanswerableError
-        If the solutions belong to no run, or no run is finished.
-    """
-    return compare_over_runs(case)["RQ1"]
-
-
-def rq2_runs(case: Case) -> pd.DataFrame:
-    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics'
-    means over solutions.
-
-    Columns: `RUNS_COLUMNS["RQ2"]`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is
-    defined as in `rq1_runs`.
-
-    Raises
-    ------
-    UnanswerableError
-        If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
-    """
-    frames = compare_over_runs(case)
-    nsga2_pairs(case)  # raises if RQ2 has no answer
-    return frames["RQ2"]
-
-
-def compare_pairs(case: Case) -> pd.DataFrame:
-    """Compare every pair of algorithms by Mann-Whitney U, with one value per run: each indicator, and each metric's
-    mean over solutions.
-
-    Columns: `PAIR_COLUMNS`, where `other` is the other algorithm. `effect_size` is A12, oriented so that higher values
-    mean that `algorithm` is better than `other`: a better front, more unsafe solutions. `p_holm` is `p_value` corrected
-    by Holm's method for all pairs and metrics of this case.
-
-    Raises
-    ------
-    UnanswerableError
-        If there are no runs, or runs of only one algorithm.
-    """
-    samples = _samples_over_runs(case, 2)
-    rows = _add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples))
-    return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
-
-
-def rank_algorithms(case: Case) -> pd.DataFrame:
-    """Mean ranks of the algorithms over runs, metric by metric, with Friedman's test.
-
-    Runs with the same number form a block; a block in which an algorithm has no value is left out. Columns:
-    `RANK_COLUMNS`. Rank 1 is the best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is
-    corrected for all metrics of this case. Mean ranks that differ by less than `critical_difference` are not
-    distinguished (Nemenyi's test at 0.01; Demsar 2006).
-
-    Raises
-    ------
-    UnanswerableError
-        If there are no runs, or fewer than three algorithms.
-    """
-    tests = dict[str, JsonObject]()
-    rows = list[JsonObject]()
-    for metric, (more_is_better, by_algorithm) in _samples_over_runs(case, 3).items():
-        blocks = pd.DataFrame(by_algorithm).dropna()
-        values = blocks.to_numpy(dtype=float)
-        ranks = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
-        statistic, p = friedman_test(values)
-        tests[metric] = {"statistic": statistic, "p_value": p}
-        rows += [
-            {
-                "setting": case.name,
-                "metric": metric,
-                "algorithm": name,
-                "runs": len(blocks),
-                "mean_rank": float(ranks[:, i].mean()) if len(blocks) else None,
-                "median": float(np.median(values[:, i])) if len(blocks) else None,
-                "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None,
-            }
-            for i, name in enumerate(blocks.columns)
-        ]
-    _add_holm(list(tests.values()))
-    return pd.DataFrame([row | tests[row["metric"]] for row in rows], columns=RANK_COLUMNS, dtype=object)
-
-
-def _samples_over_runs(case: Case, min_algorithms: int) -> Samples:
-    """The samples over runs of at least so many algorithms; raises `UnanswerableError` if there are fewer."""
-    if case.has_runs and len(case.algorithms) < min_algorithms:
+def _require_algorithms(case: Case, number: int) -> None:
+    if case.has_runs and len(case.algorithms) < number:
         names = ", ".join(case.algorithms) or "none"
         raise UnanswerableError(
             case.name,
             f"has finished runs of {number_of(len(case.algorithms), 'algorithm')} ({names})",
-            f"results of {min_algorithms} algorithms or more",
+            f"results of {number} algorithms or more",
         )
-    return _samples(case, run_means)
 
 
-def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
-    """Titles of metrics and quality indicators in tables, by name."""
-    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
+def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
+    """A row for each algorithm and metric, against the original vehicle."""
+    case.require_solutions()
+    rows = []
+    for algorithm, metric in product(case.algorithms, case.scoring.metrics):
+        values, original = _values(case, algorithm, metric, over_runs), case.original[metric.name]
+        if over_runs:
+            test = signed_rank_test(values, original)
+        else:
+            test = compare_samples(values, np.full(0 if np.isnan(original) else len(values), original))
+        row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": test.n1}
+        # Below 0.5: the algorithm's solutions are more unsafe than the original.
+        test = test.reversed_if(metric.more_is_unsafe)
+        rows.append({**row, **test._asdict(), "mean": values.mean(), "original": original})
+    return rows
+
+
+def _test_pairs(case: Case, pairs: Iterable[tuple[str, str]], *, over_runs: bool = False) -> list[JsonObject]:
+    """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`; frames take the
+    column that they list.
+    """
+    samples, rows = _samples(case, over_runs), []
+    for (first, second), (metric, more_is_better) in product(pairs, _directions(case).items()):
+        test = compare_samples(*(samples.get((name, metric), ()) for name in (first, second)))
+        row = {"setting": case.name, "algorithm": first, "other": second, "baseline": second, "metric": metric}
+        # Above 0.5: the first algorithm is better.
+        test = test.reversed_if(not more_is_better)
+        rows.append({**row, **test._asdict(), "runs": min(test.n1, test.n2)})
+    return rows
+
+
+def _directions(case: Case) -> dict[str, bool]:
+    """For each indicator and metric: whether larger values speak for an algorithm (a better front, or more unsafe
+    solutions).
+    """
+    return MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+
+
+def _samples(case: Case, over_runs: bool) -> Samples:
+    """The values of every metric and, unless the solutions belong to no run, of every indicator."""
+    samples = {
+        (algorithm, metric.name): _values(case, algorithm, metric, over_runs)
+        for algorithm, metric in product(case.algorithms, case.scoring.metrics)
+    }
+    if case.has_runs and len(case.solutions):
+        for algorithm, rows in compute_indicators(case).groupby(level="algorithm"):
+            samples |= {(str(algorithm), name): rows.droplevel("algorithm")[name] for name in MORE_IS_BETTER}
+    return samples
+
+
+def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) -> pd.Series[float]:
+    """A metric's defined values over the solutions that count for it; over runs, each run's mean, by its number."""
+    solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(subset=metric.name)
+    values = solutions[metric.name].astype(float)
+    if not over_runs:
+        return values
+    case.runs_of(algorithm)  # raises if there are none
+    return values.groupby(solutions["run"]).agg(lambda sample: np.mean(sample.to_numpy()))
+
+
+def titles_of(cases: Iterable[Case]) -> dict[str, str]:
+    """Titles of algorithms, quality indicators and the cases' metrics, by name."""
+    metrics = {metric.name: metric.title for case in cases for metric in case.scoring.metrics}
+    return ALGORITHM_TITLES | INDICATOR_TITLES | metrics
+
+
+def summary_lines(case: Case) -> list[str]:
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk."""
+    lines, titles = list[str](), titles_of([case])
+    try:
+        tests = compare_over_runs(case).replace(titles)
+        for question, subject, heading, meaning in (
+            ("RQ1", "algorithm", "{} against the original vehicle", MORE_UNSAFE),
+            ("RQ2", "baseline", "NSGA-II against {}", "above 0.5: NSGA-II is better"),
+        ):
+            if question == "RQ2":
+                nsga2_pairs(case)  # raises if RQ2 has no answer
+            lines.append(f"{question} over runs: A12 {meaning}; * p < {ALPHA:g} after Holm's correction")
+            for name, group in tests[tests.index == question].groupby(subject, sort=False):
+                marks = np.where(group["p_holm"] < ALPHA, "*", "")
+                effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
+                line = f"  A12 of {heading.format(name)}: {', '.join(effects)}"
+                if untestable := ", ".join(group.loc[~group["enough"] & group["effect_size"].notna(), "metric"]):
+                    line += f"; too few runs for a test ({fewest_runs(question)} are needed): {untestable}"
+                lines.append(line)
+    except UnanswerableError as error:
+        lines.append(f"{'RQ2' if lines else 'RQ1 and RQ2'} over runs: {error.problem}.")
+    return lines

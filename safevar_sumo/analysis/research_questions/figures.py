@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import combinations, cycle
+from itertools import combinations, cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +22,9 @@ from safevar_sumo.analysis.figures import (
     new_panels,
     save,
 )
+from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq31, rq32
+from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq32
 from safevar_sumo.analysis.research_questions.comparisons import rank_algorithms
 from safevar_sumo.analysis.research_questions.statistics import (
     ALPHA,
@@ -141,7 +142,7 @@ def draw_critical_differences(case: Case) -> Figure:
             case.name, f"{problem} of critical differences: all bars would overlap", "results of more runs"
         )
     groups = frame.groupby("metric", sort=False)
-    title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
+    title = f"{case.name}: mean ranks over {runs:.0f} runs, critical difference {difference:.2f}"
     height = 0.9 + 0.6 * len(groups) + 0.34 * len(frame)
     figure, axes = new_figure(title, len(groups), 1, (6.8, height))
     for axis, (metric, ranks) in zip(axes.flat, groups, strict=True):
@@ -209,22 +210,23 @@ def _title(algorithm: str) -> str:
 
 def draw_change_counts(cases: Sequence[Case]) -> Figure:
     """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots over the runs; a panel
-    per case.
+    per case that has an answer.
 
     Raises
     ------
     UnanswerableError
-        If `rq31` raises it for a case.
+        If no case has an answer.
     """
-    frames = [rq31(case) for case in cases]
+    (answer,) = answer_questions(cases, "rq3.1")
+    groups = answer.frame.groupby("setting", sort=False)
     title = "number of changed characteristics"
-    figure, axes = new_panels(title, len(cases), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
-    for axis, case, counts in zip(axes, cases, frames, strict=True):
+    figure, axes = new_panels(title, len(groups), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
+    for axis, (name, counts) in zip(axes, groups, strict=True):
         numbers, samples = zip(*counts.groupby("j", sort=False)["count"], strict=True)
         axis.boxplot(samples, tick_labels=numbers, widths=0.8, patch_artist=True, boxprops={"facecolor": SKY_BLUE})
         runs = counts["run"].nunique()
         axis.set(xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)")
-        axis.set_title(escape_dollars(case.name), fontsize=FONT_SIZE)
+        axis.set_title(escape_dollars(str(name)), fontsize=FONT_SIZE)
         axis.locator_params(axis="y", integer=True, min_n_ticks=1)
     return figure
 
@@ -321,19 +323,11 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
         If no figure can be drawn.
     """
     figures, errors = dict[str, "Figure"](), list[UnanswerableError]()
-    drawings, countable = list[tuple[str, Callable[[], "Figure"]]](), list[Case]()
-    for case in cases:
-        try:
-            rq31(case)
-            countable.append(case)
-        except UnanswerableError as error:
-            errors.append(error)
-        for name, draw in FIGURES_OF_ONE_CASE.items():
-            if draw is not draw_critical_differences or len(case.algorithms) > 2:  # two are compared as a pair
-                drawings.append((name if len(cases) == 1 else f"{case.name}-{name}", partial(draw, case)))
-    if countable:
-        figures[COUNTS_FIGURE] = draw_change_counts(countable)
-    for name, draw_figure in drawings:
+    drawings: dict[str, Callable[[], Figure]] = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
+    for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
+        if draw is not draw_critical_differences or len(case.algorithms) > 2:  # two are compared as a pair
+            drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)
+    for name, draw_figure in drawings.items():
         try:
             figures[name] = draw_figure()
         except UnanswerableError as error:

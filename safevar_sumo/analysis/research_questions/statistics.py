@@ -6,7 +6,7 @@ hypervolume on normalised ones.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import moocore
@@ -16,7 +16,6 @@ import scipy
 from numpy.typing import ArrayLike
 
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
@@ -36,14 +35,14 @@ NOTABLE_MAGNITUDES = ("medium", "large")
 
 
 class TwoSampleTest(NamedTuple):
-    """Comparison of two samples X and Y; None where a sample is empty.
+    """Comparison of two samples X and Y; NaN and None where a sample is empty.
 
     `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples' sizes, `method` the name
     of the test.
     """
 
-    p_value: float | None
-    effect_size: float | None
+    p_value: float
+    effect_size: float
     magnitude: str | None
     n1: int
     n2: int
@@ -51,33 +50,25 @@ class TwoSampleTest(NamedTuple):
 
     def reversed_if(self, condition: bool) -> TwoSampleTest:
         """The test itself, or with the effect size of the second sample against the first, 1 - A12."""
-        if self.effect_size is None or not condition:
+        if not condition or not self.method:
             return self
         return self._replace(effect_size=1 - self.effect_size, magnitude=magnitude_of(1 - self.effect_size))
 
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
-    """Compare two samples by U test and effect size.
-
-    Raises
-    ------
-    InputError
-        If a value is NaN.
-    """
+    """Compare two samples without undefined values by U test and effect size."""
     first, second = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    pooled = np.concatenate([first, second])
-    if np.isnan(pooled).any():
-        raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
     if not first.size or not second.size:
-        return TwoSampleTest(None, None, None, first.size, second.size, None)
-    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and np.unique(pooled).size == pooled.size
-    test = scipy.stats.mannwhitneyu(
-        first, second, alternative="two-sided", method="exact" if is_exact else "asymptotic"
-    )
+        return TwoSampleTest(np.nan, np.nan, None, first.size, second.size, None)
+    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and has_distinct_values([*first, *second])
+    name, method = (EXACT_TEST, "exact") if is_exact else (ASYMPTOTIC_TEST, "asymptotic")
+    test = scipy.stats.mannwhitneyu(first, second, method=method, nan_policy="raise")
     a12 = float(test.statistic) / (first.size * second.size)
-    return TwoSampleTest(
-        float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, EXACT_TEST if is_exact else ASYMPTOTIC_TEST
-    )
+    return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, name)
+
+
+def has_distinct_values(values: ArrayLike) -> bool:
+    return np.unique(values).size == np.size(values)
 
 
 def magnitude_of(effect_size: float) -> str:
@@ -93,22 +84,15 @@ def signed_rank_test(sample: ArrayLike, value: float) -> TwoSampleTest:
     """
     differences = np.asarray(sample, dtype=float) - value
     if not differences.size or np.isnan(value):
-        return TwoSampleTest(None, None, None, differences.size, 0, None)
-    distances = np.abs(differences[differences != 0])
+        return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
-    is_exact = not distances.size or (np.unique(distances).size == differences.size <= MAX_EXACT_RUNS)
-    p = (
-        float(
-            scipy.stats.wilcoxon(
-                differences, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx"
-            ).pvalue
-        )
-        if distances.size
-        else 1.0
-    )
-    return TwoSampleTest(
-        p, effect, magnitude_of(effect), differences.size, 1, EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
-    )
+    is_exact = differences.size <= MAX_EXACT_RUNS and has_distinct_values([0.0, *np.abs(differences)])
+    name, method = (EXACT_SIGNED_TEST, "exact") if is_exact else (ASYMPTOTIC_SIGNED_TEST, "approx")
+    if not differences.any():
+        name, p = EXACT_SIGNED_TEST, 1.0
+    else:
+        p = float(scipy.stats.wilcoxon(differences, correction=not is_exact, method=method).pvalue)
+    return TwoSampleTest(p, effect, magnitude_of(effect), differences.size, 1, name)
 
 
 def fewest_runs(question: str) -> int:
@@ -120,23 +104,21 @@ def fewest_runs(question: str) -> int:
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
-def correct_by_holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """P-values corrected by Holm's step-down method (Holm 1979); None stays None and does not count as a test."""
-    order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
-    corrected_p_values, maximum = list(p_values), 0.0
-    for rank, (p, index) in enumerate(order):
-        maximum = max(maximum, min(1.0, p * (len(order) - rank)))
-        corrected_p_values[index] = maximum
-    return corrected_p_values
+def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
+    """P-values corrected by Holm's step-down method (Holm 1979); NaN stays NaN and does not count as a test."""
+    values = pd.Series(list(p_values), dtype=float)
+    ascending = values.dropna().sort_values()
+    corrected = (ascending * np.arange(len(ascending), 0, -1)).clip(upper=1.0).cummax()
+    return np.asarray(corrected.reindex(values.index), dtype=float)
 
 
-def friedman_test(values: FloatArray) -> tuple[float | None, float | None]:
+def friedman_test(values: FloatArray) -> tuple[float, float]:
     """Friedman's statistic and p-value of N runs of k algorithms, shape (N, k); 0 and 1 if all algorithms are equal,
-    None if N < 2.
+    NaN if N < 2.
     """
     if len(values) < 2:
-        return None, None
-    if np.all(values == values[:, :1]):
+        return np.nan, np.nan
+    if not np.ptp(values, axis=1).any():
         return 0.0, 1.0
     test = scipy.stats.friedmanchisquare(*values.T)
     return float(test.statistic), float(test.pvalue)
@@ -144,8 +126,10 @@ def friedman_test(values: FloatArray) -> tuple[float | None, float | None]:
 
 def critical_difference(algorithm_count: int, run_count: int, alpha: float = ALPHA) -> float:
     """Least difference of mean ranks that the test distinguishes (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)) for k
-    algorithms and N runs.
+    algorithms and N runs; NaN without runs.
     """
+    if not run_count:
+        return np.nan
     q = scipy.stats.studentized_range.ppf(1 - alpha, algorithm_count, np.inf) / np.sqrt(2)
     return float(q * np.sqrt(algorithm_count * (algorithm_count + 1) / (6 * run_count)))
 
@@ -161,35 +145,14 @@ CURVE_POINTS = 50
 """Maximum number of points of a run's curve."""
 
 
-def _check_points(points: FloatArray) -> FloatArray:
-    """Refuse empty sets and undefined points, for which indicators would return their best value."""
-    array = np.asarray(points, dtype=float)
-    if array.ndim != 2 or not array.size or not np.isfinite(array).all():
-        raise InputError(
-            "a set of points", "is empty or holds an undefined value", "at least one point, shape (points, objectives)"
-        )
-    return array
-
-
 def nondominated_points(points: FloatArray) -> FloatArray:
     """The distinct non-dominated points for minimisation, with shape (points, objectives)."""
-    return np.asarray(moocore.filter_dominated(_check_points(points)))
-
-
-def igd(front: FloatArray, reference: FloatArray) -> float:
-    """Mean Euclidean distance from each point of the reference front to the nearest point of `front`."""
-    return float(moocore.igd(_check_points(front), ref=_check_points(reference)))
-
-
-def igd_plus(front: FloatArray, reference: FloatArray) -> float:
-    """IGD with distances that count only the objectives in which `front` is worse."""
-    return float(moocore.igd_plus(_check_points(front), ref=_check_points(reference)))
+    return np.asarray(moocore.filter_dominated(points))
 
 
 def hypervolume(front: FloatArray) -> float:
     """The volume between `front` and the reference point."""
-    points = _check_points(front)
-    return float(moocore.hypervolume(points, ref=np.full(points.shape[1], REFERENCE_COORDINATE)))
+    return float(moocore.hypervolume(front, ref=np.full(front.shape[1], REFERENCE_COORDINATE)))
 
 
 def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
@@ -231,20 +194,30 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     """IGD, IGD+ and hypervolume of every finished run that has solutions; index algorithm and run, a column for each
     indicator.
 
+    IGD is the mean Euclidean distance from each point of the reference front to the run's nearest point; IGD+ counts
+    only the objectives in which this point is worse.
+
     Raises
     ------
     UnanswerableError
         If there are no runs or no solutions.
     """
-    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     reference = reference_front(case)
-    fronts = {key: defined_minimised_values(case, group) for key, group in case.solutions.groupby(["algorithm", "run"])}
-    rows = {}
-    for run in (run for run in runs if len(fronts.get(run, ()))):
-        scaled_front, scaled_reference = (normalised(points, reference) for points in (fronts[run], reference))
-        rows[run] = igd(fronts[run], reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)
+    scaled_reference, rows = normalised(reference, reference), {}
+    for run, group in _frames_of_runs(case, case.solutions):
+        if len(points := defined_minimised_values(case, group)):
+            scaled = normalised(points, reference)
+            distances = moocore.igd(points, ref=reference), moocore.igd_plus(scaled, ref=scaled_reference)
+            rows[run] = *map(float, distances), hypervolume(scaled)
     index = pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"])
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
+
+
+def _frames_of_runs(case: Case, frame: pd.DataFrame) -> Iterator[tuple[tuple[str, int], pd.DataFrame]]:
+    """The finished runs that have rows, each with its rows, in the study's order of algorithms."""
+    groups = dict(list(frame.groupby(["algorithm", "run"])))
+    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    yield from ((run, groups[run]) for run in runs if run in groups)
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
@@ -259,26 +232,19 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs or no solutions.
     """
-    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
-    reference, budget = reference_front(case), case.study.search.evaluations
-    evaluation_counts = np.unique(
-        np.linspace(min(case.study.search.population, budget), budget, CURVE_POINTS).astype(int)
+    reference, search, frames = reference_front(case), case.study.search, list[pd.DataFrame]()
+    counts = np.unique(
+        np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
     )
-    by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
-    frames = []
-    for algorithm, run in (run for run in runs if run in by_run):
-        points = normalised(minimised_values(case, by_run[algorithm, run]), reference)
+    for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+        points = normalised(minimised_values(case, group), reference)
         is_defined = np.isfinite(points).all(axis=1)
-        points = points[is_defined]
-        ends = np.searchsorted(by_run[algorithm, run]["evaluation"].to_numpy()[is_defined], evaluation_counts)
+        ends = np.searchsorted(group["evaluation"].to_numpy()[is_defined], counts)
         front, volumes = points[:0], []
-        for new_points in np.split(points, ends)[:-1]:
-            front = np.concatenate([front, new_points])
-            front = nondominated_points(front) if len(front) else front
-            volumes.append(hypervolume(front) if len(front) else 0.0)
-        frames.append(
-            pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts, "hypervolume": volumes})
-        )
+        for new_points in np.split(points[is_defined], ends)[:-1]:
+            front = nondominated_points(np.concatenate([front, new_points]))
+            volumes.append(hypervolume(front))
+        frames.append(pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": counts, "hypervolume": volumes}))
     if not frames:
         raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(frames, ignore_index=True)
@@ -299,21 +265,18 @@ def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     surfaces: dict[str, dict[float, FloatArray]] = {}
     signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
     for algorithm in case.algorithms:
+        case.runs_of(algorithm)  # raises if there are none
         solutions = case.solutions_of(algorithm)
-        fronts = [
-            defined_minimised_values(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)
-        ]
-        fronts = [front for front in fronts if len(front)]
-        if fronts:
-            run_indices = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
-            percentages = sorted({100 / len(fronts), *SURFACE_PERCENTAGES})
-            points = moocore.eaf(np.concatenate(fronts), run_indices, percentiles=percentages)
+        points = minimised_values(case, solutions)
+        is_defined = np.isfinite(points).all(axis=1)
+        if is_defined.any():
+            runs = solutions["run"].to_numpy(dtype=int)[is_defined]
+            percentages = sorted({100 / np.unique(runs).size, *SURFACE_PERCENTAGES})
+            surface = moocore.eaf(points[is_defined, :2], runs, percentiles=percentages)
+            surface = surface[np.argsort(surface[:, 0], kind="stable")]
             surfaces[algorithm] = {
-                percentage: (minimised := points[points[:, 2] == percentage, :2])[
-                    np.argsort(minimised[:, 0], kind="stable")
-                ]
-                * signs
-                for percentage in np.unique(points[:, 2]).tolist()
+                percentage: surface[surface[:, 2] == percentage, :2] * signs
+                for percentage in np.unique(surface[:, 2]).tolist()
             }
     if not surfaces:
         raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")

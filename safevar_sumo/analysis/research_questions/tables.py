@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.answer import SAFETY_TABLE, Answer
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
+from safevar_sumo.analysis.research_questions.answer import SAFETY_TABLE, Answer, algorithms_with_few_runs
+from safevar_sumo.analysis.research_questions.changes import WEATHER_COLUMNS
 from safevar_sumo.analysis.research_questions.comparisons import titles_of
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import unit_text
 
 UNDEFINED = "-"
@@ -32,12 +33,13 @@ CELL_FORMATS = {
     **dict.fromkeys(("percent", "percent_other"), ".1f"),
     "difference": "+.1f",
     "effect_size": ".3f",
+    **dict.fromkeys(("p_value", "p_holm"), "p"),
     **dict.fromkeys(("rank", "rank_other", "n1", "n2", "runs", "solutions", "collisions"), "d"),
     **dict.fromkeys(("delta", "increase", "increase_other", "decrease", "decrease_other"), "+.3g"),
     **dict.fromkeys(("min", "Q1", "median", "Q3", "max"), "g"),
 }
-"""Format specifications of the frames' columns."""
-HEADINGS = {
+"""Format specifications of the frames' columns; `p` is three decimals or `<0.001`."""
+HEADINGS: dict[str | int, str] = {
     "setting": "case",
     "p_value": "p",
     "p_holm": "p Holm",
@@ -78,8 +80,6 @@ class Layout(NamedTuple):
 
 
 TESTS = ["p_value", "effect_size", "magnitude", "n1", "n2"]
-WEATHER_COLUMNS = ["percent", "percent_other", "difference", "rank", "rank_other", "increase", "increase_other"]
-WEATHER_COLUMNS += ["decrease", "decrease_other"]
 HOLM_TESTS = ["p_value", "p_holm", "effect_size", "magnitude"]
 LAYOUTS: Mapping[str, Sequence[Layout]] = {
     "rq1": [
@@ -105,7 +105,7 @@ LAYOUTS: Mapping[str, Sequence[Layout]] = {
     ],
     "collisions": [Layout(["algorithm"], ["solutions", "collisions", "share"])],
     "combinations": [Layout(["setting", "rank", "characteristics"], ["percent"], None)],
-    "weather": [Layout(["characteristic"], WEATHER_COLUMNS, None, ["setting", "other"])],
+    "weather": [Layout(["characteristic"], WEATHER_COLUMNS[3:], None, ["setting", "other"])],
 }
 HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
 TITLES = {
@@ -179,81 +179,80 @@ def lay_out(answer: Answer) -> list[Table]:
         for key, group in frame.groupby(list(layout.separate), sort=False) if layout.separate else [((), frame)]:
             title = f"{TITLES[answer.name]}{layout.title}" + (f": {' against '.join(map(str, key))}" if key else "")
             tables.append(Table(title, _arrange(group, layout)))
-    methods = [
-        f"p{' with e' if method == EXACT_TEST and 'p_holm' not in frame else ''}: {method}."
-        for method in (answer.frame["method"].dropna().unique() if "method" in answer.frame else ())
-    ]
-    metric_notes = [_note_on_metrics(answer.metrics)] if "metric" in answer.frame else []
-    notes = (*methods, *NOTES.get(answer.name, ()), *metric_notes, *answer.notes)
-    return [*tables[:-1], tables[-1]._replace(notes=notes)]
+    notes = [*NOTES.get(answer.name, ()), *answer.notes]
+    if "metric" in frame:
+        metrics = {metric.name: metric for case in answer.cases for metric in case.scoring.metrics}.values()
+        notes.insert(len(notes) - len(answer.notes), _note_on_metrics(metrics))
+    if "method" in frame:
+        with_e = "" if "p_holm" in frame else " with e"
+        methods = frame["method"].dropna().unique()
+        notes = [*(f"p{with_e * (method == EXACT_TEST)}: {method}." for method in methods), *notes]
+    return [*tables[:-1], tables[-1]._replace(notes=tuple(notes))]
 
 
 def _arrange(frame: pd.DataFrame, layout: Layout) -> pd.DataFrame:
-    cells = frame.set_index(list(layout.labels), drop=False).rename_axis(index=lambda name: HEADINGS.get(name, name))
+    """The layout's columns, with labels as the index, and a block of columns for each value of `over`."""
+    cells = frame.set_index(list(layout.labels)).rename_axis(index=HEADINGS)[layout.columns]
+    if isinstance(cells, pd.DataFrame):
+        cells = cells.rename(columns=HEADINGS)
     if layout.over is None:
-        return cells[layout.columns].rename(columns=HEADINGS)
-    blocks = {}
-    for block, group in cells.groupby(frame[layout.over].to_numpy(), sort=False):
-        columns = group[layout.columns]
-        blocks[block] = columns if isinstance(columns, pd.Series) else columns.rename(columns=HEADINGS)
-    return pd.concat(blocks, axis=1).fillna(UNDEFINED)
+        return cells
+    groups = cells.groupby(frame[layout.over].to_numpy(), sort=False)
+    return pd.concat(dict(list(groups)), axis=1).fillna(UNDEFINED)
 
 
 def _readable_frame(answer: Answer) -> pd.DataFrame:
     """The frame with titles in place of names and numbers as text."""
     name, frame = answer.name, answer.frame
     if name == "rq3.1":
-        counts, quartiles = frame.groupby(["setting", "j"], sort=False)["count"], ("min", "Q1", "median", "Q3", "max")
-        frame = pd.DataFrame({quartile: counts.quantile(k / 4) for k, quartile in enumerate(quartiles)}).reset_index()
+        quartiles = frame.groupby(["setting", "j"], sort=False)["count"].quantile(np.linspace(0, 1, 5)).unstack()
+        frame = quartiles.set_axis(["min", "Q1", "median", "Q3", "max"], axis=1).reset_index()
     if name == "rq3.2":
         frame = frame.assign(rank=frame.groupby(["setting", "characteristic"], sort=False)["rank"].transform("max"))
     if name == "combinations":
         frame = frame.assign(characteristics=frame["characteristics"].map(", ".join))
-    cells, titles = frame.copy(), {**ALGORITHM_TITLES, **SAFETY_UNITS, **titles_of(answer.metrics)}
-    for column in cells.columns.intersection(list(CELL_FORMATS)):
-        cells[column] = [_format(value, CELL_FORMATS[column]) for value in frame[column]]
-    for column in ("algorithm", "baseline", "metric", "quantity", *(["other"] if name == "rq2-pairs" else [])):
-        if column in frame:
-            cells[column] = frame[column].map(lambda value: titles.get(value, value))
+    titles = titles_of(answer.cases) | SAFETY_UNITS
+    texts = {
+        column: [_format(value, CELL_FORMATS[column]) for value in frame[column]]
+        for column in frame.columns.intersection(list(CELL_FORMATS))
+    }
+    names = {
+        column: frame[column].replace(titles)
+        for column in ("algorithm", "baseline", "metric", "quantity", *(["other"] if name == "rq2-pairs" else []))
+        if column in frame
+    }
+    cells = frame.assign(**texts, **names)
     return _mark_tests(cells, answer) if "p_value" in frame else cells
 
 
 def _mark_tests(cells: pd.DataFrame, answer: Answer) -> pd.DataFrame:
-    """P-values as text, and what stands out in bold: significant p-values (after Holm's correction if the frame has
-    it), and significant effect sizes, without the correction only notable ones.
+    """What stands out in bold: significant p-values (after Holm's correction if the frame has it), and significant
+    effect sizes, without the correction only notable ones.
     """
     frame = answer.frame
-    p_values = {
-        name: frame[name].map(lambda p: "<0.001" if p is not None and p < 0.001 else _format(p, ".3f"))
-        for name in ("p_value", "p_holm")
-        if name in frame
-    }
-    name = list(p_values)[-1]
-    is_significant = is_notable = frame[name].astype(float) < ALPHA
+    name = "p_holm" if "p_holm" in frame else "p_value"
+    is_significant = is_notable = frame[name] < ALPHA
     if name == "p_value":
-        algorithms = frame["algorithm" if answer.name == "rq1" else "baseline"]
-        is_tested = [pair not in answer.untested for pair in zip(frame["setting"], algorithms, strict=True)]
-        is_significant &= np.array(is_tested)
+        few = {(case.name, one) for case in answer.cases for one in algorithms_with_few_runs(case, answer.name.upper())}
+        pairs = zip(frame["setting"], frame["algorithm" if answer.name == "rq1" else "baseline"], strict=True)
+        is_significant &= np.array([pair not in few for pair in pairs])
         is_notable = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
-        p_values[name] += np.where(frame["method"] == EXACT_TEST, "e", "")
-    cells = cells.assign(**p_values)
-    cells[name] = _bold_where(cells[name], is_significant)
-    if "effect_size" in cells:
-        cells["effect_size"] = _bold_where(cells["effect_size"], is_notable)
+        cells["p_value"] += np.where(frame["method"] == EXACT_TEST, "e", "")
+    for column, condition in ((name, is_significant), ("effect_size", is_notable)):
+        if column in cells:
+            cells[column] = cells[column].where(~condition, cells[column].map(BoldText))
     return cells
 
 
-def _bold_where(cells: pd.Series[str], conditions: pd.Series[bool]) -> list[str]:
-    return [BoldText(cell) if is_bold else cell for cell, is_bold in zip(cells, conditions, strict=True)]
-
-
-def _format(value: float | None, spec: str) -> str:
-    if value is None or pd.isna(value):
+def _format(value: float, spec: str) -> str:
+    if pd.isna(value):
         return UNDEFINED
+    if spec == "p":
+        return "<0.001" if value < 0.001 else f"{value:.3f}"
     return format(int(value) if spec == "d" else value, spec)
 
 
-def _note_on_metrics(metrics: Sequence[MetricFacts]) -> str:
+def _note_on_metrics(metrics: Collection[MetricFacts]) -> str:
     """The metrics' units, and the solutions over which each metric is taken."""
     parts = []
     for over_collisions, which in ((False, "solutions without collision"), (True, "all solutions")):
@@ -282,7 +281,7 @@ def as_text(answers: Sequence[Answer]) -> str:
     texts = []
     for table in (table for answer in answers for table in lay_out(answer)):
         cells = table.frame.map(lambda cell: f"{cell}*" if isinstance(cell, BoldText) else f"{cell} ")
-        body = [] if cells.empty else ["\n".join(line.rstrip() for line in cells.to_string().splitlines()), ""]
+        body = [] if cells.empty else [re.sub(" +$", "", cells.to_string(), flags=re.MULTILINE), ""]
         texts.append("\n".join([table.title, "", *body, *table.notes, ""]))
     return "\n".join(texts)
 
@@ -293,10 +292,12 @@ def as_markdown(answers: Sequence[Answer]) -> str:
     for table in (table for answer in answers for table in lay_out(answer)):
         frame, body = table.frame, list[str]()
         if not frame.empty:
-            columns = frame.columns.to_frame().astype(str)
-            blocks = columns if columns.shape[1] == 1 or columns[0].nunique() > 1 else columns[[1]]
-            headings = [*map(str, frame.index.names), *blocks.agg(": ".join, axis=1)]
-            body = [markdown_table([headings, *frame.reset_index().to_numpy().tolist()], frame.index.nlevels), ""]
+            columns = frame.columns
+            if columns.nlevels > 1:
+                is_one_block = len(columns.unique(0)) == 1
+                columns = columns.get_level_values(1) if is_one_block else columns.map(": ".join)
+            rows = [[*frame.index.names, *map(str, columns)], *frame.reset_index().to_numpy().tolist()]
+            body = [markdown_table(rows, frame.index.nlevels), ""]
         notes = (f"{_markdown(note)}  " for note in table.notes)
         texts.append("\n".join([f"**{_markdown(table.title)}**", "", *body, *notes, ""]))
     return "\n".join(texts)
@@ -357,11 +358,10 @@ def escaped_for_latex(source: str) -> str:
 def as_csv(answers: Sequence[Answer]) -> str:
     """The tidy frame as CSV; several frames are separated by empty lines, and each follows a line with its name."""
     tables = []
-    for answer in answers:
-        frame = answer.frame
+    for name, frame, *_ in answers:
         if "characteristics" in frame:
             frame = frame.assign(characteristics=frame["characteristics"].map(" ".join))
-        title_line = f"# {answer.name}\n" if len(answers) > 1 else ""
+        title_line = f"# {name}\n" if len(answers) > 1 else ""
         tables.append(title_line + ("" if frame.empty else frame.to_csv(index=False, lineterminator="\n")))
     return "\n".join(tables)
 
@@ -370,14 +370,12 @@ def as_json(answers: Sequence[Answer]) -> str:
     """One list of records; undefined values are null, a missing rank has no key; with several tables, each record names
     its "table".
     """
-    rows: list[dict[Any, Any]] = []
-    for answer in answers:
-        frame = answer.frame.astype(object).where(answer.frame.notna(), None)
-        table_key = {"table": answer.name} if len(answers) > 1 else {}
-        rows += [
-            table_key | {name: value for name, value in row.items() if name != "rank" or value is not None}
-            for row in frame.to_dict("records")
-        ]
+    rows = list[JsonObject]()
+    for name, frame, *_ in answers:
+        table_key = {"table": name} if len(answers) > 1 else {}
+        for row in frame.astype(object).where(frame.notna(), None).to_dict("records"):
+            defined = {str(key): value for key, value in row.items() if key != "rank" or value is not None}
+            rows.append(table_key | defined)
     return json.dumps(rows, indent=2, allow_nan=False) + "\n"
 
 
