@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -304,11 +304,9 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
     """Numbers of the cells in one of `parts` parts; cells with the same network share a part as far as possible."""
 
-    def network_of(number: int) -> tuple[Any, ...]:
+    def network_of(number: int) -> tuple[str, bool, str]:
         model, parameters, _ = protocol.cells[number].scenario
-        test = protocol.cells[number].matrix.test_name
-        variation = (parameters.get("heading", 0.0), "start_share" in parameters)
-        return model, test in ("CPNA", "CPFA", "CPNCO"), variation, test
+        return model, "heading" in parameters or "start_share" in parameters, protocol.cells[number].matrix.test_name
 
     numbers = sorted(range(len(protocol.cells)), key=network_of)
     return numbers[len(numbers) * part // parts : len(numbers) * (part + 1) // parts]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import unknown_name
 from safevar_sumo.protocol.cells import COLOURS, EXTENDED, NOT_RED, STANDARD, WARNING, CellMatrix, Protocol, protocol_of
 from safevar_sumo.records import KMH_PER_MS, BoolArray, CellResults, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import weather_of
@@ -149,17 +149,13 @@ def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Bool
     """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see
     `CellResults`.
     """
-    warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
-    return (
-        runs.relative_speed * KMH_PER_MS,
-        warning,
-        (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR),
-    )
+    is_valid = (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
+    return runs.relative_speed * KMH_PER_MS, np.broadcast_to(runs.warning_ttc, is_valid.shape), is_valid
 
 
 def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> CellResults:
     """Join the `rated_quantities` of each cell to the results of all cells for M vehicles."""
-    return CellResults(*(np.stack(list(values), axis=1) for values in zip(*quantities, strict=True)))
+    return CellResults(*(np.stack(values, axis=1) for values in zip(*quantities, strict=True)))
 
 
 def is_rated(study: Study) -> bool:
@@ -182,20 +178,13 @@ def rater_of(study: Study, source: str) -> Rater | None:
     if study.matrix is None or not study.matrix.protocol:
         return None
     protocol = protocol_of(study.matrix.protocol)
-    for test, layers in study.rating.claims.items():
+    for test, claims in study.rating.claims.items():
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
             raise unknown_name(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
-        is_simulated = {layer.name: bool(layer.simulated_conditions) for layer in protocol.layers_of(test)}
-        for claimed in layers:
-            if claimed not in is_simulated:
-                raise unknown_name(source, f"{key}: {claimed!r} does not count for {test}", claimed, is_simulated)
-            if is_simulated[claimed]:
-                raise InputError(
-                    source,
-                    f"{key}: {claimed!r} is simulated for {test} and cannot be claimed",
-                    "one of " + ", ".join(name for name in is_simulated if not is_simulated[name]),
-                )
+        legal = [layer.name for layer in protocol.layers_of(test) if not layer.simulated_conditions]
+        for claim in (claim for claim in claims if claim not in legal):
+            raise unknown_name(source, f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 
@@ -218,9 +207,9 @@ def reduce_to_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> S
 
 def darken(weather: Weather) -> Weather:
     """The weather by night: the same road; darkness changes visibility and recognition delay."""
-    night = weather_of("night", "weather")
     if weather.light == "night":
         return weather
+    night = weather_of("night", "weather")
     name = "night" if weather == weather_of("clear", "weather") else f"{weather.name} by night"
     return replace(
         weather,
@@ -235,16 +224,11 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
     """Give the study a test for each cell of its protocol; tests by day have the study's weather."""
     assert study.matrix is not None
     shared_parameters = {name: value for name, value in study.scenario.parameters.items() if name in SHARED_PARAMETERS}
-    weather_by_night, tests = darken(weather), []
+    by_night, tests = darken(weather), []
     for cell in protocol_of(study.matrix.protocol).cells:
-        model, parameters, by_night = cell.scenario
-        tests.append(
-            MatrixTest(
-                name=cell.name,
-                model=model,
-                parameters={**shared_parameters, **parameters},
-                weathers=[weather_by_night if by_night else weather],
-            )
-        )
+        model, parameters, is_night = cell.scenario
+        parameters = {**shared_parameters, **parameters}
+        weathers: list[str | Weather] = [by_night if is_night else weather]
+        tests.append(MatrixTest(name=cell.name, model=model, parameters=parameters, weathers=weathers))
     no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters
     return replace(study, matrix=MatrixTable(tests=tests), scenario=no_parameters)

@@ -16,6 +16,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -197,12 +198,7 @@ def sumo_version() -> str:
 
 def round_up(n: int) -> int:
     """Round up to 1, 2, 5, 10, 20, 50, ..., so that few sizes of networks serve all batches."""
-    size = 1
-    while True:
-        for factor in (1, 2, 5):
-            if n <= size * factor:
-                return size * factor
-        size *= 10
+    return int(next(size for power in count() for factor in (1, 2, 5) if (size := factor * 10**power) >= n))
 
 
 def cache_folder_name(network: Network, n: int, digests: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -31,7 +31,7 @@ from safevar_sumo.plugins import Guard, Lookup, Member, accepts, check_parameter
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
-from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
+from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import check_network, network_remarks
 from safevar_sumo.sumo.traci_controller import TraciController, substitute_traci
@@ -83,41 +83,39 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         If a metric or measure of change does not exist, is invalid, or has a name that is taken.
     """
     metrics = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}
-    shipped, changes = {**metrics, **OPTIONAL_METRICS}, dict[str, Change]()
-    objectives_alone, users = {**CHANGES, **METRIC_OF_OBJECTIVE}, dict[str, Metric | Change]()
+    shipped: Mapping[str, Metric] = {**metrics, **OPTIONAL_METRICS}
+    changes, users = dict[str, Change](), dict[str, Metric | Change]()
 
-    def look_up(name: str, key: str) -> Metric | Change:
+    def look_up(shipped: Mapping[str, Metric | Change], name: str, key: str) -> Metric | Change:
         if name in users:
             return users[name]
-        member = lookup.find({**shipped, **(objectives_alone if key == OBJECTIVES_KEY else {})}, name, key)
+        member = lookup.find(shipped, name, key)
         record: Metric | Change = member.target
-        if member.guard is None:
-            if name in OPTIONAL_METRICS:
-                metrics[name] = OPTIONAL_METRICS[name]
-            return record
-        is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
-        record = (guard_change if is_change else guard_metric)(record, member.guard)
-        if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
-            raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
-        if isinstance(record, Change):
-            changes[record.name] = record
-        else:
-            metrics[record.name] = record
-        users[name] = users[record.name] = record
+        if member.guard is not None:
+            is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
+            record = (guard_change if is_change else guard_metric)(record, member.guard)
+            if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
+                raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
+            users[name] = users[record.name] = record
+            if isinstance(record, Change):
+                changes[record.name] = record
+        if isinstance(record, Metric):
+            metrics.setdefault(record.name, record)
         return record
 
     for name in study.metrics.also:
         if name in METRICS:
             problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
             raise InputError(lookup.source, problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
-        look_up(name, "metrics.also")
+        look_up(shipped, name, "metrics.also")
     objectives = []
     for name in study.search.objectives:
-        record = look_up(METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name, OBJECTIVES_KEY)
-        if isinstance(record, Metric):
-            objectives.append(Objective.of(record))
-        else:
-            objectives.append(Objective(name=record.name, title=record.title, unit=record.unit))
+        record = look_up({**shipped, **CHANGES, **METRIC_OF_OBJECTIVE}, name, OBJECTIVES_KEY)
+        objectives.append(
+            Objective.of(record)
+            if isinstance(record, Metric)
+            else Objective(name=record.name, title=record.title, unit=record.unit)
+        )
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"
@@ -280,48 +278,39 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
 
 def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
-    tests = () if study.matrix is None else study.matrix.tests
-    points = tuple(point for test in tests for point in _points_of(test, study, source))
-    ((name, count),) = Counter(point.name for point in points).most_common(1) or [("", 0)]
-    if count > 1:
-        raise InputError(
-            source, f"matrix.tests: {count} points are {name!r}", "unique names of tests, and each value once"
-        )
-    return points
+    points = []
+    for test in () if study.matrix is None else study.matrix.tests:
+        lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
+        model, shared = test.model or study.scenario.model, dict(test.parameters)
+        if model == study.scenario.model:
+            shared = {**study.scenario.parameters, **shared}
+        for values in product(*test.over.values()):
+            over = dict(zip(test.over, values, strict=True))
+            scenario = _create_scenario(ModelTable(model=model, parameters={**shared, **over}), lookup)
+            for weather in (weather_of(choice, lookup.source) for choice in test.weathers or [study.weather]):
+                name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
+                parameters = {"test": test.name, **over, "weather": weather.name}
+                points.append(Point(scenario, weather, name, tuple(parameters.items())))
+    for name, count in Counter(point.name for point in points).items():
+        if count > 1:
+            legal = "unique names of tests, and each value once"
+            raise InputError(source, f"matrix.tests: {count} points are {name!r}", legal)
+    return tuple(points)
 
 
-def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
-    same_model = test.model in ("", study.scenario.model)
-    base = {**(study.scenario.parameters if same_model else {}), **test.parameters}
-    lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
-    weathers: list[str | Weather] = list(test.weathers) or [study.weather]
-    for values in product(*test.over.values()):
-        over = dict(zip(test.over, values, strict=True))
-        scenario = _create_scenario(
-            ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup
-        )
-        for choice in weathers:
-            weather = weather_of(choice, lookup.source)
-            parameters = {"test": test.name, **over, "weather": weather.name}
-            name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
-            yield Point(scenario, weather, name, tuple(parameters.items()))
-
-
-def _locate_network(scenario: Any, search_folders: Sequence[str]) -> Any:
+def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
     """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the
     study.
 
     A folder with sources has priority, because a results directory beside the study may have the same name.
     """
-    name = scenario.network
-    paths = [path for folder in search_folders if is_network(path := Path(folder, name))]
-    network = str(
-        next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0] if paths else name)
-    )
-    if network == name or is_shipped(name):
+    paths = [path for folder in folders if is_network(path := Path(folder, scenario.network))]
+    if not paths or is_shipped(scenario.network):
         return scenario
+    network = str(next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0]))
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=network)
+    assert isinstance(scenario, GuardedScenario)
     scenario.network = network
     return scenario
 
@@ -358,8 +347,8 @@ def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
         parameters = lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")
-        units = {name: row.unit for name, row in table.characteristics.items()}
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
+        units = {name: row.unit for name, row in table.characteristics.items()}
         return FmuVehicle(description, units, {**msgspec.structs.asdict(table), "parameters": parameters}, guard)
     member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
     vehicle: Vehicle = create()
@@ -368,9 +357,8 @@ def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
 
 def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, Scenario)
-    scenario = create() if member.guard is None else GuardedScenario(create(), member.guard)
-    located: Scenario = _locate_network(scenario, lookup.folders)
-    return located
+    scenario: Scenario = create() if member.guard is None else GuardedScenario(create(), member.guard)
+    return _locate_network(scenario, lookup.folders)
 
 
 def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:

@@ -320,35 +320,26 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
     smaller overlap.
     """
-    across = np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)
-    to_other = other.middle - own.middle
-    relative_velocity = own.along * own.speed[:, np.newaxis] - other.along * other.speed[:, np.newaxis]
-    cosine, sine = np.abs(_dot(other.along, own.along)), np.abs(_dot(other.along, across))
-    extent_along = (own.length + other.length * cosine + other.width * sine) / 2
-    extent_across = (own.width + other.length * sine + other.width * cosine) / 2
-    x_ahead, x_left = _dot(to_other, own.along), _dot(to_other, across)
-    speed_ahead = _dot(relative_velocity, own.along)
-    age_along = _overlap_age(extent_along - np.abs(x_ahead), np.copysign(1.0, x_ahead) * speed_ahead)
-    age_across = _overlap_age(
-        extent_across - np.abs(x_left), np.copysign(1.0, x_left) * _dot(relative_velocity, across)
+    axes = np.stack([own.along, np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)])
+    cosine, sine = np.abs(_dot(other.along, axes))
+    extent = np.stack(
+        [
+            (own.length + other.length * cosine + other.width * sine) / 2,
+            (own.width + other.length * sine + other.width * cosine) / 2,
+        ]
     )
-    is_approaching = np.isfinite(np.minimum(age_along, age_across))
-    is_lengthwise = np.where(
-        is_approaching, age_along < age_across, extent_along - np.abs(x_ahead) < extent_across - np.abs(x_left)
-    )
-    age = np.where(is_approaching, np.where(is_lengthwise, age_along, age_across), 0.0)
-    side = np.where(is_lengthwise, np.where(x_ahead > 0, FRONT, REAR), np.where(x_left > 0, LEFT, RIGHT))
-    return side, age, own.length / 2 - (x_ahead + age * speed_ahead)
+    distance = _dot(other.middle - own.middle, axes)
+    speed = _dot(own.along * own.speed[:, np.newaxis] - other.along * other.speed[:, np.newaxis], axes)
+    overlap, closing_speed = extent - np.abs(distance), np.copysign(1.0, distance) * speed
+    is_closing = closing_speed > 0
+    ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)
+    is_lengthwise = np.where(is_closing.any(axis=0), ages[0] < ages[1], overlap[0] < overlap[1])
+    age = np.where(is_closing.any(axis=0), np.where(is_lengthwise, *ages), 0.0)
+    ahead, left = distance > 0
+    side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
+    return side, age, own.length / 2 - (distance[0] + age * speed[0])
 
 
-def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
-    return first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1]
-
-
-def _overlap_age(overlap: FloatArray, closing_speed: FloatArray) -> FloatArray:
-    """Time since bodies began to overlap in one direction, at a closing speed [s]; infinite if they do not approach
-    each other.
-    """
-    return np.where(
-        closing_speed > 0, np.maximum(overlap, 0.0) / np.where(closing_speed > 0, closing_speed, 1.0), np.inf
-    )
+def _dot(vectors: FloatArray, axes: FloatArray) -> FloatArray:
+    """Components of M vectors along their two axes, shape (2, M)."""
+    return vectors[:, 0] * axes[..., 0] + vectors[:, 1] * axes[..., 1]
