@@ -209,13 +209,8 @@ class Guard(NamedTuple):
         """File and line at which a method begins, else the class or function; "" for FMUs and compiled code."""
         target = getattr(self.target, "function", self.target)
         function = inspect.unwrap(getattr(target, method, target))
-        code = getattr(function, "__code__", None)
         try:
-            return (
-                f"{code.co_filename}:{code.co_firstlineno}"
-                if code
-                else f"{inspect.getfile(target)}:{inspect.getsourcelines(target)[1]}"
-            )
+            return f"{inspect.getfile(function)}:{inspect.getsourcelines(function)[1]}"
         except (OSError, TypeError):
             return ""
 

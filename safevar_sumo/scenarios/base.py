@@ -335,8 +335,7 @@ class GuardedScenario(Scenario):
         if not isinstance(changes, Mapping):
             raise self._guard.wrong_value(method, "changes", changes, "a mapping from XPaths to attributes")
         return {
-            str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
-            for path, change in changes.items()
+            path: change and {name: str(value) for name, value in change.items()} for path, change in changes.items()
         }
 
     def remarks(self) -> list[str]:
