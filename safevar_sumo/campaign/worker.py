@@ -287,15 +287,13 @@ class _ShareCarrier:
         if self._share.recorded_work:  # SUMO repeats a few cells of a rating; the runs have no values of single cells
             recorded = evaluate(self._share.recorded_work)
         refuse_unlike_sumo(self._study, recorded, in_sumo)
-        start = 0
-        for run, sample in zip(runs, samples, strict=True):
-            failed_rows = start + np.flatnonzero(in_sumo.failed[start : start + len(sample)])
-            start += len(sample)
-            if len(failed_rows):
-                self._report(
-                    f"run {run.key}: {len(failed_rows)} of {len(sample)} settings could not be verified in SUMO: "
-                    f"{in_sumo.reason(failed_rows[0])}"
-                )
+        failed_rows = np.flatnonzero(in_sumo.failed)
+        if len(failed_rows):
+            names = ", ".join(str(run.key) for run in runs)
+            self._report(
+                f"runs {names}: {len(failed_rows)} of {len(in_sumo)} settings could not be verified in SUMO: "
+                f"{in_sumo.reason(failed_rows[0])}"
+            )
 
     def _generator(self, purpose: str, key: RunKey) -> np.random.Generator:
         """The random generator that draws the settings of a run to simulate again."""

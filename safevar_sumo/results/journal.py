@@ -23,7 +23,7 @@ import portalocker
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.results.manifest import FORMAT, RUNS
+from safevar_sumo.results.manifest import FORMAT, RUNS, disk_errors
 
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
@@ -94,10 +94,8 @@ class Journal:
         self.path, self._head = path, head
         self._file = _open_and_lock(path, deadline)
         try:
-            self.content = self._read_and_claim()
-        except OSError as error:
-            self._file.close()
-            raise SafevarError(f"{path}: cannot be read: {error.strerror}; earlier data stays valid") from None
+            with disk_errors(path, "read"):
+                self.content = self._read_and_claim()
         except BaseException:
             self._file.close()
             raise
@@ -147,19 +145,19 @@ class Journal:
         return _content_of(lines, self.path, self._head)._replace(tail_size=len(data) - end)
 
     def _write(self, line: JsonObject, *, sync: bool = False) -> None:
-        start = self._file.tell()
-        try:
-            remainder = memoryview(msgspec.json.encode(line) + b"\n")
-            while remainder:
-                remainder = remainder[self._file.write(remainder) :]
-            if not self.path.exists():
-                raise OSError(errno.ENOENT, "the file is gone")
-            if sync:
-                os.fsync(self._file.fileno())
-        except OSError as error:
-            with suppress(OSError):  # if this fails too, the next reader cuts off the torn line
-                self._truncate(start)
-            raise SafevarError(f"{self.path}: cannot be written: {error.strerror}; earlier data stays valid") from None
+        with disk_errors(self.path, "written"):
+            start, remainder = self._file.tell(), memoryview(msgspec.json.encode(line) + b"\n")
+            try:
+                while remainder:
+                    remainder = remainder[self._file.write(remainder) :]
+                if not self.path.exists():
+                    raise OSError(errno.ENOENT, "the file is gone")
+                if sync:
+                    os.fsync(self._file.fileno())
+            except OSError:
+                with suppress(OSError):  # if this fails too, the next reader cuts off the torn line
+                    self._truncate(start)
+                raise
 
     def _truncate(self, end: int) -> None:
         self._file.truncate(end)
@@ -198,11 +196,9 @@ def files_read_later(directory: Path) -> dict[str, str]:
 
 
 def _open_and_lock(path: Path, deadline: float) -> IO[bytes]:
-    try:
+    with disk_errors(path, "opened"):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = open(path, "a+b", buffering=0)  # noqa: SIM115
-    except OSError as error:
-        raise SafevarError(f"{path}: cannot be opened: {error.strerror}") from None
     while True:
         try:
             portalocker.lock(file, portalocker.LOCK_EX | portalocker.LOCK_NB)

@@ -5,7 +5,7 @@ choice.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.journal import JournalContent, journal_head, read_journal
-from safevar_sumo.results.manifest import MANIFEST, identity_digest, journal_file, read_manifest, run_name
+from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -131,26 +131,18 @@ class Status(NamedTuple):
         }
 
 
-def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, int]], int, tuple[str, ...]]:
-    """The runs of a manifest's study, the budget of each run [evaluations], and the characteristics."""
-    try:
-        study = manifest["study"]
-        search, labels = study["search"], dict.fromkeys(map(label_of, study["search"]["algorithms"]))
-        runs = [(name, run) for name in labels for run in range(search["runs"])]
-        return runs, int(search["evaluations"]), tuple(study["vehicle"]["characteristics"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(folder / MANIFEST, f"was edited: {error!r}", "what the command `study` has written") from None
-
-
-def _read_journals(
-    folder: Path, manifest: JsonObject, runs: Sequence[tuple[str, int]], characteristics: Collection[str]
-) -> Iterator[tuple[str, int, JournalContent | None]]:
-    """Algorithm, number and journal's content of every run; None for a run without a journal."""
-    digest = identity_digest(manifest)
-    for algorithm, run in runs:
-        path = journal_file(folder, run_name(algorithm, run))
-        content = read_journal(path, journal_head(digest, path.stem, characteristics)) if path.exists() else None
-        yield algorithm, run, content
+def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, int, JournalContent | None]], int]:
+    """Algorithm, number and journal's content of every run, None without a journal; and the runs' budget
+    [evaluations].
+    """
+    search, digest = manifest["study"]["search"], identity_digest(manifest)
+    characteristics, runs = manifest["study"]["vehicle"]["characteristics"], []
+    for algorithm in dict.fromkeys(map(label_of, search["algorithms"])):
+        for run in range(search["runs"]):
+            path = journal_file(folder, run_name(algorithm, run))
+            content = read_journal(path, journal_head(digest, path.stem, characteristics)) if path.exists() else None
+            runs.append((algorithm, run, content))
+    return runs, search["evaluations"]
 
 
 def load_runs(directory: str | Path) -> StoredResults:
@@ -163,12 +155,13 @@ def load_runs(directory: str | Path) -> StoredResults:
     """
     folder = Path(directory)
     manifest = read_manifest(folder)
-    runs, budget, characteristics = _read_search(folder, manifest)
+    characteristics = manifest["study"]["vehicle"]["characteristics"]
     if "imported" in manifest:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
     evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], list[int](), list[Failure]()
-    for algorithm, run, content in _read_journals(folder, manifest, runs, characteristics):
+    runs, budget = _read_search(folder, manifest)
+    for algorithm, run, content in runs:
         if content is None:
             continue
         if content.tail_size and budget not in content.results:
@@ -206,9 +199,9 @@ def status(directory: str | Path) -> Status:
     manifest = read_manifest(folder)
     if "imported" in manifest:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
-    runs, budget, characteristics = _read_search(folder, manifest)
+    runs, budget = _read_search(folder, manifest)
     statuses, points = list[RunStatus](), [np.zeros((0, 3))]
-    for algorithm, run, content in _read_journals(folder, manifest, runs, characteristics):
+    for algorithm, run, content in runs:
         if content is None:
             statuses.append(RunStatus(algorithm, run, "waiting", 0, 0, 0, best=None))
             continue

@@ -8,6 +8,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -119,11 +120,21 @@ def write_whole(path: Path, text: str) -> None:
     SafevarError
         If the file cannot be written.
     """
+    with (
+        disk_errors(path, "written"),
+        whole_file(path) as temporary_file,
+        open(temporary_file, "x", encoding="utf-8", newline="") as file,
+    ):
+        file.write(text)
+
+
+@contextmanager
+def disk_errors(path: Path, action: str) -> Iterator[None]:
+    """Turn an error of the operating system into the error that `path` cannot be read, written, opened or removed."""
     try:
-        with whole_file(path) as temporary_file, open(temporary_file, "x", encoding="utf-8", newline="") as file:
-            file.write(text)
+        yield
     except OSError as error:
-        raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None
+        raise SafevarError(f"{path}: cannot be {action}: {error.strerror}; earlier data stays valid") from None
 
 
 def manifest_of(study: Study, identity: Tables) -> JsonObject:

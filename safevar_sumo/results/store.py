@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import digest_of, file_by_name
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
@@ -26,6 +26,7 @@ from safevar_sumo.results.manifest import (
     RUNS,
     SOLUTIONS,
     differences,
+    disk_errors,
     identity_digest,
     journal_file,
     make_directory,
@@ -105,12 +106,8 @@ class ResultsDirectory:
         earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
         write_manifest(self.path, manifest)
         if search_extent_of(earlier_manifest) != search_extent_of(manifest):
-            try:
+            with disk_errors(self.path / SOLUTIONS, "removed"):
                 (self.path / SOLUTIONS).unlink(missing_ok=True)
-            except OSError as error:
-                raise SafevarError(
-                    f"{self.path / SOLUTIONS}: cannot be removed: {error.strerror}; it is outdated"
-                ) from None
 
     def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""

@@ -18,20 +18,14 @@ class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         settings = problem.characteristics.filter(problem.uniform(problem.evaluations, rng))
-        archive: Evaluations | None = None
+        archive = problem.original.take([])
         for start in range(0, len(settings), problem.population):
             evaluated = yield settings[start : start + problem.population]
-            archive = _keep_non_dominated(
-                evaluated if archive is None else Evaluations.concatenate([archive, evaluated]), problem.scoring
-            )
-        assert archive is not None
+            archive = Evaluations.concatenate([archive, evaluated])
+            archive = archive.take(problem.scoring.valid(archive))
+            if len(archive):
+                archive = archive.take(moocore.is_nondominated(problem.scoring.values(archive), keep_weakly=True))
         return archive
-
-
-def _keep_non_dominated(evaluations: Evaluations, scoring: Scoring) -> Evaluations:
-    """The valid non-dominated evaluations, including all with equal objectives."""
-    valid = evaluations.take(scoring.valid(evaluations))
-    return valid.take(moocore.is_nondominated(scoring.values(valid), keep_weakly=True)) if len(valid) else valid
 
 
 RESULT_SIZE = 50

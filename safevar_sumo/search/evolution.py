@@ -91,28 +91,22 @@ class Reproduction:
             self._random_state = random.getstate()
             random.setstate(state_of_caller)
 
-    def draw_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
-        children: list[Individual] = []
-        with self.randomness():
-            while population and len(children) < number:
-                pair = self._crossover(self.select_parent(population), self.select_parent(population))
-                children += self._feasible_children([self._mutate(child) for child in pair])
-        return children[:number]
+    def draw_offspring(self, population: list[Individual], number: int, *, distinct: bool = False) -> list[Individual]:
+        """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation.
 
-    def draw_distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """Draw `number` new individuals; all parents enter equally many tournaments, and copies of existing individuals
-        are drawn again.
+        With `distinct` all parents enter equally many tournaments, and copies of existing individuals are drawn again.
         """
         existing, children, draws = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
             while population and len(children) < number:
-                for child in self._feasible_children(
-                    [self._mutate(child) for child in self._crossover(*self._parents(population))]
-                ):
-                    is_repeated, draws = tuple(child) in existing, draws + 1
-                    if not is_repeated or draws > MAX_REDRAWS * number:
+                if distinct:
+                    parents = self._parents(population)
+                else:
+                    parents = self.select_parent(population), self.select_parent(population)
+                for child in self._feasible_children([self._mutate(child) for child in self._crossover(*parents)]):
+                    draws += 1
+                    if not distinct or tuple(child) not in existing or draws > MAX_REDRAWS * number:
                         existing.add(tuple(child))
                         children.append(child)
         return children[:number]
@@ -185,20 +179,12 @@ def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> 
     """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     fitness, valid = fitness_class(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
-    for i, (individual, objectives) in enumerate(
+    for row, (individual, values) in enumerate(
         zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)
     ):
-        individual.evaluation, individual.fitness, individual.has_failed = (
-            (evaluated, i),
-            fitness(tuple(objectives)),
-            not valid[i],
-        )
+        individual.evaluation, individual.has_failed = (evaluated, row), not valid[row]
+        individual.fitness = fitness(tuple(values))
     return len(individuals)
-
-
-def objectives_of(individuals: Sequence[Individual]) -> FloatArray:
-    """Objectives of individuals, shape (M, objectives)."""
-    return np.array([individual.fitness.values for individual in individuals])
 
 
 def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
@@ -242,7 +228,5 @@ def run_tournament(population: list[Individual], size: int = 2) -> Individual:
 
 def join_evaluations(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
     """Join the evaluations of individuals in one batch."""
-    evaluations_of_individuals = [
-        evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)
-    ]
-    return Evaluations.concatenate(evaluations_of_individuals) if individuals else problem.original.take([])
+    batches = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
+    return Evaluations.concatenate([problem.original.take([]), *batches])

@@ -5,14 +5,16 @@ MOCell (Nebro et al. 2009), here synchronous, so that a generation is one batch.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import copy
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import FloatArray
 from safevar_sumo.search.base import Problem, Search
 from safevar_sumo.search.evolution import (
     Individual,
@@ -21,7 +23,6 @@ from safevar_sumo.search.evolution import (
     Size,
     initial_population,
     join_evaluations,
-    objectives_of,
     request_evaluations,
     set_front_standings,
     set_standings,
@@ -38,14 +39,28 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        reproduction = Reproduction(self, problem, rng)
-        offspring, population, used = initial_population(problem, rng), list[Individual](), 0
-        while offspring:
-            used += yield from request_evaluations(offspring, problem)
-            valid_offspring = [individual for individual in offspring if not individual.has_failed]
-            population = select_survivors(population + valid_offspring, problem.population)
-            offspring = reproduction.draw_offspring(population, min(problem.population, problem.evaluations - used))
-        return join_evaluations([individual for individual in population if individual.standing[0] == 0], problem)
+        return _search_elitist(self, problem, rng, partial(select_survivors, number=problem.population))
+
+
+def _search_elitist(
+    operators: Operators,
+    problem: Problem,
+    rng: np.random.Generator,
+    select: Callable[[list[Individual]], list[Individual]],
+    *,
+    distinct: bool = False,
+) -> Search:
+    """Search with survivors, which `select` chooses from survivors and offspring and whose `standing` begins with less
+    than 1 if they are non-dominated.
+    """
+    reproduction = Reproduction(operators, problem, rng)
+    offspring, survivors, used = initial_population(problem, rng), list[Individual](), 0
+    while offspring:
+        used += yield from request_evaluations(offspring, problem)
+        survivors = select(survivors + [individual for individual in offspring if not individual.has_failed])
+        number = min(problem.population, problem.evaluations - used)
+        offspring = reproduction.draw_offspring(survivors, number, distinct=distinct)
+    return join_evaluations([individual for individual in survivors if individual.standing[0] < 1], problem)
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
@@ -87,76 +102,40 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     normalised: bool = True
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        reproduction, size = Reproduction(self, problem, rng), self.archive or problem.population
-        offspring, archive, used = initial_population(problem, rng), list[Individual](), 0
-        while offspring:
-            used += yield from request_evaluations(offspring, problem)
-            valid_offspring = [individual for individual in offspring if not individual.has_failed]
-            archive = select_archive(archive + valid_offspring, size, normalised=self.normalised)
-            offspring = reproduction.draw_distinct_offspring(
-                archive, min(problem.population, problem.evaluations - used)
-            )
-        return join_evaluations([individual for individual in archive if individual.standing[0] < 1], problem)
+        select = partial(select_archive, size=self.archive or problem.population, normalised=self.normalised)
+        return _search_elitist(self, problem, rng, select, distinct=True)
 
 
 def select_archive(individuals: list[Individual], size: int, *, normalised: bool = False) -> list[Individual]:
     """The publication's environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated
     individuals.
+
+    The fitness is the sum of the strengths of the individuals that dominate, plus the density 1 / (distance to the k-th
+    nearest individual + 2). An individual's strength is the number of individuals that it dominates; k is the root of
+    the number of individuals, and counts from 0 as in pymoo.
     """
     if not individuals:
         return []
-    objectives = objectives_of(individuals)
-    dominates = domination_matrix(objectives)
-    distances = _distances(_scale_to_unit_range(objectives) if normalised else objectives)
-    fitness = _raw_fitness(dominates) + _density(distances)
-    for individual, value in zip(individuals, fitness.tolist(), strict=True):
-        individual.standing = (value,)
-    is_nondominated = ~dominates.any(axis=0)
-    selection = _truncate(np.flatnonzero(is_nondominated), distances, size)
-    dominated = np.flatnonzero(~is_nondominated)
-    selection += dominated[np.argsort(fitness[dominated], kind="stable")][: size - len(selection)].tolist()
-    return [individuals[i] for i in selection]
-
-
-def domination_matrix(objectives: FloatArray) -> BoolArray:
-    """Whether row i dominates row j; shape (M, M)."""
+    objectives = np.array([individual.fitness.values for individual in individuals])
     first, second = objectives[:, np.newaxis], objectives[np.newaxis]
-    return np.asarray((first <= second).all(axis=2) & (first < second).any(axis=2))
-
-
-def _raw_fitness(dominates: BoolArray) -> FloatArray:
-    """Raw fitness: the sum of the strengths of the individuals that dominate; the strength is the number of dominated
-    individuals.
-    """
-    strength = np.count_nonzero(dominates, axis=1)
-    return np.asarray(np.where(dominates, strength[:, np.newaxis], 0).sum(axis=0), dtype=float)
-
-
-def _density(distances: FloatArray) -> FloatArray:
-    """1 / (distance to the k-th nearest individual + 2); k is the root of the number of individuals, and counts from 0
-    as in pymoo.
-    """
-    k = min(int(np.sqrt(len(distances))), len(distances) - 1)
-    return np.asarray(1 / (np.sort(distances, axis=1)[:, k] + 2))
-
-
-def _distances(objectives: FloatArray) -> FloatArray:
-    """Euclidean distances, infinite from a row to itself; summed objective by objective, so that they do not depend on
-    the shape.
-    """
+    dominates = (first <= second).all(axis=2) & (first < second).any(axis=2)
+    if normalised:
+        width = np.ptp(objectives, axis=0)
+        objectives = (objectives - objectives.min(axis=0)) / np.where(width > 0, width, 1.0)
     squares = np.zeros((len(objectives), len(objectives)))
-    for column in objectives.T:
+    for column in objectives.T:  # summed objective by objective, so that sums do not depend on the shape
         squares += (column[:, np.newaxis] - column) ** 2
     distances = np.sqrt(squares)
     np.fill_diagonal(distances, np.inf)
-    return distances
-
-
-def _scale_to_unit_range(objectives: FloatArray) -> FloatArray:
-    """Objectives scaled to [0, 1]."""
-    least = objectives.min(axis=0)
-    width = objectives.max(axis=0) - least
-    return np.asarray((objectives - least) / np.where(width > 0, width, 1.0))
+    k = min(int(np.sqrt(len(distances))), len(distances) - 1)
+    fitness = np.count_nonzero(dominates, axis=1) @ dominates + 1 / (np.sort(distances, axis=1)[:, k] + 2)
+    for individual, value in zip(individuals, fitness.tolist(), strict=True):
+        individual.standing = (value,)
+    is_dominated = dominates.any(axis=0)
+    selection = _truncate(np.flatnonzero(~is_dominated), distances, size)
+    dominated = np.flatnonzero(is_dominated)
+    selection += dominated[np.argsort(fitness[dominated], kind="stable")][: size - len(selection)].tolist()
+    return [individuals[i] for i in selection]
 
 
 def _truncate(indices: np.ndarray, distances: FloatArray, number: int) -> list[int]:
