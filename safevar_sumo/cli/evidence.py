@@ -84,14 +84,13 @@ def evidence(
     jobs: int | None,
 ) -> None:
     """Pack results DIR... with their study, answers and dossier, so that anybody can make every number again."""
-    from safevar_sumo.report.evidence import Maker
+    from safevar_sumo.report.evidence import make_pack
     from safevar_sumo.report.pack import write_pack
 
     check_output(out, "--out", (".zip",))
     with open_progress(True) as progress:
-        maker = Maker(questions, references, digests_only, jobs, progress)
-        description = maker.make(directories)
-    write_pack(out, description, maker.files)
+        description, files = make_pack(directories, questions, references, jobs, progress, digests_only=digests_only)
+    write_pack(out, description, files)
     click.echo(f"Evidence: {out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {file_digest_of(out)})")
 
 
@@ -112,7 +111,7 @@ def verify(pack: Path, sample: int | None, search: bool, run_code: bool, jobs: i
         print_json({"pack": str(pack), "sha256": file_digest_of(pack), **result.to_dict()})
     else:
         print_verification(Console(), result)
-    if result.count(verification.SAME) < len(result.claims):
+    if result.count_verdict(verification.SAME) < len(result.claims):
         click.get_current_context().exit(1)
 
 
@@ -140,6 +139,6 @@ def print_verification(console: Console, result: Verification) -> None:
         if count:
             table.add_row(study, f"{count} {kinds} together", verdict, "", "")
     console.print(table)
-    same, differ = result.count("same"), result.count("differs")
+    same, differ = result.count_verdict("same"), result.count_verdict("differs")
     rest = len(result.claims) - same - differ
     print_text(console, f"{len(result.claims)} claims: {same} same, {differ} differ, {rest} cannot be made here.")

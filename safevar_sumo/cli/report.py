@@ -98,15 +98,22 @@ def report(
     directories: tuple[str, ...], out: Path, only: str | None, paper: bool, point: str | None, jobs: int | None
 ) -> None:
     """Write one self-contained page about the results directories DIR...: first what to hand over, then the details."""
-    from safevar_sumo.report import make_report
-    from safevar_sumo.terminal import open_progress
+    from safevar_sumo.report import report as make_report
 
     check_output(out, "--out", (".html", ".htm"))
     sections = split_names(only) if only is not None else ()
-    with open_progress(True) as progress, warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        page = make_report(directories, sections, jobs, progress, point=point, paper=paper, as_it_is_now=as_it_is_now())
+        page = make_report(
+            *directories,
+            out=out,
+            only=sections,
+            paper=paper,
+            point=point,
+            jobs=jobs,
+            progress=True,
+            as_it_is_now=as_it_is_now(),
+        )
     for warning in caught:
         print_warning(warning.message)
-    write_whole(out, page)
     click.echo(f"Report: {out} ({len(page.encode()) / 1e6:.2f} MB)")

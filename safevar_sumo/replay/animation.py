@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -200,20 +200,20 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
             axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white", zorder=3))
         ], []
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
-    alpha = 0.6 if body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1 else 0.9
-    corner = (-length, -width / 2)
-    window = (-0.44 * length, -0.42 * width), 0.16 * length, 0.84 * width
+    is_beneath = body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1
+
+    def draw(x: float, y: float, length: float, width: float, colour: str, **style: Any) -> Patch:
+        return axis.add_patch(
+            Rectangle((x, y), length, width, **{"color": colour, "linewidth": 0, "zorder": 3} | style)
+        )
+
     patches = [
-        Rectangle(corner, length, width, color=colour, alpha=alpha, linewidth=0, zorder=3),
-        Rectangle(*window, color="white", alpha=0.56, linewidth=0, zorder=3),
-        Rectangle(corner, length, width, fill=False, edgecolor=colour, linewidth=1.5, zorder=4 - body.row),
+        draw(-length, -width / 2, length, width, colour, alpha=0.6 if is_beneath else 0.9),
+        draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, "white", alpha=0.56),
+        draw(-length, -width / 2, length, width, colour, fill=False, linewidth=1.5, zorder=4 - body.row),
     ]
-    lights = [
-        Rectangle((-length, side), 0.28, 0.3 * width, color=BRAKE_COLOUR, linewidth=0, zorder=4)
-        for side in (-width / 2, 0.2 * width)
-        if body.is_vut
-    ]
-    return list(map(axis.add_patch, patches)), list(map(axis.add_patch, lights))
+    sides = (-width / 2, 0.2 * width) if body.is_vut else ()
+    return patches, [draw(-length, side, 0.28, 0.3 * width, BRAKE_COLOUR, zorder=4) for side in sides]
 
 
 @cache
@@ -247,29 +247,29 @@ def animation_page(scene: FlatScene) -> str:
 
 
 def player_data(scene: FlatScene) -> JsonObject:
-    """The data of the template `player`: the still picture, and under `played` the data of the script. y points
-    down.
-    """
-    comparison = scene.comparison
-    vehicles = " and ".join(
-        f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows
-    )
-    common_data = {
-        "step": scene.step,
-        "length": scene.sample_count,
-        "key": scene.key_sample,
-        "view": {
-            "left": _rounded_or_constant(scene.left_ends),
-            "top": round(-scene.bottom - scene.height, DECIMALS),
-            "width": round(scene.width, DECIMALS),
-            "height": round(scene.height, DECIMALS),
-        },
-        "drives": [_drive_data(scene, row) for row in comparison.rows],
-    }
+    """The data of the template `player`, under `played` those of its script. y points down."""
+    comparison, trace = scene.comparison, scene.comparison.runs.trace
+    drives, jumps = list[JsonObject](), list[JsonObject]()
+    for row, (braking_start, nearest, end) in enumerate(comparison.moments):
+        name, samples = comparison.name(row), slice(0, end + 1)
+        ending = "is nearest" if np.isnan(comparison.runs.collision_speed[row]) else "collides"
+        moments = ((f"{name} brakes", braking_start), (f"{name} {ending}", nearest))
+        jumps += [{"name": words, "sample": sample} for words, sample in moments if sample is not None]
+        drives.append(
+            {
+                "name": name,
+                "verdict": comparison.verdict(row),
+                "end": end,
+                "nearest": comparison.moments[row].decided,
+                "speed": _rounded_list(trace.speed[samples, row]),
+                "gap": _rounded_list(trace.gap[samples, row]),
+                "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
+            }
+        )
+    vehicles = " and ".join(f"the {drive['name']} vehicle, which {drive['verdict']}" for drive in drives)
     return {
-        **common_data,
         "description": f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}",
-        "moments": _list_jumps(scene),
+        "moments": sorted(jumps, key=lambda jump: jump["sample"]),
         "bottom": round(-scene.bottom, DECIMALS),
         "letters": round(scene.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
         "road": [
@@ -282,66 +282,33 @@ def player_data(scene: FlatScene) -> JsonObject:
             for lane in scene.road
         ],
         "ticks": scene.all_marks,
-        "bodies": [_still_body_data(body, scene) for body in scene.bodies],
-        "played": {**common_data, "bodies": [_moving_body_data(body) for body in scene.bodies]},
+        "played": {
+            "step": scene.step,
+            "length": scene.sample_count,
+            "key": scene.key_sample,
+            "view": {
+                "left": _rounded_or_constant(scene.left_ends),
+                "top": round(-scene.bottom - scene.height, DECIMALS),
+                "width": round(scene.width, DECIMALS),
+                "height": round(scene.height, DECIMALS),
+            },
+            "drives": drives,
+            "bodies": [_body_data(body) for body in scene.bodies],
+        },
     }
 
 
-def _list_jumps(scene: FlatScene) -> list[JsonObject]:
-    """The moments that the player's buttons jump to, in order of time."""
-    jumps = []
-    for row, moments in enumerate(scene.comparison.moments):
-        name = scene.comparison.name(row)
-        if moments.braking_start is not None:
-            jumps.append({"name": f"{name} brakes", "sample": moments.braking_start})
-        if moments.nearest is not None:
-            is_impact = not np.isnan(scene.comparison.runs.collision_speed[row])
-            jumps.append({"name": f"{name} {'collides' if is_impact else 'is nearest'}", "sample": moments.nearest})
-    return sorted(jumps, key=lambda moment: moment["sample"])
-
-
-def _drive_data(scene: FlatScene, row: int) -> JsonObject:
-    trace, moments = scene.comparison.runs.trace, scene.comparison.moments[row]
-    samples = slice(0, moments.end + 1)
-    return {
-        "name": scene.comparison.name(row),
-        "verdict": scene.comparison.verdict(row),
-        "end": moments.end,
-        "nearest": moments.end if moments.nearest is None else moments.nearest,
-        "speed": _rounded_list(trace.speed[samples, row]),
-        "gap": _rounded_list(trace.gap[samples, row]),
-        "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
-    }
-
-
-def _moving_body_data(body: FlatBody) -> JsonObject:
-    degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
-    return {
-        "drive": body.row if body.is_vut else None,
-        "x": _rounded_or_constant(body.x),
-        "y": _rounded_or_constant(-body.y),
-        "heading": _rounded_or_constant(degrees, decimals=1),
-    }
-
-
-def _still_body_data(body: FlatBody, scene: FlatScene) -> JsonObject:
-    """One body at the key sample."""
-    place = np.array([values[scene.key_sample] for values in (body.x, -body.y, -np.rad2deg(body.heading))])
-    x, y, heading = _rounded_list(place)
-    name = scene.comparison.name(body.row) if body.is_vut else "other"
+def _body_data(body: FlatBody) -> JsonObject:
+    degrees = -np.rad2deg(np.unwrap(body.heading) if np.isfinite(body.heading).all() else body.heading)
     return {
         "name": body.name,
         "person": body.is_person,
         "length": body.length,
         "width": body.width,
-        "look": name,
-        "title": f"{name} vehicle" if body.is_vut else body.name,
-        "radius": max(body.length, body.width) / 2,
         "drive": body.row if body.is_vut else None,
-        "brakes_key": scene.brakes(body, scene.key_sample),
-        "x_key": x,
-        "y_key": y,
-        "heading_key": heading,
+        "x": _rounded_or_constant(body.x),
+        "y": _rounded_or_constant(-body.y),
+        "heading": _rounded_or_constant(degrees, decimals=1),
     }
 
 

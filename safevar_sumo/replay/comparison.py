@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.explain.braking_comparison import brake_onset
-from safevar_sumo.analysis.words import OUTCOME_VERBS
+from safevar_sumo.analysis.words import OUTCOME_VERBS, change_texts
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
@@ -54,6 +54,10 @@ class ActorTrack(NamedTuple):
     angle: FloatArray
 
 
+ABSENT = (np.nan, np.nan, np.nan)
+"""The pose of an actor that is not there."""
+
+
 def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, ActorTrack]]:
     """Simulate N settings, shape (N, n), and record the tracks of all actors by name, in alphabetical order."""
     frames, sizes = list[dict[str, tuple[float, float, float]]](), dict[str, tuple[bool, float, float]]()
@@ -67,9 +71,8 @@ def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[st
         copy, name = copy_and_name(actor)
         absent = np.full((3, len(frames), len(settings)), np.nan)
         track = tracks.setdefault(name, ActorTrack(*sizes[actor], *absent))
-        for sample, frame in enumerate(frames):
-            if actor in frame:
-                track.x[sample, copy], track.y[sample, copy], track.angle[sample, copy] = frame[actor]
+        poses = np.array([frame.get(actor, ABSENT) for frame in frames])
+        track.x[:, copy], track.y[:, copy], track.angle[:, copy] = poses.T
     return runs, tracks
 
 
@@ -97,6 +100,11 @@ class Moments(NamedTuple):
     braking_start: int | None
     nearest: int | None
     end: int
+
+    @property
+    def decided(self) -> int:
+        """The sample from which on it is known how the run ends."""
+        return self.end if self.nearest is None else self.nearest
 
 
 ORIGINAL, CHANGED = 0, 1
@@ -148,9 +156,8 @@ class Comparison:
     @property
     def changes(self) -> list[str]:
         """Every change in words, with its unit and share."""
-        if len(self.evaluations) == 1:
-            return []
-        return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
+        setting = self.evaluations.settings[-1].tolist()
+        return change_texts(self.characteristics, dict(zip(self.characteristics.names, setting, strict=True)))
 
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
@@ -167,24 +174,9 @@ class Comparison:
         return ", ".join([ending, *texts])
 
 
-def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
-    """The changes from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
-    return [
-        f"{item.name} {format_number(item.original)} → {quantity_text(value, item.unit)} "
-        f"({(value - item.original) / abs(item.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
-        for item, value in zip(characteristics, setting.tolist(), strict=True)
-        if value != item.original
-    ]
-
-
 def format_number(value: float) -> str:
     """A number with four significant digits; from 10,000 on, with all digits before the point."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
-
-
-def quantity_text(value: float, unit: str) -> str:
-    """A number with its unit, whose powers are raised; a pure number has no unit."""
-    return format_number(value) + superscript_powers(unit_text(unit))
 
 
 def superscript_powers(text: str) -> str:
@@ -231,14 +223,8 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     worst_system = system_at_worst_point(system, settings)
-    point = next(
-        (
-            point.name
-            for point in system.matrix
-            if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)
-        ),
-        "",
-    )
+    worst = worst_system.scenario, worst_system.weather
+    point = next((point.name for point in system.matrix if (point.scenario, point.weather) == worst), "")
     network, scoring = stage_network(worst_system.scenario), worst_system.measuring.scoring
     runs, tracks = _film(worst_system, settings)
     objectives = {objective.name for objective in scoring.objectives} - {*METRICS, RATING_POINTS.name}
@@ -262,25 +248,22 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     more.
     """
     trace = runs.trace
-    throttle, brake = trace.throttle.copy(), trace.brake.copy()
+    pedals = np.stack([trace.throttle, trace.brake])
     for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
         end = int(np.flatnonzero(trace.active[:, row])[-1])
-        for pedal in (throttle, brake):
-            pedal[end, row] = pedal[max(end - 1, 0), row]
-    return replace(runs, trace=replace(trace, throttle=throttle, brake=brake))
+        pedals[:, end, row] = pedals[:, max(end - 1, 0), row]
+    return replace(runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1]))
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
     """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no
     rating points.
     """
-    differing_metrics = [
-        f"{name} was {recorded[name]:.6g} and is {values[0]:.6g} now"
-        for name, values in replayed.metrics.items()
-        if name in recorded
-        and name != RATING_POINTS.name
-        and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)
-    ]
+    found = []
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        return [f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now", *differing_metrics]
-    return differing_metrics
+        found.append(f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now")
+    for name, values in replayed.metrics.items():
+        before = recorded.get(name, values[0])
+        if name != RATING_POINTS.name and not np.array_equal(before, values[0], equal_nan=True):
+            found.append(f"{name} was {before:.6g} and is {values[0]:.6g} now")
+    return found

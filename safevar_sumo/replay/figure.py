@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BRAKING_MARK, NEAREST_MARK, IMPACT_MARK = "v", "o", "X"
+LINES = ("-", "--")
+"""The lines of the original and of the changed vehicle."""
 MAX_TTC = 6.0
 """Largest time to collision that is drawn [s]."""
 MIN_DIVERGENCE = 0.1
@@ -51,7 +53,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
                 trace.time[:end],
                 values[:end, row],
                 color=COLOURS[row],
-                linestyle="--" if row else "-",
+                linestyle=LINES[row],
                 linewidth=1.6,
                 zorder=3 + row,
             )
@@ -73,60 +75,30 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
 
 def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int) -> None:
-    """Mark where a vehicle begins to brake, is nearest, and collides."""
-    trace, moments = comparison.runs.trace, comparison.moments[row]
+    """Mark where a vehicle begins to brake, is nearest, and collides. The original's marks are larger, to show behind
+    the changed vehicle's.
+    """
+    trace, (start, nearest, end) = comparison.runs.trace, comparison.moments[row]
     impact_speed = float(comparison.runs.collision_speed[row])
     has_impact = not np.isnan(impact_speed)
-    if moments.braking_start is not None:
-        _draw_mark(
-            speed_axis, row, (trace.time[moments.braking_start], trace.speed[moments.braking_start, row]), BRAKING_MARK
+
+    def draw(axis: Axes, sample: int, value: float, mark: str, text: str = "", **place: Any) -> None:
+        point, colour = (trace.time[sample], value), COLOURS[row]
+        size = 12 - 4 * row + 2 * (mark == IMPACT_MARK)
+        axis.plot(*point, mark, color=colour, markersize=size, linestyle="", zorder=6 + row, markeredgecolor="white")
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
+        axis.annotate(
+            text, point, textcoords="offset points", color=colour, fontweight="bold", bbox=box, zorder=5, **place
         )
+
+    if start is not None:
+        draw(speed_axis, start, trace.speed[start, row], BRAKING_MARK, xytext=(0, 0))
     if has_impact:
-        _draw_mark(
-            speed_axis,
-            row,
-            (trace.time[moments.end], impact_speed),
-            IMPACT_MARK,
-            f"{impact_speed:.1f} m/s",
-            (3, 7),
-            "left",
-        )
-    if moments.nearest is not None and np.isfinite(gap := trace.gap[moments.nearest, row]):
+        draw(speed_axis, end, impact_speed, IMPACT_MARK, f"{impact_speed:.1f} m/s", xytext=(3, 7), ha="left")
+    if nearest is not None and np.isfinite(gap := trace.gap[nearest, row]):
         is_largest = np.argmax(np.where(trace.active, trace.gap, np.inf).min(axis=0)) == row
         mark, text = (IMPACT_MARK, "impact") if has_impact else (NEAREST_MARK, f"{gap:.2f} m")
-        _draw_mark(gap_axis, row, (trace.time[moments.nearest], gap), mark, text, (0, 9 if is_largest else -17))
-
-
-def _draw_mark(
-    axis: Axes,
-    row: int,
-    point: tuple[float, float],
-    mark: str,
-    text: str = "",
-    offset: tuple[int, int] = (0, 0),
-    alignment: str = "center",
-) -> None:
-    """Draw a mark on a line. The original's mark is larger, to show behind the changed vehicle's mark."""
-    axis.plot(
-        *point,
-        marker=mark,
-        color=COLOURS[row],
-        markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK),
-        linestyle="",
-        zorder=6 + row,
-        markeredgecolor="white",
-    )
-    axis.annotate(
-        text,
-        point,
-        xytext=offset,
-        textcoords="offset points",
-        color=COLOURS[row],
-        fontweight="bold",
-        ha=alignment,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
-        zorder=5,
-    )
+        draw(gap_axis, nearest, gap, mark, text, xytext=(0, 9 if is_largest else -17), ha="center")
 
 
 def _end_time(comparison: Comparison) -> float:
@@ -141,26 +113,20 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     """Draw the legend: vehicles, marks, and lines."""
     from matplotlib.lines import Line2D
 
-    def entry(label: str, **style: Any) -> Line2D:
-        return Line2D([], [], label=label, **style)
-
+    entries = {
+        f"{comparison.name(row)} vehicle: {comparison.verdict(row)}": {"color": COLOURS[row], "linestyle": LINES[row]}
+        for row in comparison.rows
+    }
     marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK}
     if np.isfinite(comparison.runs.collision_speed).any():
         marks["impact"] = IMPACT_MARK
-    entries = [
-        entry(
-            f"{comparison.name(row)} vehicle: {comparison.verdict(row)}",
-            color=COLOURS[row],
-            linestyle="--" if row else "-",
-        )
-        for row in comparison.rows
-    ]
-    entries += [entry(label, color="0.35", marker=mark, linestyle="", markersize=7) for label, mark in marks.items()]
+    entries |= {label: {"marker": mark, "linestyle": "", "markersize": 7} for label, mark in marks.items()}
     if divergence_time is not None:
-        entries.append(entry("speeds diverge (by 0.1 m/s)", color="0.35", linestyle="-.", linewidth=0.9))
+        entries["speeds diverge (by 0.1 m/s)"] = {"linestyle": "-.", "linewidth": 0.9}
     threshold = f"TTC* = {comparison.ttc_threshold:g} s: critical below"
-    entries.append(entry(threshold, color="0.4", linestyle=":", linewidth=0.9))
-    figure.legend(handles=entries, loc="outside lower center", ncols=3, frameon=False)
+    entries[threshold] = {"color": "0.4", "linestyle": ":", "linewidth": 0.9}
+    handles = [Line2D([], [], label=label, **{"color": "0.35", **style}) for label, style in entries.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
 def find_divergence(runs: SimulationRuns) -> int | None:

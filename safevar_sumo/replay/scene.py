@@ -73,8 +73,7 @@ class FlatScene:
         """The sample that a still picture shows: the moment at which the changed vehicle, or else the original, is
         nearest.
         """
-        last = self.comparison.moments[-1]
-        return last.nearest if last.nearest is not None else last.end
+        return self.comparison.moments[-1].decided
 
     def brakes(self, body: FlatBody, sample: int) -> bool:
         """Whether an actor is the vehicle under test and brakes; after the end of its run, whether it braked then."""
@@ -85,16 +84,17 @@ class FlatScene:
         """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run ends."""
         trace, moments = self.comparison.runs.trace, self.comparison.moments[row]
         now = min(sample, moments.end)
-        is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
-        ending = self.comparison.verdict(row) if is_finished else "brakes" if trace.brake[now, row] > 0 else ""
+        ending = "brakes" if trace.brake[now, row] > 0 else ""
+        if sample >= moments.decided:
+            ending = self.comparison.verdict(row)
         gap = f"gap {max(trace.gap[now, row], 0):.1f} m" if np.isfinite(trace.gap[now, row]) else ""
         return f"{trace.speed[now, row]:4.1f} m/s  {gap:10}  {ending}"
 
     @property
     def all_marks(self) -> list[int]:
         """The marks that ever come into view, by their distance from the start [m]."""
-        left, right = float(self.left_ends.min()), float(self.left_ends.max()) + self.width
-        return list(range(math.floor(left / MARK_DISTANCE) * MARK_DISTANCE, int(right) + MARK_DISTANCE, MARK_DISTANCE))
+        first = math.floor(self.left_ends.min() / MARK_DISTANCE) * MARK_DISTANCE
+        return list(range(first, int(self.left_ends.max() + self.width) + MARK_DISTANCE, MARK_DISTANCE))
 
 
 def lay_out_scene(comparison: Comparison) -> FlatScene:
@@ -126,18 +126,19 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> tuple[FloatAr
     """The whole road or, in a long scene, what a camera that follows the vehicles shows: left ends, bottom, width,
     height.
     """
-    left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
-    right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
-    edges = [
-        edge for body in bodies for edge in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)
-    ]
-    bottom, top = float(min(edges)) - MARGIN / 2, float(max(edges)) + MARGIN / 2
-    padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
+    x, y = (np.array([getattr(body, axis) for body in bodies]) for axis in "xy")
+    is_vut = np.array([body.is_vut for body in bodies])
+    length, half_width = np.array([(body.length, body.width / 2) for body in bodies]).T[:, :, np.newaxis]
+    left_end = float(np.nanmin(x - length)) - MARGIN / 2
+    right_end = float(np.nanmax(x + np.where(is_vut[:, np.newaxis], 0, length))) + MARGIN
+    bottom = float(np.nanmin(y - half_width)) - MARGIN / 2
+    height = float(np.nanmax(y + half_width)) + MARGIN / 2 - bottom
+    padding = max(0.0, MIN_HEIGHT - height) / 2
     left_ends, width = np.full(sample_count, left_end), right_end - left_end
     if width > MAX_LENGTH:
-        front, width = np.mean([body.x for body in bodies if body.is_vut], axis=0), CAMERA_LENGTH
-        left_ends = np.clip(front - width * 0.45, left_end, max(left_end, right_end - width))
-    return left_ends, bottom - padding, width, top - bottom + 2 * padding
+        width = CAMERA_LENGTH
+        left_ends = np.clip(x[is_vut].mean(axis=0) - width * 0.45, left_end, max(left_end, right_end - width))
+    return left_ends, bottom - padding, width, height + 2 * padding
 
 
 def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
@@ -156,8 +157,8 @@ def lane_outlines(lane: LaneLine, width: float) -> Iterator[FloatArray]:
         if lane.kind != "crossing":
             yield strip_corners(start, end, width)
             continue
-        direction = (end - start) / (np.hypot(*(end - start)) or 1.0)
-        for distance in np.arange(STRIPE_LENGTH / 2, np.hypot(*(end - start)) - STRIPE_LENGTH, 2 * STRIPE_LENGTH):
-            yield strip_corners(
-                start + direction * distance, start + direction * (distance + STRIPE_LENGTH), lane.width
-            )
+        length = np.hypot(*(end - start))
+        stripe = (end - start) / (length or 1.0) * STRIPE_LENGTH
+        for distance in np.arange(STRIPE_LENGTH / 2, length - STRIPE_LENGTH, 2 * STRIPE_LENGTH):
+            corner = start + stripe * (distance / STRIPE_LENGTH)
+            yield strip_corners(corner, corner + stripe, lane.width)

@@ -5,7 +5,9 @@ numbers.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from string import Formatter
 from typing import Any, NamedTuple
 
 from safevar_sumo.records import JsonObject
@@ -25,6 +27,8 @@ ASSUMED = "assumed: no data for this combination of vehicle, driving system and 
 """Levels of evidence of a statement."""
 STRONGEST = 3
 """Number of characteristics that the section on sensitivity names."""
+STEPS = {"half_step": "half the time step", "double_step": "double the time step"}
+"""The checks with another time step."""
 ROBUST = 0.8
 """Share of unsafe neighbours below which a finding is borderline."""
 MEASURES = {
@@ -53,7 +57,6 @@ STATE_WITH = {
 """What a safety case has to say beside an answer."""
 
 
-SHARE_KEYS = {"low": "range.0", "high": "range.1", "sets": "sets"}
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 
 
@@ -65,17 +68,17 @@ class Statement(NamedTuple):
     command: str = ""
     numbers: Mapping[str, Any] = {}
 
-    @classmethod
-    def of(cls, text: str, level: str, command: str, answer: Any, paths: Mapping[str, str]) -> Statement:
-        """A statement whose text has a field for each name of `paths`, with the number at its path of the answer."""
-        values = {name: value_at(answer, path) for name, path in paths.items()}
-        shown = {name: float("nan") if value is None else value for name, value in values.items()}
-        return cls(
-            text.format(**shown) if paths else text,
-            level,
-            command,
-            {path: values[name] for name, path in paths.items()},
-        )
+
+class _Reading(Formatter):
+    """Fills the fields of a text, which are paths in an answer's JSON below `at`, and keeps what stands there."""
+
+    def __init__(self, answer: Any, at: str) -> None:
+        self.answer, self.at, self.numbers = answer, at, dict[str, Any]()
+
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        path = f"{self.at}{field_name}"
+        self.numbers[path] = value = value_at(self.answer, path)
+        return float("nan") if value is None else value, field_name
 
 
 def value_at(answer: Any, path: str) -> Any:
@@ -94,7 +97,15 @@ def make_dossier(
     validations: Sequence[JsonObject],
 ) -> JsonObject:
     """The dossier of one study as plain values; `answers` are commands and JSON by question."""
-    made = _Dossier(manifest, study, counts, answers, checks, validations)
+    directory = f"results/{study.name}"
+    sources = {
+        "manifest": (f"python -m json.tool {directory}/manifest.json", manifest),
+        "status": (f"python -m safevar_sumo status {directory} --json", {"simulated": counts["evaluations"]}),
+        "checks": (_measure(directory), checks),
+        **{validation["file"]: (_measure(directory, validation["file"]), validation) for validation in validations},
+        **answers,
+    }
+    made = _Dossier(study, sources, list(answers), [validation["file"] for validation in validations])
     sections = {
         "Intended use and scope": made.scope(),
         "Toolchain": made.toolchain(),
@@ -116,108 +127,95 @@ def make_dossier(
     }
 
 
+def _measure(*arguments: str) -> str:
+    """The command that prints the numbers of `report/measurements.py`."""
+    texts = ", ".join(map(repr, arguments))
+    return f'python -c "from safevar_sumo.report.measurements import print_checks; print_checks({texts})"'
+
+
 def dossier_page(dossier: JsonObject) -> str:
     """The dossier as a page that needs no network."""
     css = (TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")
     return template_environment(TEMPLATE_FOLDER).get_template("dossier.html.j2").render(**dossier, css=css)
 
 
+@dataclass(frozen=True)
 class _Dossier:
-    """The statements of each section; see `make_dossier` for the parameters."""
+    """The statements of each section. `sources` are a command and its JSON by question, file of validation, or
+    "manifest", "status" and "checks".
+    """
 
-    def __init__(
-        self,
-        manifest: JsonObject,
-        study: Study,
-        counts: Mapping[str, int],
-        answers: Mapping[str, tuple[str, Any]],
-        checks: JsonObject,
-        validations: Sequence[JsonObject],
-    ) -> None:
-        self._manifest, self._study, self._counts = manifest, study, counts
-        self._answers, self._checks, self._validations = answers, checks, validations
-        self._directory = f"results/{study.name}"
-        self._level = OF_MODEL if study.calibration or study.spread else ASSUMED
+    study: Study
+    sources: Mapping[str, tuple[str, Any]]
+    questions: Sequence[str]
+    validations: Sequence[str]
 
-    def _from_manifest(self, text: str, **paths: str) -> Statement:
-        command = f"python -m json.tool {self._directory}/manifest.json"
-        return Statement.of(text, "", command, self._manifest, paths)
+    @property
+    def level(self) -> str:
+        return OF_MODEL if self.study.calibration or self.study.spread else ASSUMED
 
-    def _from_checks(self, text: str, level: str, **paths: str) -> Statement:
-        return Statement.of(text, level, self._python(), self._checks, paths)
+    def _say(self, source: str, text: str, level: str = "", at: str = "") -> Statement:
+        """A statement whose text has as fields the paths of a source's JSON below `at`."""
+        command, answer = self.sources[source]
+        reading = _Reading(answer, at)
+        shown = reading.format(text)
+        return Statement(shown, self.level if source in self.questions else level, command, reading.numbers)
 
-    def _from_answer(self, question: str, text: str, level: str = "", **paths: str) -> Statement:
-        command, answer = self._answers[question]
-        return Statement.of(text, level or self._level, command, answer, paths)
-
-    def _python(self, *further: str) -> str:
-        arguments = ", ".join(repr(text) for text in (self._directory, *further))
-        return f'python -c "from safevar_sumo.report.measurements import print_checks; print_checks({arguments})"'
+    def _answer(self, question: str, default: Any) -> Any:
+        return self.sources[question][1] if question in self.sources else default
 
     def _causes(self) -> Iterator[tuple[str, JsonObject]]:
         """Every minimal cause of the explained failures, and its path in the answer."""
-        _, answer = self._answers.get("explain", ("", [None]))
-        for index, failure in enumerate(answer[:-1]):
+        for index, failure in enumerate(self._answer("explain", [None])[:-1]):
             for number, cause in enumerate(failure["minimal_causes"]):
                 yield f"{index}.minimal_causes.{number}", cause
 
     def scope(self) -> Iterator[Statement]:
-        yield self._from_manifest(
-            "Vehicle {vehicle}, driving system {ads}, scenario {scenario}.",
-            vehicle="study.vehicle.model",
-            ads="study.ads.model",
-            scenario="study.scenario.model",
-        )
+        text = "Vehicle {study.vehicle.model}, driving system {study.ads.model}, scenario {study.scenario.model}."
+        yield self._say("manifest", text)
         yield Statement(
             "Vehicle and driving system were fitted to published simulations of another simulator; section 4 has how "
             "far they agree, where reference data is given, and the manual's page on trust."
-            if self._level == OF_MODEL
+            if self.level == OF_MODEL
             else "No data was fitted, and none was compared: parameters are from their sources or assumed."
         )
         for line in GENERAL_LIMITS:
             yield Statement(f"Limit: {line}")
-        for question in self._answers:
-            yield Statement(f"Answer of `{question}`: section 7.", self._level)
+        for question in self.questions:
+            yield Statement(f"Answer of `{question}`: section 7.", self.level)
 
     def toolchain(self) -> Iterator[Statement]:
-        for name in self._manifest["versions"]:
-            yield self._from_manifest(f"{name} {{version}}", version=f"versions.{name}")
+        manifest = self._answer("manifest", {})
+        for name in manifest["versions"]:
+            yield self._say("manifest", f"{name} {{versions.{name}}}")
         for layer in ("network", "sources"):
-            for name, digest in self._manifest[layer].items():
-                yield self._from_manifest(f"{layer}: {name}, sha256 {digest}...")
-        yield self._from_checks(
-            "Numbers that go in: {published} published, {fitted} fitted, {assumed} neither, so counted as assumed.",
-            "",
-            **{name: f"constants.{name}" for name in ("published", "fitted", "assumed")},
+            for name, digest in manifest[layer].items():
+                yield Statement(f"{layer}: {name}, sha256 {digest}...", command=self.sources["manifest"][0])
+        yield self._say(
+            "checks",
+            "Numbers that go in: {constants.published} published, {constants.fitted} fitted, {constants.assumed} "
+            "neither, so counted as assumed.",
         )
 
     def verification(self) -> Iterator[Statement]:
-        if "settings" in self._checks:
-            recorded = (
-                "compared with the recorded scene" if self._checks["recorded"] else "which moves the actors itself"
+        checks = self._answer("checks", {})
+        if "settings" in checks:
+            recorded = "compared with the recorded scene" if checks["recorded"] else "which moves the actors itself"
+            text = f"{{same_in_sumo}} of {{settings}} settings have the same results in SUMO to the bit, {recorded}."
+            yield self._say("checks", text, EXACT)
+        for name, words in STEPS.items() if "settings" in checks else ():
+            text = (
+                f"With {words} {{{name}.same_outcome}} of {{settings}} settings end alike; the safety degree changes "
+                f"by at most {{{name}.largest_change:.2f}} m."
             )
-            text = f"{{same}} of {{settings}} settings have the same results in SUMO to the bit, {recorded}."
-            yield self._from_checks(text, EXACT, same="same_in_sumo", settings="settings")
-        for name in ("half_step", "double_step") if "settings" in self._checks else ():
-            if "reason" in self._checks[name]:
-                yield self._from_checks(
-                    f"{name.replace('_', ' the time ').capitalize()}: {{reason}}", "", reason=f"{name}.reason"
-                )
-                continue
-            yield self._from_checks(
-                f"With {name.replace('_', ' the time ')} {{same}} of {{settings}} settings end alike; the safety "
-                "degree changes by at most {change:.2f} m.",
-                "",
-                same=f"{name}.same_outcome",
-                settings="settings",
-                change=f"{name}.largest_change",
-            )
+            failed = f"{words.capitalize()}: {{{name}.reason}}"
+            yield self._say("checks", failed if "reason" in checks[name] else text)
         yield Statement(
             "Closed forms and second implementations (metrics, search algorithms, vehicle dynamics) are among the "
             "program's tests: `make test-all` in its sources.",
             EXACT,
         )
-        code = user_code_names(self._study)
+        code = user_code_names(self.study)
         yield Statement(
             f"User code ({', '.join(code)}) was tried before the first batch, as `check` does: repeated, in another "
             "order, in smaller batches, alone. A finding ends the study; there was none."
@@ -226,142 +224,128 @@ class _Dossier:
         )
 
     def validation(self) -> Iterator[Statement]:
-        if not self._validations:
+        if not self.validations:
             yield Statement("No reference data was given: nothing is validated here.")
-        for answer in self._validations:
-            command = self._python(answer["file"])
+        for file in self.validations:
+            answer = self._answer(file, {})
             for part, rows in (("used", "that a fit uses"), ("held_back", "held back from a fit")):
-                paths = {"file": "file", "rows": f"{part}.rows"}
-                yield Statement.of(f"{{file}}: {{rows}} rows {rows}.", "", command, answer, paths)
+                yield self._say(file, f"{{file}}: {{{part}.rows}} rows {rows}.")
                 for name, words in MEASURES.items() if answer[part]["rows"] else ():
                     if name == "coverage" and (part == "used" or answer["coverage"] is None):
                         continue
                     path = "coverage.held_back" if name == "coverage" else f"{part}.{name}"
-                    value, (definition, side) = value_at(answer, path), words.rsplit(", ", 1)
-                    text = f"Rows {rows}: {definition}: {{value:.4g}}{self._beside_threshold(name, value, side)}"
-                    yield Statement.of(text, SIMULATED, command, answer, {"value": path})
+                    definition, side = words.rsplit(", ", 1)
+                    beside = self._beside_threshold(name, value_at(answer, path), side)
+                    yield self._say(file, f"Rows {rows}: {definition}: {{{path}:.4g}}{beside}", SIMULATED)
 
     def _beside_threshold(self, name: str, value: float | None, side: str) -> str:
         """The user's threshold of a measure, in words; a full stop without one."""
-        thresholds = [threshold for key, threshold in self._study.evidence.threshold.items() if key == name]
-        if not thresholds:
+        threshold = next((limit for key, limit in self.study.evidence.threshold.items() if key == name), None)
+        if threshold is None:
             return "."
-        kept = value is not None and (value <= thresholds[0] if side == "at most" else value >= thresholds[0])
-        return f"; declared by the user: {side} {thresholds[0]:g}, which it {'keeps' if kept else 'does not keep'}."
+        kept = value is not None and (value <= threshold if side == "at most" else value >= threshold)
+        return f"; declared by the user: {side} {threshold:g}, which it {'keeps' if kept else 'does not keep'}."
 
     def uncertainty(self) -> Iterator[Statement]:
-        if original := self._checks.get("original"):
-            paths, aleatory, epistemic = {"value": "original.safety_degree"}, "unknown", list[str]()
-            if original["repeats"] is not None:
-                paths["repeats"], aleatory = "original.repeats", "+-{repeats:.3g} m (90 % of repeats)"
-            for name in ("half_step", "double_step"):
-                if self._checks[name].get("original") is not None:
-                    paths[name] = f"{name}.original"
-                    epistemic.append(f"{{{name}:.4g}} m with {name.replace('_', ' the time ')}")
+        checks = self._answer("checks", {})
+        if original := checks.get("original"):
+            repeats = "unknown" if original["repeats"] is None else "+-{original.repeats:.3g} m (90 % of repeats)"
+            epistemic = [
+                f"{{{name}.original:.4g}} m with {words}"
+                for name, words in STEPS.items()
+                if checks[name].get("original") is not None
+            ]
             if original.get("lower") is not None:
-                paths |= {name: f"original.{name}" for name in ("lower", "upper", "sets", "collisions")}
-                epistemic.append("{lower:.4g} to {upper:.4g} m over {sets} fitted sets, {collisions} of which collide")
-            text = "The original's safety degree is {value:.4g} m. Aleatory: " + aleatory
-            yield self._from_checks(f"{text}. Epistemic: {'; '.join(epistemic) or 'unknown'}.", self._level, **paths)
+                epistemic.append(
+                    "{original.lower:.4g} to {original.upper:.4g} m over {original.sets} fitted sets, "
+                    "{original.collisions} of which collide"
+                )
+            text = (
+                f"The original's safety degree is {{original.safety_degree:.4g}} m. Aleatory: {repeats}. Epistemic: "
+                f"{'; '.join(epistemic) or 'unknown'}."
+            )
+            yield self._say("checks", text, self.level)
         for path, cause in self._causes():
             if cause.get("across_fits"):
                 text = (
                     f"Epistemic: {', '.join(cause['changes'])}: a cause in {{holds}} of {{sets}} fitted vehicle models."
                 )
-                paths = {name: f"{path}.across_fits.{name}" for name in ("holds", "sets")}
-                yield self._from_answer("explain", text, **paths)
+                yield self._say("explain", text, at=f"{path}.across_fits.")
         yield from self._shares()
-        if "risk" in self._answers:
-            text = "Sampling: the share of unsafe vehicles is {low:.3g} to {high:.3g} ({confidence:.0%} interval)."
-            yield self._from_answer("risk", text, low="interval.0", high="interval.1", confidence="confidence")
+        if "risk" in self.questions:
+            interval = "{interval.0:.3g} to {interval.1:.3g} ({confidence:.0%} interval)"
+            yield self._say("risk", f"Sampling: the share of unsafe vehicles is {interval}.")
 
     def _shares(self) -> Iterator[Statement]:
         """Ranges of the shares of `explain` over the fitted vehicle models."""
-        _, answer = self._answers.get("explain", ("", [{}]))
-        summary = answer[-1].get("summary", {})
-        ranges, prefix = summary.get("across_fits") or {}, "-1.summary"
-        shares = {"of the different solutions are unsafe": "unsafe"}
-        shares |= {f"of the failures need {name}": f"necessary.{name}" for name in ranges.get("necessary", {})}
+        summary = self._answer("explain", [{}])[-1].get("summary", {})
+        ranges = summary.get("across_fits") or {}
+        shares = {"unsafe": "of the different solutions are unsafe"} if ranges else {}
+        shares |= {f"necessary.{name}": f"of the failures need {name}" for name in ranges.get("necessary", {})}
         shares |= {
-            f"of the collisions: {name.replace('_', ' ')} avoids them": f"preventable.{name}"
+            f"preventable.{name}": f"of the collisions: {name.replace('_', ' ')} avoids them"
             for name in ranges.get("preventable", {})
             if name in summary["preventable"] and name not in ("nobody", "later")
         }
-        for words, path in shares.items() if ranges else ():
-            paths = {name: f"{prefix}.across_fits.{path}.{key}" for name, key in SHARE_KEYS.items()}
-            if value_at(answer, paths["low"]) < value_at(answer, paths["high"]):
-                text = f"Epistemic: {{low:.1%}} to {{high:.1%}} {words}, over {{sets}} fitted vehicle models."
-                yield self._from_answer("explain", text, **paths)
+        for name, words in shares.items():
+            low, high = value_at(ranges, f"{name}.range")
+            if low < high:
+                text = f"Epistemic: {{range.0:.1%}} to {{range.1:.1%}} {words}, over {{sets}} fitted vehicle models."
+                yield self._say("explain", text, at=f"-1.summary.across_fits.{name}.")
 
     def sensitivity(self) -> Iterator[Statement]:
-        _, answer = self._answers.get("risk", ("", {}))
-        totals = {index: row["total"] for index, row in enumerate(answer.get("sensitivity", ()))}
-        indices = sorted((index for index in totals if totals[index] is not None), key=lambda index: -totals[index])
-        if not indices:
+        rows = self._answer("risk", {}).get("sensitivity", ())
+        totals = {index: row["total"] for index, row in enumerate(rows) if row["total"] is not None}
+        if not totals:
             yield Statement("Not computed: `evidence --risk` adds it, unless characteristics are correlated.")
-        for index in indices[:STRONGEST]:
-            keys = {
-                "name": "characteristic",
-                "alone": "first_order",
-                "total": "total",
-                "low": "total_interval.0",
-                "high": "total_interval.1",
-            }
-            text = "{name}: {alone:.2f} of the variance alone, {total:.2f} in all ({low:.2f} to {high:.2f})."
-            yield self._from_answer("risk", text, **{name: f"sensitivity.{index}.{key}" for name, key in keys.items()})
+        for index in sorted(totals, key=lambda index: -totals[index])[:STRONGEST]:
+            yield self._say(
+                "risk",
+                "{characteristic}: {first_order:.2f} of the variance alone, {total:.2f} in all "
+                "({total_interval.0:.2f} to {total_interval.1:.2f}).",
+                at=f"sensitivity.{index}.",
+            )
 
     def results(self) -> Iterator[Statement]:
-        searched = {"simulated": self._counts["evaluations"]}
-        text = "The search simulated {number} settings; it proves nothing about those that it did not try."
-        command = f"python -m safevar_sumo status {self._directory} --json"
-        yield Statement.of(text, "", command, searched, {"number": "simulated"})
+        text = "The search simulated {simulated} settings; it proves nothing about those that it did not try."
+        yield self._say("status", text)
         for path, cause in self._causes():
-            paths = {f"value_{number}": f"{path}.changes.{name}" for number, name in enumerate(cause["changes"])}
-            words = ", ".join(f"{name} {{value_{number}:.4g}}" for number, name in enumerate(cause["changes"]))
-            text = f"Enough by themselves: {words} ({{outcome}})."
-            yield self._from_answer("explain", text, outcome=f"{path}.outcome", **paths)
-        _, tolerance = self._answers.get("tolerance", ("", {"alone": []}))
+            words = ", ".join(f"{name} {{changes.{name}:.4g}}" for name in cause["changes"])
+            yield self._say("explain", f"Enough by themselves: {words} ({{outcome}}).", at=f"{path}.")
+        tolerance = self._answer("tolerance", {"alone": []})
         for index, row in enumerate(tolerance["alone"]):
             if row["safe"]:
-                paths = {
-                    "name": f"alone.{index}.characteristic",
-                    "low": f"alone.{index}.safe.0",
-                    "high": f"alone.{index}.safe.1",
-                }
-                unit = unit_text(row["unit"])
-                text = f"Alone: no unsafe value of {{name}} found from {{low:.4g}} to {{high:.4g}}{unit}."
-                yield self._from_answer("tolerance", text, **paths)
+                text = "Alone: no unsafe value of {characteristic} found from {safe.0:.4g} to {safe.1:.4g}"
+                yield self._say("tolerance", f"{text}{unit_text(row['unit'])}.", at=f"alone.{index}.")
         if tolerance.get("joint"):
-            text = (
-                "All together: {factor:.1%} of the domain, at most {bound:.2%} unsafe with {confidence:.0%} confidence."
-            )
-            paths = {"factor": "joint.factor", "bound": "joint.unsafe_at_most", "confidence": "joint.confidence"}
-            yield self._from_answer("tolerance", text, **paths)
-        if "risk" in self._answers:
-            yield self._from_answer("risk", "The share of unsafe vehicles is {share:.3g}.", share="probability")
-        for question, (command, _) in self._answers.items():
-            yield Statement(f"`{question}`: {STATE_WITH[question]}", self._level, command)
+            bound = "at most {unsafe_at_most:.2%} unsafe with {confidence:.0%} confidence"
+            yield self._say("tolerance", f"All together: {{factor:.1%}} of the domain, {bound}.", at="joint.")
+        if "risk" in self.questions:
+            yield self._say("risk", "The share of unsafe vehicles is {probability:.3g}.")
+        for question in self.questions:
+            yield self._say(question, f"`{question}`: {STATE_WITH[question]}")
 
     def open_points(self) -> Iterator[Statement]:
         yield Statement("No vehicle was driven: every statement is about models.")
-        if not self._validations:
+        if not self.validations:
             yield Statement("Reference data is missing: `evidence --reference FILE.csv` adds section 4.")
-        if not self._study.evidence.threshold:
+        if not self.study.evidence.threshold:
             yield Statement("No threshold was declared: [evidence] threshold in the study.")
         for question in STATE_WITH:
-            if question not in self._answers and question not in ("rating", "repair"):
+            if question not in self.questions and question not in ("rating", "repair"):
                 yield Statement(f"`{question}` was not asked.")
-        _, explained = self._answers.get("explain", ("", [{}]))
-        for index, failure in enumerate(explained[:-1]):
+        for index, failure in enumerate(self._answer("explain", [None])[:-1]):
             if (failure["robustness"] or 0.0) < ROBUST:
                 changed = ", ".join(failure["changed"])
-                text = f"Borderline: {{share:.0%}} of the neighbours of the failure with {changed} are unsafe."
-                yield self._from_answer("explain", text, share=f"{index}.robustness")
-        if "explain" in self._answers:
+                text = f"Borderline: {{robustness:.0%}} of the neighbours of the failure with {changed} are unsafe."
+                yield self._say("explain", text, at=f"{index}.")
+        if "explain" in self.questions:
             yield Statement("The second vehicle model was not asked about the causes: `opinion`.")
-        if not self._study.variation:
+        if not self.study.variation:
             yield Statement("No [variation]: shares are of the domain, not of vehicles in the field.")
-        if any(record.get("driven") is False for record in self._last_records()):
+        answers = (self._answer(question, {}) for question in self.questions)
+        last = (answer[-1].get("summary", {}) if isinstance(answer, list) else answer for answer in answers)
+        if any(record.get("driven") is False for record in last):
             yield Statement(
                 "No verdict: the original vehicle never reaches the encounter, or brakes with nobody in sight."
             )
@@ -369,7 +353,3 @@ class _Dossier:
             "EU 2022/1426, UN R157 and WP.29/2022/57 are cited as their readers quote them: they were not read in the "
             "original."
         )
-
-    def _last_records(self) -> Iterator[JsonObject]:
-        for _, answer in self._answers.values():
-            yield answer[-1].get("summary", {}) if isinstance(answer, list) else answer

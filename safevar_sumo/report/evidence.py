@@ -1,4 +1,6 @@
-"""What a pack of evidence claims about results: made from their directory, and again from the pack alone."""
+"""What a pack of evidence claims about results: each file is made from those before it, by `evidence` and again by
+`verify`.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import io
 import json
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -33,14 +36,13 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import file_by_name
 from safevar_sumo.records import FloatArray, JsonObject
-from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.report.dossier import dossier_page, make_dossier
-from safevar_sumo.report.measurements import check_study, validate_with
+from safevar_sumo.report.measurements import check_study, settings_of, validate_with
 from safevar_sumo.report.pack import Description, PackedAnswer, PackedStudy, describe
 from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, read_manifest
 from safevar_sumo.results.journal import files_read_later
 from safevar_sumo.study import Origin, Study, convert_table, write_study
-from safevar_sumo.sumo.network import OPTIONS_FILE, is_shipped, open_network, options_of
+from safevar_sumo.sumo.network import OPTIONS_FILE, open_network, options_of
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import CharacteristicSet
@@ -53,9 +55,10 @@ QUESTIONS: Mapping[str, tuple[type[Options], Callable[..., Any]]] = {
     "repair": (RepairOptions, find_repairs),
 }
 """The questions whose answers a pack may hold: their options, and the functions that compute them."""
-STUDY, SETTINGS, CHECKS, DOSSIER = "study.toml", "settings.csv", "checks.json", "dossier"
+STUDY, SETTINGS, CHECKS = "study.toml", "settings.csv", "checks.json"
+DOSSIER, DOSSIER_PAGE = "dossier.json", "dossier.html"
 ANSWERS, CODE, REFERENCES, VALIDATIONS = "answers", "code", "references", "validations"
-"""Files and folders of a study in a pack."""
+"""Files and folders of a study in a pack, beside manifest and solutions."""
 PLACE = "place"
 """Column of `settings.csv`: the answer that names a setting, and where in its JSON."""
 TEXT_COLUMNS = ("algorithm", "outcome", PLACE)
@@ -63,8 +66,10 @@ WHOLE_COLUMNS = ("run", "f_num_diff")
 
 
 class Subject(NamedTuple):
-    """A study with its results, as a pack holds them: the manifest and the case, whose solutions were read as CSV."""
+    """A study of a pack with the files of its folder; the case has the solutions as they were read from CSV."""
 
+    packed: PackedStudy
+    files: dict[str, bytes]
     manifest: JsonObject
     case: Case
 
@@ -72,44 +77,84 @@ class Subject(NamedTuple):
     def study(self) -> Study:
         return self.case.study
 
-    def answer(self, options: Options, pool: Pool, progress: Progress) -> str:
-        """The JSON of an answer, with the bytes that its command prints."""
-        _, compute = QUESTIONS[options.question]
-        answer = answer_question(compute, self.case, options, pool=pool, progress=progress)
-        return json.dumps(answer.to_dict(), indent=2, allow_nan=False) + "\n"
+    def in_folder(self, *folders: str) -> list[str]:
+        """The names, without folder and ending, of the files in these folders."""
+        names = (PurePosixPath(name) for name in self.files)
+        return sorted({name.stem for name in names if str(name.parent) in folders})
 
-    def checks(self, pool: Pool, progress: Progress) -> bytes:
-        """The JSON of `check_study` on the solutions."""
-        settings = self.case.solutions[list(self.case.characteristics.names)].to_numpy(float)
-        return json_bytes(check_study(self.study, settings, pool, progress))
+    @property
+    def made(self) -> list[str]:
+        """The files that `make` makes, in order."""
+        answers = [f"{ANSWERS}/{answer.question}.json" for answer in self.packed.answers]
+        validations = [f"{VALIDATIONS}/{name}.json" for name in self.in_folder(REFERENCES, VALIDATIONS)]
+        return [*validations, *answers, CHECKS, STUDY, DOSSIER, DOSSIER_PAGE]
 
-    def validation(self, reference: Path, pool: Pool, progress: Progress) -> bytes:
-        """The JSON of `validate_with`."""
-        return json_bytes(validate_with(self.study, reference, pool, progress))
+    def make(self, name: str, pool: Pool, progress: Progress) -> bytes:
+        """A file of the pack, from the study and the files before it.
+
+        Raises
+        ------
+        InputError
+            If the published rows of a validation are missing.
+        """
+        kind, stem = name.partition("/")[0], PurePosixPath(name).stem
+        if name == STUDY:
+            return study_text(self.study)
+        if name == CHECKS:
+            return json_bytes(check_study(self.study, settings_of(self.case), pool, progress))
+        if kind == VALIDATIONS:
+            references = (file for file in self.files if file.startswith(f"{REFERENCES}/"))
+            reference = next((file for file in references if PurePosixPath(file).stem == stem), None)
+            if reference is None:
+                raise InputError(name, "the pack has only the digest of its published rows")
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder, PurePosixPath(reference).name)
+                path.write_bytes(self.files[reference])
+                return json_bytes(validate_with(self.study, path, pool, progress))
+        if kind == ANSWERS:
+            (answer,) = (answer for answer in self.packed.answers if answer.question == stem)
+            options, compute = QUESTIONS[stem]
+            result = answer_question(compute, self.case, options(**answer.options), pool=pool, progress=progress)
+            return json_bytes(result.to_dict())
+        dossier = self.dossier()
+        return json_bytes(dossier) if name == DOSSIER else dossier_page(dossier).encode()
+
+    def dossier(self) -> JsonObject:
+        answers = {
+            answer.question: (answer.command, json.loads(self.files[f"{ANSWERS}/{answer.question}.json"]))
+            for answer in self.packed.answers
+        }
+        validations = [json.loads(self.files[f"{VALIDATIONS}/{name}.json"]) for name in self.in_folder(VALIDATIONS)]
+        checks = json.loads(self.files[CHECKS])
+        return make_dossier(self.manifest, self.study, self.packed.counts, answers, checks, validations)
+
+    def named_settings(self, question: str) -> Iterator[tuple[str, FloatArray]]:
+        """The settings that an answer names, with their places."""
+        answer = json.loads(self.files[f"{ANSWERS}/{question}.json"])
+        return _named_settings(answer, self.case.characteristics, question)
 
     def evaluated(self, settings: FloatArray, pool: Pool, progress: Progress, stage: str) -> pd.DataFrame:
         """Settings, shape (M, n), as rows of `solutions.csv` without algorithm and run."""
         evaluations = Evaluator(self.study, pool, progress).evaluate(settings, stage, ignore_constraints=True)
-        return evaluations_frame(self.case.characteristics.names, [(("", 0), evaluations)]).drop(
-            columns=["algorithm", "run"]
-        )
+        frame = evaluations_frame(self.case.characteristics.names, [(("", 0), evaluations)])
+        return frame.drop(columns=["algorithm", "run"])
 
 
-def subject_of(
-    manifest: JsonObject, solutions: bytes, runs: Sequence[tuple[str, int]], places: Sequence[str]
-) -> Subject:
-    """The subject that a manifest and a CSV table of solutions describe; `places` are the folders of user code.
+def subject_of(packed: PackedStudy, files: dict[str, bytes], places: Sequence[str] = ()) -> Subject:
+    """The subject that the manifest and the solutions among the files describe; `places` are the folders of user code.
 
     Raises
     ------
-    InputError
-        If one of them cannot be read.
+    InputError, KeyError, TypeError, ValueError
+        If one of them is damaged.
     """
+    manifest = json.loads(files[MANIFEST])
     study = convert_table(MANIFEST, manifest["study"], Study, "study")
     study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
     scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
-    frame = read_table(solutions)
-    return Subject(manifest, build_case(study, manifest["original"], frame, frame.iloc[:0], runs, scoring=scoring))
+    frame = read_table(files[SOLUTIONS])
+    case = build_case(study, manifest["original"], frame, frame.iloc[:0], packed.runs, scoring=scoring)
+    return Subject(packed, files, manifest, case)
 
 
 def read_table(content: bytes) -> pd.DataFrame:
@@ -120,7 +165,7 @@ def read_table(content: bytes) -> pd.DataFrame:
     return frame.astype({name: int for name in WHOLE_COLUMNS if name in frame})
 
 
-def json_bytes(value: JsonObject) -> bytes:
+def json_bytes(value: Any) -> bytes:
     return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
 
 
@@ -128,12 +173,29 @@ def csv_of(frame: pd.DataFrame) -> bytes:
     return frame.to_csv(index=False, lineterminator="\n").encode()
 
 
-def named_settings(answer: Any, characteristics: CharacteristicSet, path: str = "") -> Iterator[tuple[str, FloatArray]]:
+def count_found(
+    solutions: pd.DataFrame, runs: Collection[tuple[str, int]], evaluations: pd.DataFrame
+) -> dict[str, int]:
+    """What a search has found."""
+    return {
+        "solutions": len(solutions),
+        "runs": len(runs),
+        "evaluations": len(evaluations),
+        "collisions": int(are_collisions(evaluations).sum()),
+    }
+
+
+def command_of(question: str, options: Mapping[str, Any], study_name: str) -> str:
+    """The command that prints an answer."""
+    return f"{QUESTIONS[question][0](**options).command_line(f'results/{study_name}')} --json"
+
+
+def _named_settings(answer: Any, characteristics: CharacteristicSet, path: str) -> Iterator[tuple[str, FloatArray]]:
     """The settings that an answer's JSON names as a whole or by their changes from the original, and their paths."""
     names = characteristics.names
     if isinstance(answer, list):
         for index, item in enumerate(answer):
-            yield from named_settings(item, characteristics, f"{path}.{index}")
+            yield from _named_settings(item, characteristics, f"{path}.{index}")
     elif isinstance(answer, dict):
         for key, value in answer.items():
             is_setting = isinstance(value, dict) and value and value.keys() <= set(names) and "outcome" in answer
@@ -141,11 +203,19 @@ def named_settings(answer: Any, characteristics: CharacteristicSet, path: str = 
                 original = dict(zip(names, characteristics.original.tolist(), strict=True))
                 yield f"{path}.{key}", np.array([float({**original, **value}[name]) for name in names])
             else:
-                yield from named_settings(value, characteristics, f"{path}.{key}")
+                yield from _named_settings(value, characteristics, f"{path}.{key}")
 
 
-class Maker:
-    """Makes the content of a pack from results directories.
+def make_pack(
+    directories: Iterable[str | Path],
+    questions: Collection[str],
+    references: Sequence[Path],
+    jobs: int | None,
+    progress: Progress,
+    *,
+    digests_only: bool,
+) -> tuple[Description, dict[str, bytes]]:
+    """The description and the files of a pack about results.
 
     Parameters
     ----------
@@ -155,127 +225,74 @@ class Maker:
         Files of published rows to validate each study with.
     digests_only
         Whether user code and files stay out of the pack.
+
+    Raises
+    ------
+    InputError
+        If a directory holds no results of a study, or its inputs have changed since.
     """
-
-    def __init__(
-        self,
-        questions: Collection[str],
-        references: Sequence[Path],
-        digests_only: bool,
-        jobs: int | None,
-        progress: Progress,
-    ) -> None:
-        self._questions, self._references = [name for name in QUESTIONS if name in questions], references
-        self._digests_only, self._jobs, self._progress = digests_only, jobs, progress
-        self.files: dict[str, bytes] = {}
-
-    def make(self, directories: Iterable[str | Path]) -> Description:
-        """The description of a pack, whose files are then in `files`.
-
-        Raises
-        ------
-        InputError
-            If a directory holds no results of a study, or its inputs have changed since.
-        """
-        if len({path.stem for path in self._references}) < len(self._references):
-            raise InputError("references", "two files have the same name", "files of different names")
-        cases = []
-        for directory in map(Path, directories):
-            case = study_or_case(directory, results_only=True)
-            assert isinstance(case, Case)
-            if not case.has_runs:
-                raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
-            for reference in self._references:
-                read_reference(reference, case.characteristics)  # refuses a wrong file before the work begins
-            cases.append((directory, case))
-        studies = [self._pack(number, directory, case) for number, (directory, case) in enumerate(cases, 1)]
-        return describe(studies, self._digests_only)
-
-    def _pack(self, number: int, directory: Path, case: Case) -> PackedStudy:
-        manifest, folder = read_manifest(directory), f"{number}-{case.study.name}"
-        del manifest["folders"]  # of this machine
-        solutions = csv_of(case.solutions)
-        subject = subject_of(manifest, solutions, case.finished_runs, case.study.origin.places)
-        code = (
-            {}
-            if self._digests_only
-            else _files_of_user(subject.study, {**manifest["sources"], **files_read_later(directory)})
-        )
-        answers = list[PackedAnswer]()
-        settings = dict[str, FloatArray]()
-        with local_pool(self._jobs or available_cores(), subject.study.search.time_limit) as pool:
-            for name in self._questions:
-                options = QUESTIONS[name][0]()
-                text = subject.answer(options, pool, self._progress)
-                command = f"{options.command_line(f'results/{case.study.name}')} --json"
-                answers.append(PackedAnswer(name, msgspec.to_builtins(options), command))
-                self.files[f"{folder}/{ANSWERS}/{name}.json"] = text.encode()
-                settings |= named_settings(json.loads(text), case.characteristics, name)
+    if len({path.stem for path in references}) < len(references):
+        raise InputError("references", "two files have the same name", "files of different names")
+    cases = list[tuple[Path, Case]]()
+    for directory in map(Path, directories):
+        case = study_or_case(directory, results_only=True)
+        assert isinstance(case, Case)
+        if not case.has_runs:
+            raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
+        cases.append((directory, case))
+    studies, files = list[PackedStudy](), dict[str, bytes]()
+    for number, (directory, case) in enumerate(cases, 1):
+        code = {} if digests_only else _files_of_user(case.study, directory)
+        subject = _begin(f"{number}-{case.study.name}", directory, case, questions, code)
+        subject.files.update({f"{REFERENCES}/{path.name}": path.read_bytes() for path in references})
+        with local_pool(jobs or available_cores(), case.study.search.time_limit) as pool:
+            for name in subject.made:
+                subject.files[name] = subject.make(name, pool, progress)
+            settings = {at: row for one in subject.packed.answers for at, row in subject.named_settings(one.question)}
             if settings:
-                frame = subject.evaluated(np.array([*settings.values()]), pool, self._progress, "named settings")
-                self.files[f"{folder}/{SETTINGS}"] = csv_of(
-                    pd.concat([pd.Series([*settings], name=PLACE), frame], axis=1)
-                )
-            checks = subject.checks(pool, self._progress)
-            made = [subject.validation(path, pool, self._progress) for path in self._references]
-        for path, validation in zip(self._references, made, strict=True):
-            self.files[f"{folder}/{VALIDATIONS}/{path.stem}.json"] = validation
-            if not self._digests_only:
-                self.files[f"{folder}/{REFERENCES}/{path.name}"] = path.read_bytes()
-        self.files |= {
-            f"{folder}/{CHECKS}": checks,
-            f"{folder}/{MANIFEST}": json_bytes(manifest),
-            f"{folder}/{SOLUTIONS}": solutions,
-            f"{folder}/{STUDY}": study_text(subject.study).encode(),
-            **{f"{folder}/{CODE}/{name}": content for name, content in code.items()},
-        }
-        counts = {
-            "solutions": len(case.solutions),
-            "runs": len(case.finished_runs),
-            "evaluations": len(case.evaluations),
-            "collisions": int(are_collisions(case.evaluations).sum()),
-        }
-        packed = PackedStudy(folder, case.study.name, counts, answers, list(case.finished_runs), sorted(code))
-        mine = {name.removeprefix(f"{folder}/"): text for name, text in self.files.items() if name.startswith(folder)}
-        self.files |= {f"{folder}/{name}": text for name, text in dossier_of(subject, packed, mine).items()}
-        return packed
+                frame = subject.evaluated(np.array([*settings.values()]), pool, progress, "named settings")
+                subject.files[SETTINGS] = csv_of(frame.assign(**{PLACE: [*settings]})[[PLACE, *frame]])
+        for name, content in subject.files.items():
+            if not (digests_only and name.startswith(f"{REFERENCES}/")):
+                files[f"{subject.packed.folder}/{name}"] = content
+        studies.append(subject.packed)
+    return describe(studies, digests_only), files
 
 
-def dossier_of(subject: Subject, packed: PackedStudy, files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """The dossier as JSON and as a page, from the other files of a study's folder."""
-    dossier = make_dossier(
-        subject.manifest,
-        subject.study,
-        packed.counts,
-        {one.question: (one.command, json.loads(files[f"{ANSWERS}/{one.question}.json"])) for one in packed.answers},
-        json.loads(files[CHECKS]),
-        [json.loads(text) for name, text in sorted(files.items()) if name.startswith(f"{VALIDATIONS}/")],
-    )
-    return {f"{DOSSIER}.json": json_bytes(dossier), f"{DOSSIER}.html": dossier_page(dossier).encode()}
+def _begin(folder: str, directory: Path, case: Case, questions: Collection[str], code: Mapping[str, bytes]) -> Subject:
+    """A subject with the files that are not made of others."""
+    name, manifest, answers = case.study.name, read_manifest(directory), list[PackedAnswer]()
+    del manifest["folders"]  # of this machine
+    for question, (options, _) in QUESTIONS.items():
+        if question in questions:
+            values = msgspec.to_builtins(options())
+            answers.append(PackedAnswer(question, values, command_of(question, values, name)))
+    counts = count_found(case.solutions, case.finished_runs, case.evaluations)
+    packed = PackedStudy(folder, name, counts, answers, list(case.finished_runs), sorted(code))
+    files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions)}
+    files |= {f"{CODE}/{file}": content for file, content in code.items()}
+    return subject_of(packed, files, case.study.origin.places)
 
 
-def study_text(study: Study) -> str:
+def study_text(study: Study) -> bytes:
     """A study file with all that the study extends."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"{study.name}.toml")
         write_study(path, study, "The study as it was run, with all that it extends.")
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes()
 
 
-def _files_of_user(study: Study, sources: Iterable[str]) -> dict[str, bytes]:
-    """The user's files that count in a study's identity, by the names that a pack gives them: code, files that code
-    reads, and networks that are named relative to the study.
+def _files_of_user(study: Study, directory: Path) -> dict[str, bytes]:
+    """The user's files that count in the identity of results, by the names that a pack gives them: code, files that
+    code reads, and networks in the folders of the study.
     """
+    sources = {**read_manifest(directory)["sources"], **files_read_later(directory)}
     paths = {name: Path(path) for name in sources if (path := file_by_name(name, study.origin.places))}
-    tests = [] if study.matrix is None else study.matrix.tests
-    tables = [study.scenario.parameters, *(table for test in tests for table in (test.parameters, test.over))]
-    texts = [text for table in tables for text in np.atleast_1d(table.get("network", [])).tolist()]
-    located = {point.scenario.network for point in assemble(study, study.source).points}
-    for text in map(PurePosixPath, {str(text) for text in texts}):
-        place = next((path for path in located if Path(path).parts[-len(text.parts) :] == text.parts), "")
-        if place and not is_shipped(str(text)) and not text.is_absolute() and ".." not in text.parts:
-            network, folder = open_network(place), text if Path(place).is_dir() else text.parent
-            view = options_of(network.path(OPTIONS_FILE)).get("gui-settings-file", "")  # SUMO does not start without it
-            names = [*(name for name, _ in network.digests), *([view] if view else [])]
-            paths |= {str(folder / name): network.folder / name for name in names}
+    networks = {point.scenario.network for point in assemble(study, study.source).points}
+    for network, root in product(networks, study.origin.places):
+        if Path(network).is_relative_to(root) and ".." not in Path(network).relative_to(root).parts:
+            opened = open_network(network)
+            view = options_of(opened.path(OPTIONS_FILE)).get("gui-settings-file", "")  # SUMO does not start without it
+            names = [*(name for name, _ in opened.digests), *([view] if view else [])]
+            paths |= {str((opened.folder / name).relative_to(root)): opened.folder / name for name in names}
     return {name: path.read_bytes() for name, path in sorted(paths.items())}

@@ -20,9 +20,10 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
+from safevar_sumo.analysis.words import change_texts
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.animation import player_data
-from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
+from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import choose_handle, handles_of
@@ -98,7 +99,7 @@ class ReportInput:
         """
         characteristics = self.case.characteristics
         changed = [item for item, value in zip(characteristics, setting, strict=True) if value != item.original]
-        texts = changes_in_words(characteristics, setting)
+        texts = change_texts(characteristics, dict(zip(characteristics.names, setting.tolist(), strict=True)))
         return [(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
 
     def play(self, setting: FloatArray) -> tuple[Comparison, JsonObject]:

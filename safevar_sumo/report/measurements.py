@@ -8,13 +8,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.model_spread import HALF_WIDTH, compute_model_spreads
+from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import load
+from safevar_sumo.campaign.evaluation import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import SafevarError
@@ -22,7 +23,8 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_
 from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.reference.effects import is_held_back, measure_coverage
 from safevar_sumo.reference.rows import read_reference
-from safevar_sumo.study import SAFETY_DEGREE, Study, tables_of
+from safevar_sumo.results import record
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo import Engine, is_recorded
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
@@ -97,17 +99,12 @@ def check_study(study: Study, solutions: FloatArray, pool: Pool, progress: Progr
         "constants": constants,
         "settings": len(settings),
         "recorded": is_recorded(system),
-        "same_in_sumo": int(np.sum([_bits(base, row) == _bits(in_sumo, row) for row in range(len(settings))])),
+        "same_in_sumo": sum(record(base, row) == record(in_sumo, row) for row in range(len(settings))),
         "time_step": step,
         "half_step": _with_step(evaluator, base, step / 2),
         "double_step": _with_step(evaluator, base, step * 2),
         "original": _uncertainty(study, float(base.f_safe[0])),
     }
-
-
-def _bits(evaluations: Evaluations, row: int) -> tuple[Any, ...]:
-    numbers = [values[row] for values in (*evaluations.metrics.values(), evaluations.collision_speed)]
-    return str(evaluations.outcome[row]), np.array(numbers, dtype=float).tobytes()
 
 
 def _with_step(evaluator: Evaluator, base: Evaluations, step: float) -> JsonObject:
@@ -141,17 +138,11 @@ def count_constants(study: Study) -> dict[str, int]:
     """Numbers of a study by origin: the characteristics' originals and domains and what [published] and [repeatability]
     hold; parameters that a fit has found; all others of vehicle, ADS, scenario and weather, with their defaults.
     """
-    system = assemble(study, study.source)
-    models = {"vehicle": system.vehicle, "ads": system.ads, "scenario": system.scenario}
-    tables = tables_of(study)
-    others = sum(
-        _count_numbers(msgspec.to_builtins(model) if isinstance(model, msgspec.Struct) else tables[name]["parameters"])
-        for name, model in models.items()
-    )
+    resolved = identity_of(study, assemble(study, study.source))["resolved"]
+    tables = [resolved["weather"], *(resolved[name]["parameters"] for name in ("vehicle", "ads", "scenario"))]
     published = 3 * len(study.vehicle.characteristics) + len(study.published) + len(study.repeatability)
     fitted = len({*study.calibration, *study.spread})
-    weather = _count_numbers(msgspec.to_builtins(system.weather))
-    return {"published": published, "fitted": fitted, "assumed": max(others + weather - fitted, 0)}
+    return {"published": published, "fitted": fitted, "assumed": max(_count_numbers(tables) - fitted, 0)}
 
 
 def _count_numbers(value: Any) -> int:
@@ -162,11 +153,16 @@ def _count_numbers(value: Any) -> int:
 
 def print_checks(directory: str, reference: str = "") -> None:
     """Print the JSON of `check_study` on results or, with a reference file, of `validate_with`."""
-    results = load(directory)
-    with local_pool(available_cores(), results.study.search.time_limit) as pool:
-        if reference:
-            answer = validate_with(results.study, Path(reference), pool)
-        else:
-            names = list(results.case.characteristics.names)
-            answer = check_study(results.study, results.solutions[names].to_numpy(float), pool)
+    case = load(directory).case
+    with local_pool(available_cores(), case.study.search.time_limit) as pool:
+        answer = (
+            validate_with(case.study, Path(reference), pool)
+            if reference
+            else check_study(case.study, settings_of(case), pool)
+        )
     print(json.dumps(answer, indent=2, allow_nan=False))
+
+
+def settings_of(case: Case) -> FloatArray:
+    """The settings of all solutions, shape (M, n)."""
+    return case.solutions[list(case.characteristics.names)].to_numpy(float)

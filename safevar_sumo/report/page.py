@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from io import BytesIO
@@ -27,10 +26,10 @@ from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.figures import draw_figures
-from safevar_sumo.analysis.research_questions.tables import BoldText, lay_out
+from safevar_sumo.analysis.research_questions.tables import lay_out
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules
-from safevar_sumo.analysis.subject import answer_question
+from safevar_sumo.analysis.subject import Results, answer_question
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import question_command
@@ -38,7 +37,7 @@ from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
-from safevar_sumo.replay.comparison import format_number, superscript_powers
+from safevar_sumo.replay.comparison import superscript_powers
 from safevar_sumo.report.input import ReportInput, page_options, read_inputs
 from safevar_sumo.report.sections import (
     GENERAL_LIMITS,
@@ -50,10 +49,12 @@ from safevar_sumo.report.sections import (
     make_verdict,
     reason_without_opinion,
     replay_solutions,
+    table_data,
 )
+from safevar_sumo.results import write_whole
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.terminal import Progress, show_no_progress
+from safevar_sumo.terminal import Progress, answer_as_html, open_progress, show_no_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,37 +80,6 @@ def list_tables(cases: Sequence[Case]) -> list[JsonObject]:
     except UnanswerableError as error:
         return [table_data(pd.DataFrame(), "RQ1 to RQ3", [f"{error.source}: {error.problem}."])]
     return [table_data(table.frame, table.title, table.notes) for answer in answers for table in lay_out(answer)]
-
-
-def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> JsonObject:
-    """A frame as the template's table: the index as labels, the outer level of columns as headings over several
-    columns.
-    """
-    columns, labels = frame.columns, frame.index.nlevels
-    blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
-    rows = [
-        [{"text": _cell_text(cell), "bold": isinstance(cell, BoldText)} for cell in row]
-        for row in frame.reset_index().to_numpy(dtype=object).tolist()
-    ]
-    heads = [] if frame.empty else [*frame.index.names, *columns.get_level_values(-1)]
-    return {
-        "title": superscript_powers(title),
-        "heads": [superscript_powers(str(head)) for head in heads],
-        "rows": rows,
-        "labels": labels,
-        "spans": [("", labels), *((superscript_powers(name), width) for name, width in blocks.items())]
-        if blocks
-        else [],
-        "notes": list(map(superscript_powers, notes)),
-    }
-
-
-def _cell_text(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(f"{format_number(low)} to {format_number(high)}" for low, high in value)
-    if isinstance(value, float):
-        return "" if pd.isna(value) else format_number(value)
-    return "" if value is None else superscript_powers(str(value))
 
 
 def figure_data(figure: Figure, frame: pd.DataFrame) -> JsonObject:
@@ -150,39 +120,34 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
     }
 
 
-def commands_to_reproduce(
-    inputs: Sequence[ReportInput], questions: Sequence[str], *, paper: bool, is_compared: bool
-) -> list[tuple[str, str]]:
-    """What the commands reproduce, and the commands that give the numbers of the page, which answers `questions`."""
-    commands = []
+def commands_to_reproduce(inputs: Sequence[ReportInput], sections: Collection[str]) -> list[tuple[str, str]]:
+    """What the commands reproduce, and the commands that give the numbers of the page."""
+    commands, options = [], page_options()
     for data in inputs:
         directory, flag = str(data.directory), " --as-it-is-now" if data.later_changes else ""
         if data.case.has_runs:
-            study = f"sv.load({json.dumps(directory)}).study"
+            out = json.dumps(f"{directory}-again")
             script = (
-                f"import safevar_sumo as sv; sv.run({study}, out={json.dumps(f'{directory}-again')}, progress=True)"
+                f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out}, progress=True)"
             )
             what = f"The study {data.case.study.name}, as its manifest.json records it, into another directory"
             commands.append((what, f"python -c {shlex.quote(script)}"))
-        asked = [*questions, *(["opinion"] if "explain" in questions and not reason_without_opinion(data) else [])]
-        commands += [
-            (f"The part {name}", page_options()[name].command_line(directory, data.point) + flag) for name in asked
-        ]
+        asked = [command for name, command in COMMAND_OF_SECTION.items() if name in sections]
+        if "explain" in asked and not reason_without_opinion(data):
+            asked.append("opinion")
+        commands += [(f"The part {name}", options[name].command_line(directory, data.point) + flag) for name in asked]
         if not data.point:
-            options = f"--most-severe --plot it.png --animate it.html{flag}"
-            simulate = f"{PROGRAM_COMMAND} simulate {shlex.quote(directory)} {options}"
-            commands.append(("A replay, with figure and animation", simulate))
+            simulate = question_command("simulate", directory)
+            what = "A replay, with figure and animation"
+            commands.append((what, f"{simulate} --most-severe --plot it.png --animate it.html{flag}"))
     directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
-    if is_compared:
-        flags = f" --point {shlex.quote(inputs[0].point)}" if inputs[0].point else ""
+    flags = f" --point {shlex.quote(inputs[0].point)}" if inputs[0].point else ""
+    if "compare" in sections:
         commands.append(("The comparison", f"{PROGRAM_COMMAND} compare {directories}{flags}"))
-    if not paper:
-        return commands
-    return [
-        *commands,
-        ("The tables of RQ1 to RQ3", f"{PROGRAM_COMMAND} tables {directories}"),
-        ("The figures", f"{PROGRAM_COMMAND} figures {directories} --out figures"),
-    ]
+    if "questions" in sections:
+        commands.append(("The tables of RQ1 to RQ3", f"{PROGRAM_COMMAND} tables {directories}"))
+        commands.append(("The figures", f"{PROGRAM_COMMAND} figures {directories} --out figures"))
+    return commands
 
 
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
@@ -206,6 +171,76 @@ COMMAND_OF_SECTION = {"causes": "explain", **{name: name for name in DOMAIN_QUES
 """The command that computes each section that needs simulations."""
 
 
+def report(
+    *results: Results | str | Path,
+    out: str | Path | None = None,
+    only: Sequence[str] = (),
+    paper: bool = False,
+    point: str | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> str:
+    """Make one self-contained HTML page about the results of one or several studies; the same results give the same
+    page.
+
+    Parameters
+    ----------
+    results
+        Results, or their directories.
+    out
+        File to write the page to, if any.
+    only
+        Names of sections from `SECTIONS`, such as "verdict"; by default all but the research questions.
+    paper
+        With the research questions, as tables and figures.
+    point
+        Name of a point of the study's matrix: the page is about this point only, without the research questions, which
+        need whole studies.
+    jobs
+        Worker processes for simulations, by default one for each core.
+    progress
+        True for a bar on the terminal, or a function called with the stage, the amount done, and the total amount.
+    as_it_is_now
+        If results were computed with other files or versions, simulate with the present ones; the page says so.
+
+    Returns
+    -------
+    str
+        The page.
+
+    Warns
+    -----
+    UserWarning
+        If a new simulation of a solution differs from the results; with `as_it_is_now`, for each change of a file or
+        version.
+
+    Raises
+    ------
+    InputError
+        If a directory holds no results, there is no such section or point, or the file cannot be written.
+    """
+    if unknown := [name for name in only if name not in SECTIONS]:
+        hint = did_you_mean(unknown[0], SECTIONS)
+        raise InputError("only", f"there is no section {unknown[0]!r}{hint}", f"some of {','.join(SECTIONS)}")
+    if point is not None and (paper or "questions" in only):
+        raise InputError(
+            "point", "the research questions are about whole studies", "the page without them, or no `point`"
+        )
+    directories = [source.directory if isinstance(source, Results) else source for source in results]
+    inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
+    if len(inputs) != 2 and "compare" in only:
+        raise InputError("only", f"compare needs two results, and there are {len(inputs)}", "two results directories")
+    for data in inputs:
+        for change in data.later_changes:
+            warn(f"{data.directory}: {change}")
+    with open_progress(progress) as show_progress:
+        page = _make_page(inputs, only, jobs, show_progress, paper=paper)
+    if out is not None:
+        write_whole(Path(out), page)
+    return page
+
+
 def make_report(
     directories: Iterable[str | Path],
     only: Sequence[str] = (),
@@ -216,52 +251,42 @@ def make_report(
     paper: bool = False,
     as_it_is_now: bool = False,
 ) -> str:
-    """Make the page about results in directories; parameters, warnings and errors are those of
-    `safevar_sumo.report`.
-    """
-    unknown_name = next((name for name in only if name not in SECTIONS), None)
-    if unknown_name is not None:
-        hint = did_you_mean(unknown_name, SECTIONS)
-        raise InputError("only", f"there is no section {unknown_name!r}{hint}", f"some of {','.join(SECTIONS)}")
-    if point is not None and (paper or "questions" in only):
-        raise InputError(
-            "point", "the research questions are about whole studies", "the page without them, or no `point`"
-        )
-    inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
-    if len(inputs) != 2 and "compare" in only:
-        raise InputError("only", f"compare needs two results, and there are {len(inputs)}", "two results directories")
-    has_promise = all(data.case.study.repair.promise or data.case.study.limits for data in inputs)
-    left_out = {*([] if paper else ["questions"]), *(["compare"] if len(inputs) != 2 else [])}
-    left_out |= set() if has_promise else {"repair"}
-    sections = {
-        name: heading for name, heading in SECTIONS.items() if name in only or (not only and name not in left_out)
-    }
-    for data in inputs:
-        for change in data.later_changes:
-            warn(f"{data.directory}: {change}")
+    """The page of `report` about results in directories."""
+    return report(
+        *directories, only=only, jobs=jobs, progress=progress, point=point, paper=paper, as_it_is_now=as_it_is_now
+    )
+
+
+def _make_page(
+    inputs: Sequence[ReportInput], only: Sequence[str], jobs: int | None, progress: Progress, *, paper: bool
+) -> str:
     names = ", ".join(data.case.name for data in inputs)
-    are_rated = {is_rated(data.case.study) and point is None for data in inputs}
+    are_rated = {is_rated(data.case.study) and not data.point for data in inputs}
     if len(are_rated) > 1:
         problem = "some hold results of rated studies, others do not"
         raise InputError("directories", problem, "a report for each kind")
     if True in are_rated:
-        studies = [rated_study_data(data, jobs, progress) for data in inputs]
-        return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=studies)
-    cases = [data.case for data in inputs] if "questions" in sections else []
-    data_of_studies = [_study_data(data, sections, jobs, progress) for data in inputs]
+        rated_studies = [rated_study_data(data, jobs, progress) for data in inputs]
+        return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=rated_studies)
+    is_possible = {
+        "questions": paper,
+        "compare": len(inputs) == 2,
+        "repair": all(data.case.study.repair.promise or data.case.study.limits for data in inputs),
+    }
+    chosen = only or [name for name in SECTIONS if is_possible.get(name, True)]
+    sections = {name: heading for name, heading in SECTIONS.items() if name in chosen}
+    studies = [_study_data(data, sections, jobs, progress) for data in inputs]
     progress("tables and figures", 0, 1)
-    questions = [command for name, command in COMMAND_OF_SECTION.items() if name in sections]
+    cases = [data.case for data in inputs] if "questions" in sections else []
     return _render(
         "report.html.j2",
         title=f"Safety report: {names}",
         sections=sections,
-        studies=data_of_studies,
+        studies=studies,
         comparison=_comparison_data(inputs, jobs, progress) if "compare" in sections else {},
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
-        commands=commands_to_reproduce(inputs, questions, paper=bool(cases), is_compared="compare" in sections)
-        if "reproduce" in sections
-        else [],
+        commands=commands_to_reproduce(inputs, sections) if "reproduce" in sections else [],
         general_limits=GENERAL_LIMITS,
         player=player_files(),
         js=_web_file("report.js"),
@@ -290,7 +315,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         )
     makers: dict[str, Callable[[], Any]] = {
         "tested": lambda: describe_tested_system(data),
-        "verdict": lambda: make_verdict(data, explained, answers.get("tolerance")),
+        "verdict": lambda: make_verdict(data, explained),
         "causes": lambda: make_cause_sections(data, explained) if explained else [],
         "trust": lambda: describe_limits(data, explained),
     }
@@ -312,8 +337,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         if explained and explained.analysed
         else None,
         "answers": {
-            name: [superscript_powers(sentence) for sentence in result.sentences() if isinstance(sentence, str)]
-            for name, result in answers.items()
+            name: [part for part in result.sentences() if isinstance(part, str)] for name, result in answers.items()
         },
         "figures": {
             name: figure_data(result.figure(), result.to_frame())
@@ -334,7 +358,7 @@ def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: 
     except InputError as error:
         return {"sentences": [f"{error.problem}."]}
     return {
-        "sentences": [superscript_powers(part) for part in result.sentences() if isinstance(part, str)],
+        "sentences": [part for part in result.sentences() if isinstance(part, str)],
         "figure": {
             **_picture("compare", result.figure()),
             "table": table_data(result.limits_frame().set_index("characteristic"), "Limits side by side"),
@@ -346,22 +370,14 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
     """The page's data about one rated study: the original vehicle, and the solution with the fewest changes that loses
     a point, simulated in all cells.
     """
-    case, directory, options = data.case, str(data.directory), RatingOptions()
-    if data.any_unsafe:
-        options = RatingOptions(solution=data.select_handles("fewest")[0])
-    rating = answer_question(rate_variant, case, options, jobs=jobs, progress=progress)
+    directory = str(data.directory)
+    options = RatingOptions(solution=data.select_handles("fewest")[0] if data.any_unsafe else None)
+    rating = answer_question(rate_variant, data.case, options, jobs=jobs, progress=progress)
     return {
-        "title": case.study.title,
-        "sentence": f"{rating.no_verdict} {rating.verdict}".lstrip(),
+        "answer": Markup(answer_as_html(rating)),
         "notes": rating.remarks,
-        "points": [
-            (name, [f"{total:.2f}" for total in points.sum(axis=1)], f"{possible:g}")
-            for name, points, possible in rating.points
-        ],
-        "lost": [(test, f"{lost:.2f}") for test, lost in rating.losses.items()],
         "picture": _picture("matrices", rating.figure()),
         "names": [vehicle.name for vehicle in rating.vehicles],
-        "not_simulated": rating.not_simulated,
         "commands": [
             options.command_line(directory),
             *(question_command(question, directory) for question in ("tolerance", "explain")),
@@ -371,7 +387,7 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
 
 def _render(template: str, **values: Any) -> str:
     page = template_environment(TEMPLATE_FOLDER).get_template(template)
-    return page.render(css=_web_file("report.css"), **values) + "\n"
+    return superscript_powers(page.render(css=_web_file("report.css"), **values)) + "\n"
 
 
 def _web_file(name: str) -> Markup:

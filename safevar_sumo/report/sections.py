@@ -6,29 +6,29 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import Cause
-from safevar_sumo.analysis.explain.failure import ROBUST, Explanation
+from safevar_sumo.analysis.explain.failure import Explanation
 from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE
 from safevar_sumo.analysis.model_spread import compute_model_spreads
 from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
-from safevar_sumo.analysis.tolerance.answer import Tolerance
+from safevar_sumo.analysis.research_questions.tables import BoldText
 from safevar_sumo.analysis.words import number_of, points_in_words, question_command
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import KMH_PER_MS, JsonObject, Outcome
-from safevar_sumo.reference import Totals, shipped_totals_of
-from safevar_sumo.replay.comparison import format_number, list_differences, quantity_text, superscript_powers
+from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.reference import shipped_totals_of
+from safevar_sumo.replay.comparison import format_number, list_differences
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import read_manifest
-from safevar_sumo.scenarios import SCENARIOS, distance_in_words, equals_clear, pre_crash_sentence
+from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.terminal import Progress
@@ -38,24 +38,46 @@ MAX_CAUSES = 6
 """Maximum number of minimal causes in a report."""
 FIRST_CHOICES = ("fewest", "smallest", "most_severe")
 """Choices that select the first solutions on the page, as the flags of `simulate` do."""
-NO_VALUE = "–"  # noqa: RUF001
 
 
-def make_verdict(data: ReportInput, explained: Explained | None, tolerance: Tolerance | None) -> JsonObject:
-    """The verdict: the sentences of `explain`, key figures, and the commands that repeat the study and the failure."""
+def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> JsonObject:
+    """A frame as the template's table: the index as labels, the outer level of columns as headings over several
+    columns.
+    """
+    columns, labels = frame.columns, frame.index.nlevels
+    blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
+    return {
+        "title": title,
+        "heads": [] if frame.empty else [*frame.index.names, *columns.get_level_values(-1)],
+        "rows": [
+            [{"text": _cell_text(cell), "bold": isinstance(cell, BoldText)} for cell in row]
+            for row in frame.reset_index().to_numpy(dtype=object).tolist()
+        ],
+        "labels": labels,
+        "spans": [("", labels), *blocks.items()] if blocks else [],
+        "notes": list(notes),
+    }
+
+
+def _cell_text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(f"{format_number(low)} to {format_number(high)}" for low, high in value)
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return format_number(value) if isinstance(value, float) else str(value)
+
+
+def make_verdict(data: ReportInput, explained: Explained | None) -> JsonObject:
+    """The verdict: the sentences of `explain`, and the commands that repeat the study and the failure."""
     commands = [question_command(name, str(data.directory), data.point) for name in ("explain", "tolerance")]
     if explained is None:
-        return {"sentences": ["No solution was found."], "is_bad": False, "key_figures": [], "commands": commands}
+        return {"sentences": ["No solution was found."], "is_bad": False, "commands": commands}
     sentences = [explained.no_verdict] if explained.no_verdict else explained.verdict
     if explained.choices and explained.choices[0].handle:
         simulate = question_command("simulate", str(data.directory), data.point)
         commands.append(f"{simulate} --solution {explained.choices[0].name} --plot it.png")
-    return {
-        "sentences": [*sentences, explained.counts],
-        "is_bad": explained.failures > 0,
-        "key_figures": _key_figures(data, explained, tolerance),
-        "commands": commands,
-    }
+    is_bad = explained.failures > 0
+    return {"sentences": [*sentences, explained.counts], "is_bad": is_bad, "commands": commands}
 
 
 def describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
@@ -70,33 +92,6 @@ def describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
         "changes": data.list_changes(setting),
         "points": points_in_words(failure.points, len(matrix)) if matrix and not data.point else "",
     }
-
-
-def _key_figures(data: ReportInput, explained: Explained, tolerance: Tolerance | None) -> list[tuple[str, str, str]]:
-    """Title, value and note: robust failure with the fewest changes, severity, preventability, joint tolerance."""
-    robust, preventability = explained.by_reason.get(ROBUST), explained.preventability
-    degree, factor = float(explained.nearest.f_safe[0]), 0.0 if tolerance is None else tolerance.joint.factor
-    severity = f"safety degree {distance_in_words(data.system.points[0].scenario, degree)}", "no collision"
-    if explained.nearest.collided[0]:
-        severity = f"collision at {-degree:.1f} m/s", f"{-KMH_PER_MS * degree:.0f} km/h"
-    return [
-        (
-            "Robust with the fewest changes",
-            number_of(len(robust.changed), "change") if robust else NO_VALUE,
-            str(robust.robustness) if robust else "no failure tested is robust",
-        ),
-        ("Most severe", *severity),
-        (
-            "A competent driver avoids",
-            preventability.range_in_words if preventability.looked_at else NO_VALUE,
-            f"in the same vehicle; {number_of(preventability.looked_at, 'collision')} analysed",
-        ),
-        (
-            "Joint tolerance of all characteristics",
-            f"{100 * factor:.1f} % of the way" if factor else NO_VALUE,
-            "not computed" if tolerance is None else "from the original to the ends of their domains",
-        ),
-    ]
 
 
 def make_cause_sections(data: ReportInput, explained: Explained) -> list[JsonObject]:
@@ -125,21 +120,21 @@ def _make_cause_section(
     data: ReportInput, rank: int, cause: Cause, failure: Explanation, opinion: Opinion | None
 ) -> JsonObject:
     comparison, player = data.play(data.case.characteristics.setting(cause.changes, "cause", beyond=True))
-    rows = [
-        (item.name, item.short_name, item.words, *(quantity_text(value, item.unit) for value in values))
-        for item in data.case.characteristics
-        if item.name in cause.changes
-        for values in [(item.original, cause.changes[item.name], cause.boundary[item.name])]
-    ]
+    title, rows = f"Cause {rank}: {', '.join(cause.changes)}", {}
+    for item in data.case.characteristics:
+        if item.name in cause.changes:
+            values = (item.original, cause.changes[item.name], cause.boundary[item.name])
+            rows[f"{item.name} ({item.short_name})"] = [f"{format_number(value)}{item.suffix}" for value in values]
+    frame = pd.DataFrame.from_dict(rows, "index", columns=["original", "here", "limit (all scaled)"])
     return {
-        "title": f"Cause {rank}: {', '.join(cause.changes)}",
+        "title": title,
         "anchor": data.anchor("cause", rank),
         "cause": cause,
         "failure": failure,
-        "rows": rows,
+        "table": table_data(frame.rename_axis("characteristic"), f"Changes of {title}"),
         "end": comparison.verdict(comparison.rows[-1]),
         "opinion": opinion,
-        "reason": superscript_powers(str(failure.because)),
+        "reason": str(failure.because),
         "player_data": player,
         "replay_anchor": data.anchor("replay", failure.name),
     }
@@ -175,6 +170,12 @@ def replay_solutions(data: ReportInput, explained: Explained | None, progress: P
     return sorted(entries, key=lambda entry: (entry["f_safe"], entry["handle"]))
 
 
+NO_RESULT = {
+    Outcome.SIMULATOR_ERROR: "could not be simulated; no result contains them",
+    Outcome.INVALID_TEST: "left the tolerance of a test's speed before the driving system acted: they are neither "
+    "failures nor successes",
+}
+"""Outcomes of settings about which nothing is known."""
 GENERAL_LIMITS = (
     "A search that finds no failure proves nothing about the settings that it did not try.",
     "One vehicle in its lane: no steering beyond lane keeping, no separate wheels and axles, no suspension, no wind, "
@@ -184,11 +185,16 @@ GENERAL_LIMITS = (
 
 
 def describe_tested_system(data: ReportInput) -> JsonObject:
-    """Describe the tested vehicle, driving system and scenario, and the search, in sentences.
-
-    `characteristics` holds name, unit, original, lower, upper, threshold and meaning of each.
-    """
+    """Describe the tested vehicle, driving system and scenario, and the search, in sentences."""
     case, study = data.case, data.case.study
+    heads = ["characteristic", "unit", "original", "from", "to", "filter threshold", "meaning"]
+    rows = pd.DataFrame(
+        [
+            (item.name, unit_text(item.unit, "{}"), item.original, item.lower, item.upper, item.threshold, item.words)
+            for item in case.characteristics
+        ],
+        columns=heads,
+    )
     return {
         "subject": f"Vehicle: {_name_and_sentence(VEHICLES, study.vehicle.model)}, "
         f"{number_of(len(case.characteristics), 'varied characteristic')}. "
@@ -196,15 +202,7 @@ def describe_tested_system(data: ReportInput) -> JsonObject:
         f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {describe_conditions(data)}.",
         "tags": pre_crash_sentence(data.system.points),
         "search": _describe_search(data),
-        "characteristics": [
-            (
-                item.name,
-                superscript_powers(unit_text(item.unit, "{}")),
-                *map(format_number, (item.original, item.lower, item.upper, item.threshold)),
-                item.words,
-            )
-            for item in case.characteristics
-        ],
+        "characteristics": table_data(rows.set_index("characteristic"), f"Characteristics of {case.name}"),
         "remarks": [*case.remarks, *vehicle_remarks(data.system)],
     }
 
@@ -243,70 +241,56 @@ def _name_and_sentence(models: Mapping[str, Any], name: str) -> str:
     return f"{name} ({first_line.rstrip('.')})"
 
 
-def describe_agreement(study: Study) -> str:
-    """How well a study agrees with each file of published data, in sentences."""
-    totals = shipped_totals_of(study)
-    if not totals:
-        return (
-            "This study was not compared with published data: whether another simulator or a real vehicle behaves in "
-            "the same way is unknown."
-        )
-    by_collisions = sorted(totals.items(), key=lambda item: (-item[1].collisions["reference"], -item[1].rows))
-    sentences = (_agreement_sentence(file, entry) for file, entry in by_collisions)
-    return f"Agreement with published data. {' '.join(sentences)}"
-
-
-def _agreement_sentence(file: str, totals: Totals) -> str:
-    counts, parts = totals.collisions, [f"{file}, {totals.rows} vehicles simulated again"]
-    if (rho := totals.spearman.get(SAFETY_DEGREE)) is not None:
-        parts.append(f"the rank correlation of the safety degrees is {rho:.2f} (1: the same order, 0: none)")
-    if (error := totals.mean_absolute_error.get(SAFETY_DEGREE)) is not None:
-        parts.append(f"their mean error is {error:.2f} m")
-    if totals.recall is not None:
-        published = f"{counts['both']} of the {counts['reference']} published collisions collide here too"
-        parts.append(f"{published} (recall {totals.recall:.2f})")
-    if totals.precision is not None:
-        here = f"{counts['both']} of the {counts['here']} collisions here are published ones"
-        parts.append(f"{here} (precision {totals.precision:.2f})")
-    return f"{'; '.join(parts)}."
+def describe_agreement(study: Study) -> JsonObject | None:
+    """How well a study agrees with each file of published data, as a table; None if there is no data."""
+    rows = {
+        f"{file}: {entry.rows} vehicles simulated again": {
+            "rank correlation": entry.spearman.get(SAFETY_DEGREE),
+            "mean error [m]": entry.mean_absolute_error.get(SAFETY_DEGREE),
+            "collisions there": entry.collisions["reference"],
+            "here": entry.collisions["here"],
+            "in both": entry.collisions["both"],
+        }
+        for file, entry in shipped_totals_of(study).items()
+    }
+    if not rows:
+        return None
+    frame = pd.DataFrame.from_dict(rows, "index").sort_values("collisions there", ascending=False, kind="stable")
+    return table_data(frame.round(2).rename_axis("published data"), "Agreement with published data: safety degrees")
 
 
 def describe_limits(data: ReportInput, explained: Explained | None) -> JsonObject:
-    """Describe how far the findings of one study hold, and how well it agrees with published data.
-
-    `published` lists metrics of the original vehicle: name, published value, value here. `spread` lists vehicles: name,
-    safety degree here, safety degrees with the study's other parameter sets.
+    """How far the findings of one study hold: remarks, the vehicle model's own uncertainty, and the original vehicle's
+    published metrics beside those here.
     """
-    case, failures = data.case, explained.explanations if explained else ()
-    published = [
-        (name, case.study.published[name], case.original[name])
-        for name in METRICS
-        if name in case.study.published and not math.isnan(case.original[name])
+    case, failures, tables = data.case, explained.explanations if explained else (), list[JsonObject]()
+    remarks = [
+        f"{count} of {len(case.evaluations)} settings {words}."
+        for outcome, words in NO_RESULT.items()
+        if (count := int((case.evaluations["outcome"] == str(outcome)).sum()))
     ]
-    remarks = []
-    for outcome, words in (
-        (Outcome.SIMULATOR_ERROR, "could not be simulated; no result contains them"),
-        (
-            Outcome.INVALID_TEST,
-            "left the tolerance of a test's speed before the driving system acted: they are neither failures nor "
-            "successes",
-        ),
-    ):
-        if count := int((case.evaluations["outcome"] == str(outcome)).sum()):
-            remarks.append(f"{count} of {len(case.evaluations)} settings {words}.")
     if failures:
         borderline = sum(failure.robustness.borderline for failure in failures)
         remarks.append(
             f"{borderline} of {len(failures)} failures analysed are borderline: fewer than "
             f"{100 * MIN_ROBUST_SHARE:.0f} % of their neighbours are unsafe too."
         )
-    if not published:
-        remarks.append("There are no published values of the original vehicle to compare the study with.")
-    spread = []
     if case.study.spread:
         handles = data.select_handles(*FIRST_CHOICES) if data.any_unsafe else []
         settings = [case.characteristics.original, *map(data.setting_of, handles)]
-        degrees = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]
         spreads = compute_model_spreads(case.study, np.stack(settings), data.point)
-        spread = list(zip(("original vehicle", *handles), degrees, spreads, strict=True))
-    return {"remarks": remarks, "published": published, "spread": spread}
+        frame = pd.DataFrame(spreads, ["original vehicle", *handles]).rename_axis("vehicle")
+        degrees = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]
+        frame.insert(0, "safety degree here", degrees)
+        note = (
+            "Parameter sets that fit the published data as well, repeats of one simulation, and the model's error on "
+            "the rows of the fit; from lower to upper are 90 %. The band does not cover other data."
+        )
+        tables.append(table_data(frame, "The vehicle model's own uncertainty", [note]))
+    published = pd.DataFrame({"published": dict(case.study.published), "here": dict(case.original)}).dropna()
+    if published.empty:
+        remarks.append("There are no published values of the original vehicle to compare the study with.")
+    else:
+        published["difference [%]"] = (100 * (published["here"] / published["published"] - 1)).round(1)
+        tables.append(table_data(published.rename_axis("metric"), "The original vehicle, published and here"))
+    return {"remarks": remarks, "tables": tables}

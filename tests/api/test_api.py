@@ -115,7 +115,7 @@ def test_a_criterion_is_a_number_a_word_or_an_object() -> None:
 
 def test_compare_needs_a_study_and_changes_alone() -> None:
     comparison = sv.compare_with_original("sun", {"tireFric": 1.2})
-    assert comparison.changes == ["tireFric 3.5 → 1.2 (-66\N{NO-BREAK SPACE}%)"]
+    assert comparison.changes == ["tireFric 3.5 -> 1.20 (-65.7 %)"]
     assert (
         comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
     )

@@ -4,6 +4,8 @@ process.
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +23,7 @@ from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, run, searched
 
 STUDY = load_study("euro_ncap_rating")
 WHOLE = protocol_of(EURO_NCAP_2026)
@@ -113,3 +115,13 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     ((comparison, worse_cells),) = compare_at_cells(evaluator, original, original)
     assert worse_cells == (matrix[0].name, matrix[4].name)
     assert comparison.point == matrix[4].name
+
+
+@pytest.mark.slow
+def test_a_rating_is_packed_and_made_again(in_tmp: Path) -> None:
+    search = {"population": 4, "evaluations": 8}
+    searched(load_study("euro_ncap_rating", search=search), Path("results"))
+    run("evidence", "results", "--out", "it.zip", "--rating")
+    result = json.loads(run("verify", "it.zip", "--json").stdout)
+    assert result["same"] == result["claims"]
+    assert "answer rating" in {claim["claim"] for claim in result["table"]}

@@ -18,6 +18,7 @@ from safevar_sumo.report import pack as packs
 from safevar_sumo.report.pack import DESCRIPTION, Description, describe, read_pack, write_pack
 from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
+from tests.analysis.test_repair import planted as planted
 from tests.in_process import refused, run
 
 MINE = """
@@ -307,6 +308,16 @@ def test_an_own_network_travels_along(in_tmp: Path) -> None:
     refused("verify", "it.zip", message=("roads/scenario.sumocfg", "--run-code"))  # SUMO's options may name outputs
     result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
     assert result["same"] == result["claims"] > 4
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("planted")
+def test_repairs_are_packed_and_made_again(in_tmp: Path) -> None:
+    run("study", "planted.toml", "--out", "results", "--quiet", "--jobs", "1")
+    run("evidence", "results", "--out", "it.zip", "--repair")
+    result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
+    assert result["same"] == result["claims"]
+    assert "answer repair" in {claim["claim"] for claim in result["table"]}
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def first_command(study: Study) -> list[str]:
     one: Any = SimpleNamespace(
         directory=Path("its results"), point="", later_changes=(), case=SimpleNamespace(study=study, has_runs=True)
     )
-    return shlex.split(commands_to_reproduce([one], [], paper=True, is_compared=False)[0][1])
+    return shlex.split(commands_to_reproduce([one], ["questions"])[0][1])
 
 
 @pytest.mark.parametrize("changes", [{"name": "pilot"}, {"step_length": 0.02}])
