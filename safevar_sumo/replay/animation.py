@@ -202,18 +202,19 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     is_beneath = body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1
 
-    def draw(x: float, y: float, length: float, width: float, colour: str, **style: Any) -> Patch:
-        return axis.add_patch(
-            Rectangle((x, y), length, width, **{"color": colour, "linewidth": 0, "zorder": 3} | style)
-        )
+    def draw(
+        x: float, y: float, length: float, width: float, zorder: float = 3, linewidth: float = 0.0, **style: Any
+    ) -> Patch:
+        rectangle = Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style)
+        return axis.add_patch(rectangle)
 
     patches = [
-        draw(-length, -width / 2, length, width, colour, alpha=0.6 if is_beneath else 0.9),
-        draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, "white", alpha=0.56),
-        draw(-length, -width / 2, length, width, colour, fill=False, linewidth=1.5, zorder=4 - body.row),
+        draw(-length, -width / 2, length, width, color=colour, alpha=0.6 if is_beneath else 0.9),
+        draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, color="white", alpha=0.56),
+        draw(-length, -width / 2, length, width, zorder=4 - body.row, linewidth=1.5, color=colour, fill=False),
     ]
     sides = (-width / 2, 0.2 * width) if body.is_vut else ()
-    return patches, [draw(-length, side, 0.28, 0.3 * width, BRAKE_COLOUR, zorder=4) for side in sides]
+    return patches, [draw(-length, side, 0.28, 0.3 * width, zorder=4, color=BRAKE_COLOUR) for side in sides]
 
 
 @cache

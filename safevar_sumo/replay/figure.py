@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safevar_sumo.metrics import time_to_collision
-from safevar_sumo.records import STANDSTILL, SimulationRuns
+from safevar_sumo.records import STANDSTILL, JsonObject, SimulationRuns
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     """Draw the legend: vehicles, marks, and lines."""
     from matplotlib.lines import Line2D
 
-    entries = {
+    entries: JsonObject = {
         f"{comparison.name(row)} vehicle: {comparison.verdict(row)}": {"color": COLOURS[row], "linestyle": LINES[row]}
         for row in comparison.rows
     }

@@ -250,6 +250,8 @@ def describe_agreement(study: Study) -> JsonObject | None:
             "collisions there": entry.collisions["reference"],
             "here": entry.collisions["here"],
             "in both": entry.collisions["both"],
+            "recall": entry.recall,
+            "precision": entry.precision,
         }
         for file, entry in shipped_totals_of(study).items()
     }
