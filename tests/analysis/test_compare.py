@@ -13,6 +13,7 @@ import scipy
 import safevar_sumo as sv
 from safevar_sumo.analysis.evaluator import sobol_settings
 from safevar_sumo.analysis.research_questions.statistics import compare_samples
+from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -60,7 +61,8 @@ def test_the_collisions_that_another_version_avoids_are_those_of_single_simulati
     assert "The original vehicles differ: passed, SD" in text
 
 
-def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
+def test_a_system_does_not_differ_from_itself(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
     answer = json.loads(run("compare", "smoke", "smoke", "--samples", "100", "--json").stdout)
     assert list(answer) == KEYS
     assert (answer["only_a_unsafe"], answer["only_b_unsafe"]) == (0, 0)

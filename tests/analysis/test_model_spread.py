@@ -7,6 +7,7 @@ import pytest
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, with_values
+from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan_with_sets
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.study import Study, load_study
@@ -67,7 +68,8 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
     assert not other.model_error
 
 
-def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
+def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
     friction = list(load_study("sun").vehicle.characteristics).index("tireFric")
     gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
     study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})

@@ -16,6 +16,7 @@ import pytest
 import scipy
 
 from safevar_sumo import risk
+from safevar_sumo.analysis.risk import rare as rare_failures
 from safevar_sumo.analysis.risk.answer import Risk
 from safevar_sumo.analysis.risk.variation import VariationModel
 from safevar_sumo.errors import InputError
@@ -259,10 +260,12 @@ def test_a_rare_failure_its_interval_and_its_most_probable_point() -> None:
     assert rare(linear(beta_of(1e-5)), 3).to_dict() == record
 
 
-def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same() -> None:
+def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenTURNS raises an error for a probability below the smallest that it estimates, and for samples without any
     failure.
     """
+    for name in ("REPEATS", "VERY_RARE_REPEATS"):
+        monkeypatch.setattr(rare_failures, name, 1)
     beyond = rare(linear(9.0), 2, method="subset_simulation")
     assert (beyond.method, beyond.probability) == ("subset_simulation", 0)
     assert "no failure was found" in beyond.remark
