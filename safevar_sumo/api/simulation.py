@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -188,6 +189,12 @@ class Simulation:
             "vcs": dict(self.setting),  # vehicle characteristics
             **record(self.evaluation, row=0),
         }
+
+    def _repr_html_(self) -> str:
+        import pandas as pd
+
+        both = [{**one.setting, **one.metrics, **one.objectives} for one in (self.original, self)]
+        return f"<p>{escape(repr(self))}</p>\n{pd.DataFrame(both, ['original', 'simulated']).T.to_html()}"
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
