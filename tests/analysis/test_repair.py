@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.analysis.repair import attack, compute, smallest
+from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import run
+from tests.in_process import InlinePool, run
 
 SPEED, STEP, MARGIN, GAP_TODAY, SIGHT = 20.0, 0.005, 0.3, 12.0, 50.0
 """Speed [m/s] and step [s] of the planted system; its gap of today lets even a new sled collide, so that the price of
@@ -118,7 +124,7 @@ grip = { at_least = 5 }
 
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name, number in (("SOBOL_SETS", 256), ("DIAGONAL_SETS", 64)):
+    for name, number in (("SOBOL_SETS", 64), ("DIAGONAL_SETS", 32)):
         monkeypatch.setattr(smallest, name, number)
     monkeypatch.setattr(attack, "RANDOM_ATTACKS", 64)
     monkeypatch.setattr(compute, "SOBOL_VEHICLES", 32)
@@ -150,16 +156,87 @@ def test_repair_price_and_curve_of_a_planted_system_equal_the_closed_form(plante
 
 
 @pytest.mark.slow
-def test_always_braking_has_its_price_and_a_kept_promise_writes_no_file(planted: Path, tmp_path: Path) -> None:
-    (repair,) = sv.repair(planted, change=["always"], jobs=2).repairs
-    assert repair.price.needless is not None
-    scenes, repaired, original = repair.price.needless
-    assert scenes >= 6
-    assert (repaired, original) == (scenes, 0)
+def test_always_braking_has_its_price_for_any_number_of_jobs(planted: Path) -> None:
+    answers = [sv.repair(planted, change=["always"], jobs=jobs).to_dict() for jobs in (1, 2)]
+    assert answers[0] == answers[1]
+    needless = answers[0][0]["price"]["needless_braking"]
+    assert needless["repaired"] == needless["scenes"] >= 6
+    assert needless["original"] == 0
+
+
+class Adding:
+    """A problem without simulations: the changes of the parameters, up to 0.85 each, add up to what a vehicle needs."""
+
+    takes_arrays, margin, study = True, MARGIN, SimpleNamespace(search=SimpleNamespace(seed=3))
+
+    def __init__(self, parameters: int, need: float) -> None:
+        self.today, self.parameters, self._need = np.full(parameters, 0.1), range(parameters), need
+
+    def degrees(self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Any) -> tuple[FloatArray, Any]:
+        gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
+        degrees = gain[:, np.newaxis] - self._need * vehicles[:, 0] + MARGIN
+        return degrees, np.zeros(degrees.shape, dtype=int)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "need", "changed"),
+    [(2, 0.4, {1: 0.4, 2: 0.2}), (2, 1.2, {2: 0.6}), (5, 1.0, {2: 0.5, 3: 1 / 3}), (4, 3.0, {4: 0.75}), (4, 9.0, {})],
+)
+def test_the_smallest_changes_are_those_of_the_closed_form(
+    parameters: int, need: float, changed: dict[int, float]
+) -> None:
+    problem: Any = Adding(parameters, need)
+    search = smallest.Search(problem, np.linspace(0.5, 0, 20)[:, np.newaxis], [])
+    search.pareto_set(lambda one: 0.0)
+    search.add(np.linspace(1, 0.5, 20)[:, np.newaxis])  # what was found before becomes a lower bound
+    found = {int((one != problem.today).sum()): float(search.change(one)) for one in search.pareto_set(lambda one: 0.0)}
+    assert found == pytest.approx(changed, abs=0.005)
+
+
+@pytest.mark.slow
+def test_an_impossible_promise_ends_with_the_largest_that_can_be_kept(planted: Path) -> None:
+    planted.write_text(STUDY.replace("upper = 64.0", "upper = 26.0"))
+    found = sv.repair(planted, change=["gap"], pool=InlinePool())
+    assert not found.repairs
+    assert found.largest_promise is not None
+    (grip,) = found.largest_promise.worn
+    assert grip.lower == pytest.approx(SPEED**2 / (2 * (26.0 - MARGIN)), abs=2 * (8 - 5) / 2**compute.HALVINGS)
+    assert "The largest that can be kept: grip >= 7.8" in found.verdict
+
+
+@pytest.mark.slow
+def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: Path) -> None:
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 26.0, always"))
     out = tmp_path / "kept.toml"
-    done = run("repair", str(planted), "--promise", "grip>=7.9", "--change", "gap", "--out", str(out))
-    assert "keeps this promise" in done.stdout
+    done = run("repair", str(planted), "--promise", "grip>=7.9", "--change", "gap", "--out", str(out), "--json")
+    (summary,) = json.loads(done.stdout)
+    assert summary["repairs"] == 0
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "change", "message"),
+    [
+        ("lower = 4.0", "lower = 14.0", "gap", "bounds that hold the value of today"),
+        ("", "", "colour", "colour: no simulation reads it"),
+        ("", "", "gape", "did you mean 'gap'?"),
+        ("at_least = 5", "at_least = 3", "gap", "outside its domain"),
+        ("gap = 12.0, always", "gap = true, always", "gap", "a number, the value of today"),
+    ],
+)
+def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, change: str, message: str) -> None:
+    planted.write_text(STUDY.replace(old, new))
+    with pytest.raises(sv.InputError, match=re.escape(message)):
+        sv.repair(planted, change=[change], pool=InlinePool())
+
+
+def test_ctrl_c_leaves_no_file(planted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compute, "_without_unread", interrupted)
+    out = tmp_path / "repaired.toml"
+    run("repair", str(planted), "--change", "gap", "--out", str(out), "--jobs", "1", expect=130)
     assert not out.exists()
 
 

@@ -22,7 +22,7 @@ from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, unit_text
 from safevar_sumo.study.schema import NAME_PATTERN
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.terminal import WholeTable, answer_as_html
@@ -172,7 +172,7 @@ class Repairs:
         """
         if not self.curve:
             raise InputError("plot", "there is no curve", "a characteristic for the curve")
-        (one,) = (one for one in self.promise.characteristics if one.name == self.curve[0].characteristic)
+        (one,) = (one for one in self.promise.region.characteristics if one.name == self.curve[0].characteristic)
         figure, (axis,) = new_panels(
             f"{self.study.name}: promised wear and earlier braking", 1, 1, (4.0, 2.6), min_width=4.6, title_height=1.0
         )
@@ -235,7 +235,7 @@ class Repairs:
         for part in self.not_repairable:
             limits = [
                 f"{name} {'below' if value < one.original else 'above'} {one.text(value)}{one.suffix}"
-                for one in self.promise.characteristics
+                for one in self.promise.region.characteristics
                 for name, value in part.limits.items()
                 if name == one.name
             ]
@@ -253,7 +253,7 @@ class Repairs:
 
     def _changes_in_words(self, repair: Repair) -> str:
         return ", ".join(
-            f"{one.name} {one.today:.4g} -> {repair.values[one.name]:.4g}{one.suffix} ({one.meaning})"
+            f"{one.name} {one.today:.4g} -> {repair.values[one.name]:.4g}{unit_text(one.unit)} ({one.meaning})"
             for one in self.parameters
             if one.name in repair.values
         )

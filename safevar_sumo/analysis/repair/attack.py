@@ -1,10 +1,10 @@
-"""Attacks on sets of parameters with the search that broke today's, and proof on fresh wear."""
+"""Attacks on sets of parameters with the search that broke today's, and proof on fresh wear (steps 3 and 5)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +14,17 @@ from safevar_sumo.analysis.repair.problem import Problem, degrees_of
 from safevar_sumo.campaign.run import algorithm_of
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search import Problem as SearchProblem
-from safevar_sumo.vehicles import CharacteristicSet
 
 ATTACKS = 3
 """Runs of the search, each with a seed of its own, that must find nothing."""
 RANDOM_ATTACKS = 1024
-"""Random vehicles that attack too: they find failures that lie far from the worst."""
+"""Random vehicles that attack where the search has found nothing: they find failures far from the worst."""
+MAX_NEW = 32
+"""Failures at which an attack ends, and which become counterexamples."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
+PROOF_PARTS = 4
+"""Parts of the fresh wear, after each of which a failure ends the proof."""
 
 
 class Proof(NamedTuple):
@@ -35,131 +38,81 @@ class Proof(NamedTuple):
     confidence: float = CONFIDENCE
 
 
-def attack(problem: Problem, sets: Sequence[FloatArray], round_number: int) -> list[FloatArray]:
-    """For each set of parameters the vehicles within the promise that it does not keep safe, worst first, shape (M, n).
-
-    Vehicles that no driving system keeps safe are left out.
+def attack(problem: Problem, sets: Sequence[FloatArray], points: Sequence[int], number: int) -> list[FloatArray]:
+    """For each set of parameters the vehicles within the promise that it does not keep safe at some points, and a
+    driving system could, worst first, shape (M, w). `number` counts the attacks.
     """
-    characteristics, columns = problem.promise.characteristics, problem.promise.columns
-    members = tuple(
-        replace(characteristics.members[column], lower=float(lower), upper=float(upper))
-        for column, lower, upper in zip(
-            columns, problem.promise.lower[columns], problem.promise.upper[columns], strict=True
-        )
-    )
-    own, search = CharacteristicSet(members), problem.study.search
+    shares, worn, search = np.array(sets), problem.promise.worn, problem.study.search
     label = next(iter(search.labels))
-    original = np.tile(characteristics.original, (len(sets), 1))
-    originals = problem.evaluate(np.array(sets), original, "attack")
-    runs = []
-    owners = [number for number in range(len(sets)) for _ in range(ATTACKS)]
-    for index, number in enumerate(owners):
+    originals = problem.evaluate(shares, np.tile(worn.original, (len(shares), 1)), "attack", points)
+    runs = {}
+    for owner in range(len(shares)):
         task = SearchProblem(
-            characteristics=own,
-            original=_reduced(originals.take([number]), columns, own),
+            characteristics=worn,
+            original=originals.take([owner]),
             evaluations=search.evaluations,
             population=search.population,
         )
-        rng = np.random.default_rng((search.seed, round_number, index))
-        runs.append(algorithm_of(label, problem.study).search(task, rng))
-    failures: list[list[tuple[float, FloatArray]]] = [[] for _ in sets]
-    pending: dict[int, Evaluations | None] = dict.fromkeys(range(len(runs)))
-    while pending:
-        wanted = dict[int, FloatArray]()
-        for index, answer in pending.items():
-            try:
-                wanted[index] = next(runs[index]) if answer is None else runs[index].send(answer)
-            except StopIteration:
-                continue
-        pending = dict(zip(wanted, _judge(problem, sets, owners, wanted, columns, own, failures), strict=True))
-    random = problem.draw(RANDOM_ATTACKS, np.random.default_rng((search.seed, round_number, ATTACKS)))
-    for number, one in enumerate(sets):
-        degrees = problem.degrees(np.tile(one, (len(random), 1)), random, "attack by random wear")
-        failures[number] += [(degrees[row], random[row]) for row in np.flatnonzero(degrees < problem.margin)]
-    return [_worst(problem, found) for found in failures]
+        for seed in range(ATTACKS):
+            rng = np.random.default_rng((search.seed, number, owner, seed))
+            runs[owner, seed] = algorithm_of(label, problem.study).search(task, rng)
+    found = [np.zeros((0, 1 + len(worn))) for _ in sets]  # safety degree and vehicle
+    answers: dict[tuple[int, int], Evaluations | None] = dict.fromkeys(runs)
+    while answers:
+        wanted = dict[tuple[int, int], FloatArray]()
+        for key, answer in answers.items():
+            if len(found[key[0]]) < MAX_NEW:
+                with suppress(StopIteration):
+                    wanted[key] = next(runs[key]) if answer is None else runs[key].send(answer)
+        answers = dict(zip(wanted, _judge(problem, shares, wanted, found, points), strict=True))
+    rng = np.random.default_rng((search.seed, number))
+    random = problem.promise.draw(RANDOM_ATTACKS, rng)
+    failures = []
+    for one, rows in zip(shares, found, strict=True):
+        vehicles = rows[:, 1:]
+        if not len(rows):
+            degrees, vehicles, _ = problem.failing(one, random, "attack by random wear", points)
+            vehicles = vehicles[np.argsort(degrees, kind="stable")]
+        failures.append(vehicles[np.linspace(0, len(vehicles) - 1, min(len(vehicles), MAX_NEW)).astype(int)])
+    return failures
 
 
 def _judge(
     problem: Problem,
-    sets: Sequence[FloatArray],
-    owners: Sequence[int],
-    wanted: dict[int, FloatArray],
-    columns: Sequence[int],
-    own: CharacteristicSet,
-    failures: list[list[tuple[float, FloatArray]]],
+    shares: FloatArray,
+    wanted: dict[tuple[int, int], FloatArray],
+    found: list[FloatArray],
+    points: Sequence[int],
 ) -> list[Evaluations]:
-    """Evaluations of the settings that searches want, in the characteristics that may wear; notes the failures."""
+    """Evaluate the vehicles that searches want, and note their failures that a driving system could avoid."""
     if not wanted:
         return []
-    wear = []
-    for settings in wanted.values():
-        full = np.tile(problem.promise.characteristics.original, (len(settings), 1))
-        full[:, list(columns)] = settings
-        wear.append(problem.evaluator.region.repaired(full, filtered=False) if problem.evaluator.region else full)
-    shares = np.repeat(
-        [sets[owners[index]] for index in wanted], [len(settings) for settings in wanted.values()], axis=0
-    )
-    evaluations = problem.evaluate(shares, np.concatenate(wear), "attack")
-    degrees, answers, start = degrees_of(evaluations), [], 0
-    for (index, settings), full in zip(wanted.items(), wear, strict=True):
-        rows = np.arange(start, start + len(settings))
-        failures[owners[index]] += [
-            (degrees[row], full[row - start]) for row in rows.tolist() if degrees[row] < problem.margin
-        ]
-        answers.append(_reduced(replace(evaluations.take(rows), settings=full), columns, own))
-        start += len(settings)
-    return answers
+    promise, owners = problem.promise, [owner for owner, _ in wanted]
+    sizes = [len(vehicles) for vehicles in wanted.values()]
+    settings = promise.region.repaired(promise.settings(np.concatenate(list(wanted.values()))), filtered=False)
+    vehicles, owner_of = settings[:, promise.columns], np.repeat(owners, sizes)
+    evaluations = problem.evaluate(shares[owner_of], vehicles, "attack", points)
+    degrees = degrees_of(evaluations)
+    failing = np.flatnonzero(degrees < problem.margin)
+    failing = failing[problem.repairable(vehicles[failing])]
+    for owner in set(owners):
+        own = failing[owner_of[failing] == owner]
+        found[owner] = np.unique(np.concatenate([found[owner], np.column_stack([degrees[own], vehicles[own]])]), axis=0)
+    return [evaluations.take(rows) for rows in np.split(np.arange(len(vehicles)), np.cumsum(sizes)[:-1])]
 
 
-def _reduced(evaluations: Evaluations, columns: Sequence[int], own: CharacteristicSet) -> Evaluations:
-    """Evaluations with the columns of the characteristics that may wear."""
-    settings = evaluations.settings[:, list(columns)]
-    return replace(
-        evaluations,
-        settings=settings,
-        f_diff=own.largest_change(settings),
-        f_num_diff=own.number_changed(settings),
-        worst_points=None,
-    )
+def prove(problem: Problem, one: FloatArray, attempt: int) -> tuple[Proof | None, FloatArray]:
+    """Draw fresh wear for a set of parameters: the proof, if no vehicle is unsafe, and the first unsafe vehicles.
 
-
-MAX_NEW = 32
-"""Largest number of failures of an attack that become counterexamples."""
-
-
-def _worst(problem: Problem, found: Sequence[tuple[float, FloatArray]]) -> FloatArray:
-    """The worst distinct failures that a driving system could avoid, worst first."""
-    empty = np.zeros((0, len(problem.promise.characteristics)))
-    if not found:
-        return empty
-    order = np.argsort([degree for degree, _ in found], kind="stable")
-    settings = np.array([found[row][1] for row in order])
-    _, first = np.unique(settings, axis=0, return_index=True)
-    settings = settings[np.sort(first)]
-    spread = settings[np.linspace(0, len(settings) - 1, min(len(settings), MAX_NEW)).astype(int)]
-    return np.asarray(spread[problem.repairable(spread)])
-
-
-def prove(problem: Problem, one: FloatArray, attempt: int) -> tuple[Proof, FloatArray]:
-    """Draw fresh wear for a set of parameters; returns the proof and the unsafe vehicles.
-
-    Attempt k may be wrong with probability alpha / 2^k of alpha = 1 - `CONFIDENCE`, the first with alpha itself if it
-    succeeds, so that later attempts draw more.
+    Attempt k may be wrong with probability alpha / 2^k of alpha = 1 - `CONFIDENCE`, so that later attempts draw more.
     """
     error = (1 - CONFIDENCE) / 2**attempt
     number = math.ceil(math.log(error) / math.log1p(-MAX_UNSAFE_SHARE))
-    wear = problem.draw(number, np.random.default_rng((problem.study.search.seed, 7, attempt)))
-    degrees = problem.degrees(np.tile(one, (number, 1)), wear, "proof on fresh wear")
-    failing = wear[degrees < problem.margin]
-    unsafe = failing[problem.repairable(failing)] if len(failing) else failing
-    drawn = number - len(failing) + len(unsafe)
-    bound = (
-        1.0 if not drawn else -math.expm1(math.log(error) / drawn) if not len(unsafe) else _bound(len(unsafe), drawn)
-    )
-    return Proof(drawn, len(unsafe), bound), unsafe
-
-
-def _bound(unsafe: int, drawn: int) -> float:
-    from scipy.stats import beta
-
-    return float(beta.ppf(CONFIDENCE, unsafe + 1, drawn - unsafe)) if unsafe < drawn else 1.0
+    fresh = problem.promise.draw(number, np.random.default_rng((problem.study.search.seed, 7, attempt)))
+    drawn = 0
+    for part in np.array_split(fresh, PROOF_PARTS):
+        _, unsafe, lost = problem.failing(one, part, "proof on fresh wear")
+        if len(unsafe):
+            return None, unsafe
+        drawn += len(part) - lost
+    return Proof(drawn, 0, -math.expm1(math.log(error) / drawn) if drawn else 1.0), fresh[:0]

@@ -1,44 +1,51 @@
-"""Finds repairs by counterexamples: searches the smallest changes, attacks them, and proves the rest on fresh wear."""
+"""Finds repairs by counterexamples: the smallest changes that survive them, attacks, and proof on fresh wear.
+
+The steps of the algorithm: 0. what no driving system survives; 1. counterexamples; 2. the smallest changes that survive
+them (`smallest`); 3. attacks on these, whose failures are new counterexamples (`attack`); 4. the end, when attacks find
+nothing, or the largest promise that can be kept; 5. proof on fresh wear; 6. what the repair has not seen (`held_out`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import cause_key, describe_causes, find_minimal_causes
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.repair.answer import Exchange, NotRepairable, Repair, Repairs
 from safevar_sumo.analysis.repair.attack import Proof, attack, prove
-from safevar_sumo.analysis.repair.curve import exchange_rate
 from safevar_sumo.analysis.repair.held_out import check_unseen
-from safevar_sumo.analysis.repair.price import NewCar, Price, benign_scenes, drive_new_car, price_of
-from safevar_sumo.analysis.repair.problem import Problem, Promise, default_margin, parameters_of
-from safevar_sumo.analysis.repair.smallest import Search, Subset
+from safevar_sumo.analysis.repair.price import Prices
+from safevar_sumo.analysis.repair.problem import Problem, Promise, parameters_of
+from safevar_sumo.analysis.repair.smallest import Search
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import Point
-from safevar_sumo.study import Study
+from safevar_sumo.records import FloatArray, JsonObject, differences
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import CharacteristicSet
 
+DEFAULT_MARGIN = 0.3
+"""Safety degree to keep of a study that states no error of its model [m]."""
 SOBOL_VEHICLES = 256
 """Sobol points of the promise among the first counterexamples."""
-MOST_CHANGED, MOST_KEPT, MAX_ROUNDS = 3, 4, 30
-"""Largest number of parameters changed, of repairs kept, and of rounds of attacks."""
+MAX_ROUNDS = 30
+"""Largest number of rounds of attacks."""
 LEFT_OUT = 3
 """Every so many points of a matrix are left out until a repair has survived all attacks at the others."""
 HALVINGS = 6
 """Halvings that locate the largest promise that can be kept."""
 CAUSES_OF, WORST_AT_POINTS = 4, 16
 """Failures of full braking whose causes are told; the worst vehicles that are driven at each point left out."""
-EARLIER_BOX = 0.05
-"""A repair that failed is sought again in a box that is larger by this share of the ranges."""
+EVERY_READER = 8
+"""One in so many counterexamples shows whether a simulation reads a parameter."""
+CURVE_PROMISES, CURVE_VEHICLES = 10, 32
+"""Promises of a curve; Sobol points of each, besides its corners."""
 
 
 def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evaluator) -> Repairs:
@@ -49,335 +56,227 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
     InputError
         If the study is rated, the promise or a parameter cannot be used, or no simulation reads the parameters.
     """
+    problem = _problem_of(evaluator, options)
+    system = assemble(problem.study)
+    prices, count = Prices(problem.study, system), len(system.matrix)
+    # 1. Counterexamples: corners and Sobol points of the promise, and failures of the results; the worst first.
+    vehicles = problem.promise.spread(SOBOL_VEHICLES, problem.study.search.seed)
+    if not isinstance(source, Study):
+        names = list(evaluator.characteristics.names)
+        settings = source.solutions[Unsafe(problem.margin).rows(source.solutions)][names].to_numpy(dtype=float)
+        vehicles = np.unique(
+            np.concatenate([vehicles, problem.promise.feasible(problem.promise.of_solutions(settings))]), axis=0
+        )
+    degrees = problem.degrees(problem.today[np.newaxis], vehicles, "the driving system of today")[0][0]
+    order = np.argsort(degrees, kind="stable")
+    vehicles, failing, worst_today = vehicles[order], degrees[order] < problem.margin, float(degrees.min())
+    # 0. What no driving system survives needs another part, not a parameter; the rest is repaired.
+    can = ~failing
+    can[failing] = problem.repairable(vehicles[failing])
+    lost, vehicles = vehicles[~can], vehicles[can]
+    not_repairable = _describe(problem, system, lost, len(lost) / len(can))
+    seen = [number for number in range(count) if number % LEFT_OUT != LEFT_OUT - 1]
+    finder = _Finder(problem=problem, prices=prices, points=count, search=Search(problem, vehicles, seen))
+    repairs, unread, largest, curve = list[Repair](), list[str](), None, list[Exchange]()
+    proof_of_today = finder.prove_today() if len(vehicles) and not failing[can].any() else None
+    if len(vehicles) and proof_of_today is None:
+        finder.problem, unread = _without_unread(problem, finder.search.vehicles)
+        finder.search = Search(finder.problem, finder.search.vehicles, seen)
+        repairs = finder.find()
+        largest = None if repairs else finder.largest_promise()
+    if options.curve is not None and len(vehicles):
+        curve = finder.exchange_rate(options.curve, repairs)
+    return Repairs(
+        study=problem.study,
+        promise=problem.promise,
+        margin=problem.margin,
+        parameters=tuple(problem.parameters),
+        repairs=tuple(repairs),
+        worst_today=worst_today,
+        proof_of_today=proof_of_today,
+        not_repairable=tuple(not_repairable),
+        largest_promise=largest,
+        unread=tuple(unread),
+        attacks=finder.attacks,
+        simulations=evaluator.simulated,
+        counterexamples=len(finder.search.vehicles),
+        curve=tuple(curve),
+        no_verdict=evaluator.no_verdict,
+    )
+
+
+def _problem_of(evaluator: Evaluator, options: RepairOptions) -> Problem:
+    """The problem that options state."""
     study = evaluator.study
     if is_rated(study):
-        problem_text = (
-            f"{study.name!r} is rated, and its repair would take a whole test matrix for every vehicle and change"
+        text = f"{study.name!r} is rated, and its repair would take a whole test matrix for every vehicle and change"
+        raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
+    promise = Promise.of(study, evaluator.region, options.promise)
+    if options.curve is not None and options.curve not in evaluator.characteristics.names:
+        evaluator.characteristics.setting({options.curve: 0.0}, "curve")  # raises the error of an unknown name
+    margin = study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if options.margin is None else options.margin
+    return Problem(evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), margin=margin)
+
+
+def _without_unread(problem: Problem, vehicles: FloatArray) -> tuple[Problem, list[str]]:
+    """The problem without the parameters that no simulation reads, and their names; an error if none is left."""
+    vehicles, count = vehicles[::EVERY_READER], len(problem.parameters)
+    ends = np.repeat([problem.today], 1 + 2 * count, axis=0)
+    ends[np.arange(1, 1 + 2 * count), np.repeat(range(count), 2)] = np.tile([0.0, 1.0], count)
+    rows = np.repeat(ends, len(vehicles), axis=0), np.tile(vehicles, (len(ends), 1))
+    evaluations = problem.evaluate(*rows, "which parameters matter")
+    today, *others = np.split(np.arange(len(evaluations)), len(ends))
+    results = evaluations.take(today).results
+    is_read = [any(differences(results, evaluations.take(other).results)) for other in others]
+    read = [one for one, flags in zip(problem.parameters, np.reshape(is_read, (-1, 2)), strict=True) if flags.any()]
+    unread = [one.name for one in problem.parameters if one not in read]
+    if not read:
+        raise InputError(
+            "change", f"{', '.join(unread)}: no simulation reads it", "a parameter that changes a simulation"
         )
-        raise InputError(study.source, problem_text, "the study without the rating, such as wear for euro_ncap_rating")
-    promise = Promise.of(study, options.promise)
-    if not promise.columns:
-        raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
-    if options.curve is not None and options.curve not in promise.characteristics.names:
-        promise.characteristics.setting({options.curve: 0.0}, "curve")  # raises the error of an unknown name
-    margin = default_margin(study) if options.margin is None else options.margin
-    problem = Problem(
-        evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), margin=margin
-    )
-    system = assemble(study)
-    finder = _Finder(problem=problem, system=system, benign=benign_scenes(study, system))
-    return finder.answer(source, options)
+    return replace(problem, parameters=read), unread
+
+
+def _describe(problem: Problem, system: System, vehicles: FloatArray, share: float) -> list[NotRepairable]:
+    """What no driving system can survive: the minimal causes of failures of full braking, shrunk to the limit."""
+    if not len(vehicles):
+        return []
+    driver, unsafe = problem.best_driver, Unsafe(problem.margin)
+    rows = vehicles[np.linspace(0, len(vehicles) - 1, min(len(vehicles), CAUSES_OF)).astype(int)]
+    causes = find_minimal_causes(driver, problem.promise.settings(rows), unsafe)
+    chosen = list({cause_key(driver.characteristics, cause): cause for group in causes for cause in group}.values())
+    described = describe_causes(driver, chosen, unsafe)
+    limits = np.array([cause.setting(driver.characteristics) for cause in chosen])
+    worst = driver.evaluate(limits, "full braking").worst_points
+    names = [""] * len(chosen) if worst is None else [system.points[number].name for number in worst.tolist()]
+    return [NotRepairable(cause.boundary, name, share) for cause, name in zip(described, names, strict=True)]
 
 
 @dataclass(kw_only=True)
 class _Finder:
-    """The state of the search for repairs: the counterexamples, the smallest change of each subset, what is proved."""
+    """The search for repairs, by counterexamples."""
 
     problem: Problem
-    system: System
-    unread: list[str] = field(default_factory=list)
+    search: Search
+    prices: Prices
+    points: int
     attacks: int = 0
-    left_out: int = 0
-    at_left_out: int = 0
-    benign: list[Point] = field(default_factory=list)
-    cars: dict[bytes, NewCar] = field(default_factory=dict)
+    at_left_out: JsonObject | None = None
 
-    def answer(self, source: Study | Case, options: RepairOptions) -> Repairs:
-        problem, study = self.problem, self.problem.study
-        vehicles = self._first_vehicles(source)
-        degrees = problem.degrees(np.tile(problem.today, (len(vehicles), 1)), vehicles, "the driving system of today")
-        order = np.argsort(degrees, kind="stable")
-        vehicles, degrees = vehicles[order], degrees[order]
-        worst = float(degrees[0])
-        failing = degrees < problem.margin
-        can = np.ones(len(vehicles), dtype=bool)
-        can[failing] = problem.repairable(vehicles[failing])
-        not_repairable = self._describe(vehicles[~can], float(np.mean(~can)))
-        self.search = Search(problem, vehicles[can], self._seen())
-        repairs: list[Repair] = []
-        proof_of_today = None if failing[can].any() or not can.any() else self._proof_of_today()
-        largest = None
-        if can.any() and proof_of_today is None:
-            self._refuse_unread()
-            repairs = self._repairs()
-            largest = None if repairs else self._largest_promise(self.search.vehicles)
-        curve = list[Exchange]()
-        if options.curve is not None and can.any():
-            curve = exchange_rate(problem, len(self.system.matrix), self._price, options.curve, repairs)
-        return Repairs(
-            study=study,
-            curve=tuple(curve),
-            promise=problem.promise,
-            margin=problem.margin,
-            parameters=tuple(problem.parameters),
-            repairs=tuple(repairs),
-            worst_today=worst,
-            proof_of_today=proof_of_today,
-            not_repairable=tuple(not_repairable),
-            largest_promise=largest,
-            unread=tuple(self.unread),
-            attacks=self.attacks,
-            simulations=problem.evaluator.simulated,
-            counterexamples=len(self.search.vehicles),
-            no_verdict=problem.evaluator.no_verdict,
-        )
-
-    def _first_vehicles(self, source: Study | Case) -> FloatArray:
-        """The first counterexamples: corners, Sobol points, and the solutions of results that lie in the promise."""
-        problem, promise = self.problem, self.problem.promise
-        seed = problem.study.search.seed
-        drawn = 0
-
-        def draw_next(count: int) -> FloatArray:
-            nonlocal drawn
-            drawn += count
-            return promise.settings(sobol_points(drawn, len(promise.columns), seed)[-count:])
-
-        groups = [promise.corners(seed), problem.feasible(draw_next, SOBOL_VEHICLES)]
-        if not isinstance(source, Study):
-            unsafe, names = Unsafe(problem.margin), list(promise.characteristics.names)
-            solutions = source.solutions[unsafe.rows(source.solutions)][names].to_numpy(dtype=float)
-            groups.append(solutions[promise.holds(solutions)])
-        vehicles = np.unique(np.concatenate(groups), axis=0)
-        return vehicles[problem.evaluator.region.feasible(vehicles)]
-
-    def _seen(self) -> list[int]:
-        """The points that the search sees at first; empty for a study without a matrix."""
-        count = len(self.system.matrix)
-        return [number for number in range(count) if number % LEFT_OUT != LEFT_OUT - 1]
-
-    def _proof_of_today(self) -> Proof | None:
+    def prove_today(self) -> Proof | None:
         """The proof that the driving system of today survives attacks and fresh wear; None if it does not: its failures
         join the counterexamples.
         """
         today = self.problem.today
-        found = self._attacked([today])[0]
+        (found,), proof = self._attack([today], range(self.points)), None
         if not len(found):
             proof, found = prove(self.problem, today, 0)
-            if not len(found):
-                return proof
         self.search.add(found)
-        return None
+        return proof
 
-    def _attacked(self, sets: Sequence[FloatArray]) -> list[FloatArray]:
+    def _attack(self, sets: Sequence[FloatArray], points: Sequence[int]) -> list[FloatArray]:
         self.attacks += len(sets)
-        return attack(self.problem, sets, self.attacks)
+        return attack(self.problem, sets, points, self.attacks) if sets else []
 
-    def _refuse_unread(self) -> None:
-        """Leave out parameters that no simulation reads; an error if none is left."""
-        problem = self.problem
-        vehicles = self.search.vehicles[: len(self.search.vehicles) : 8]
-        rows = np.tile(problem.today, (len(vehicles), 1))
-        before = problem.evaluate(rows, vehicles, "which parameters matter")
-        read = []
-        for column in range(len(problem.parameters)):
-            for end in (0.0, 1.0):
-                changed = rows.copy()
-                changed[:, column] = end
-                after = problem.evaluate(changed, vehicles, "which parameters matter")
-                if any(
-                    (values != after.results[name])[
-                        (values == values) | (after.results[name] == after.results[name])
-                    ].any()
-                    for name, values in before.results.items()
-                ):
-                    read.append(column)
-                    break
-        self.unread = [one.name for column, one in enumerate(problem.parameters) if column not in read]
-        if not read:
-            text = f"{', '.join(self.unread)}: no simulation reads it"
-            raise InputError("change", text, "a parameter that changes a simulation")
-        problem.parameters = [problem.parameters[column] for column in read]
-        problem.__dict__.pop("today", None)
-
-    def _repairs(self) -> list[Repair]:
+    def find(self) -> list[Repair]:
         """Search, attack and prove in turns until the repairs kept survive everything."""
-        found = self._smallest({})
-        survived, proofs, _held_out = set[bytes](), dict[bytes, Proof](), dict[bytes, tuple[int, int]]()
-        proof_attempt = 0
+        survived, attempt = set[bytes](), 0
         for _ in range(MAX_ROUNDS):
-            kept = self._kept(found)
+            # 2. The smallest changes that survive all counterexamples.
+            kept = self.search.pareto_set(self._mean_price)
             if not kept:
                 return []
-            fresh = [subset for subset in kept if found[subset].tobytes() not in survived]
-            failures = dict[Subset, FloatArray]()
-            if fresh:
-                for subset, failing in zip(fresh, self._attacked([found[one] for one in fresh]), strict=True):
-                    failures[subset] = failing
-                    if not len(failing):
-                        survived.add(found[subset].tobytes())
-            elif len(self.search.seen) < len(self.system.matrix):
-                self._look_at_left_out([found[subset] for subset in kept])
-                failures = {
-                    subset: np.array([one.setting])
-                    for subset, one in zip(
-                        kept, self.search.survivors(np.array([found[subset] for subset in kept])), strict=True
-                    )
-                    if one is not None
-                }
-                survived.clear()
-                if not failures:
+            # 3. Attacks on those that have survived none yet; new failures are counterexamples.
+            fresh = [one for one in kept if one.tobytes() not in survived]
+            failures = self._attack(fresh, self.search.seen)
+            survived |= {one.tobytes() for one, failing in zip(fresh, failures, strict=True) if not len(failing)}
+            # 4. Attacks find nothing: the points left out count, too, and then fresh wear.
+            if not any(map(len, failures)):
+                if len(self.search.seen) < self.points:
+                    self._look_at_left_out(kept)
+                    survived.clear()
                     continue
-            else:
-                for subset in kept:
-                    key = found[subset].tobytes()
-                    if key not in proofs:
-                        proofs[key], failing = prove(self.problem, found[subset], proof_attempt)
-                        if len(failing):
-                            failures[subset] = failing
-                if not failures:
-                    return [self._repair(found[subset], proofs[found[subset].tobytes()]) for subset in kept]
-                proof_attempt += 1
-                proofs.clear()
-            lost = [subset for subset, failing in failures.items() if len(failing)]
-            if lost:
-                self.search.add(np.concatenate([failures[subset] for subset in lost]))
-                found = self._smallest(found, kept)
+                # 5. Proof on fresh wear.
+                proofs = list[Proof]()
+                for one in kept:
+                    proof, failing = prove(self.problem, one, attempt)
+                    if proof is None:
+                        failures, attempt = [failing], attempt + 1
+                        break
+                    proofs.append(proof)
+                else:
+                    return [self._repair(one, proof) for one, proof in zip(kept, proofs, strict=True)]
+            self.search.add(np.concatenate(failures))
         return []
 
-    def _smallest(
-        self, found: dict[Subset, FloatArray], kept: Sequence[Subset] | None = None
-    ) -> dict[Subset, FloatArray]:
-        """The smallest change of each subset of 1, 2, 3 parameters, up to one more than the first number that works.
-
-        Of the changes that are known, only those that new counterexamples break are sought again, in a larger box; only
-        those of the subsets `kept`, unless none of the others survives.
-        """
-        search, count = self.search, len(self.problem.parameters)
-        starts = {subset: float(search.change(one)) + EARLIER_BOX for subset, one in found.items()}
-        result, worked = self._surviving(found), 0
-        if not result:
-            kept = None
-        for size in range(1, min(MOST_CHANGED, count) + 1):
-            limits = {}
-            for subset in combinations(range(count), size):
-                inner = [float(search.change(one)) for key, one in result.items() if set(key) < set(subset)]
-                if subset not in result and (kept is None or subset in kept):
-                    limits[subset] = min([1.0, *(change - 0.005 for change in inner)])
-            result |= search.smallest(list(limits), limits, starts)
-            worked = worked or (size if any(len(subset) <= size for subset in result) else 0)
-            if worked and size > worked:
-                break
-        return result if len(self._surviving(result)) == len(result) else self._smallest(result, kept)
-
-    def _surviving(self, found: dict[Subset, FloatArray]) -> dict[Subset, FloatArray]:
-        """The changes that survive all counterexamples; failures of the others join those that candidates are tried
-        with.
-        """
-        if not found:
-            return {}
-        firsts = self.search.survivors(np.array(list(found.values())))
-        self.search.failures += [one for one in firsts if one is not None]
-        return {subset: one for (subset, one), first in zip(found.items(), firsts, strict=True) if first is None}
-
-    def _kept(self, found: dict[Subset, FloatArray]) -> list[Subset]:
-        """The Pareto set of number of changes, largest change and price; the smallest `MOST_KEPT` of it."""
-        rows = []
-        for subset, one in found.items():
-            price = self._price(one)
-            rows.append(
-                (len(subset), float(self.search.change(one)), price.mean if price.mean is not None else 0.0, subset)
-            )
-        best = [
-            row
-            for row in rows
-            if not any(
-                other is not row
-                and all(a <= b for a, b in zip(other[:3], row[:3], strict=True))
-                and other[:3] != row[:3]
-                for other in rows
-            )
-        ]
-        return [row[3] for row in sorted(best)[:MOST_KEPT]]
-
-    def _values(self, one: FloatArray) -> dict[str, float]:
-        """The values of the parameters that change."""
-        values = self.problem.values(one[np.newaxis])[0].tolist()
-        return {
-            parameter.name: value
-            for parameter, value, share, today in zip(
-                self.problem.parameters, values, one, self.problem.today, strict=True
-            )
-            if share != today
-        }
-
-    def _price(self, one: FloatArray) -> Price:
-        return price_of(self.system, self._new_car(one), self._new_car(self.problem.today))
-
-    def _new_car(self, one: FloatArray) -> NewCar:
-        """How a new vehicle drives with a set of parameters; each is simulated once."""
-        if one.tobytes() not in self.cars:
-            self.cars[one.tobytes()] = drive_new_car(self.problem.study, self._values(one), self.benign)
-        return self.cars[one.tobytes()]
+    def _mean_price(self, one: FloatArray) -> float:
+        return self.prices.of(self.problem.changed_values(one)).mean or 0.0
 
     def _look_at_left_out(self, sets: Sequence[FloatArray]) -> None:
-        """Note how many repairs are unsafe at the points left out, and let the search see all points from now on."""
-        everything = range(len(self.system.matrix))
-        left_out = [number for number in everything if number not in self.search.seen]
-        self.search.seen = left_out
-        for one, failure in zip(sets, self.search.survivors(np.array(sets)), strict=True):
-            unsafe = 0
-            if failure is not None:
-                worst = self.search.vehicles[:WORST_AT_POINTS]
-                unsafe = sum(
-                    bool(
-                        (
-                            self.problem.degrees(np.tile(one, (len(worst), 1)), worst, "points left out", [number])
-                            < self.problem.margin
-                        ).any()
-                    )
-                    for number in left_out
-                )
-            self.at_left_out = max(self.at_left_out, unsafe)
-        self.left_out, self.search.seen = len(left_out), list(everything)
+        """Note at how many of the points left out all repairs are safe, and let the search see all points from now
+        on.
+        """
+        left_out = [number for number in range(self.points) if number not in self.search.seen]
+        worst, stage = self.search.vehicles[:WORST_AT_POINTS], "points left out"
+        safe = [
+            (self.problem.degrees(np.array(sets), worst, stage, [number])[0] >= self.problem.margin).all()
+            for number in left_out
+        ]
+        self.at_left_out = {"all": len(left_out), "safe": int(sum(safe))}
+        self.search.seen = list(range(self.points))
 
     def _repair(self, one: FloatArray, proof: Proof) -> Repair:
-        values = self._values(one)
-        held_out = check_unseen(self.problem, values, self.search.vehicles)
-        points = {"all": self.left_out, "safe": self.left_out - self.at_left_out} if self.left_out else None
-        today, car = self._new_car(self.problem.today), self._new_car(one)
-        lost = np.count_nonzero((today.degrees >= self.problem.margin) & (car.degrees < self.problem.margin))
+        """A repair with its price, and what it has not seen (6)."""
+        values, problem = self.problem.changed_values(one), self.problem
+        unseen = check_unseen(problem, values, self.search.vehicles)
+        lost = self.prices.lost_points(values, problem.margin)
         return Repair(
             values=values,
             largest_change=float(self.search.change(one)),
-            price=self._price(one),
+            price=self.prices.with_needless_braking(values),
             proof=proof,
-            held_out={"points": points, **held_out, "lost_on_new_car": int(lost)},
+            held_out={"points": self.at_left_out, **unseen, "lost_on_new_car": lost},
         )
 
-    def _describe(self, settings: FloatArray, share: float) -> list[NotRepairable]:
-        """What no driving system can survive: the minimal causes of failures of full braking, shrunk to the limit."""
-        if not len(settings):
-            return []
-        problem, driver = self.problem, self.problem.best_driver
-        unsafe = Unsafe(problem.margin)
-        rows = settings[np.linspace(0, len(settings) - 1, min(len(settings), CAUSES_OF)).astype(int)]
-        causes = find_minimal_causes(driver, rows, unsafe)
-        distinct = {cause_key(driver.characteristics, cause): cause for group in causes for cause in group}
-        chosen = list(distinct.values())
-        described = describe_causes(driver, chosen, unsafe)
-        worst = driver.evaluate(
-            np.array([cause.setting(driver.characteristics) for cause in chosen]), "full braking"
-        ).worst_points
-        names = [""] * len(chosen) if worst is None else [self.system.points[number].name for number in worst.tolist()]
-        return [NotRepairable(cause.boundary, name, share) for cause, name in zip(described, names, strict=True)]
-
-    def _largest_promise(self, vehicles: FloatArray) -> Promise | None:
-        """The largest part of the promise, shrunk towards the original, that some change keeps; None if none does."""
-        original, low, high = self.problem.promise.characteristics.original, 0.0, 1.0
+    def largest_promise(self) -> Promise | None:
+        """The largest part of the promise, shrunk towards the original, that some change keeps by the counterexamples;
+        None if none does.
+        """
+        original, vehicles, low, high = self.problem.promise.worn.original, self.search.vehicles, 0.0, 1.0
         for _ in range(HALVINGS):
             middle = (low + high) / 2
-            smaller = original + middle * (vehicles - original)
-            search = Search(self.problem, smaller, self.search.seen)
-            found = search.smallest(*_all_open(len(self.problem.parameters)))
-            if found and not all(search.survivors(np.array(list(found.values())))):
-                low = middle
-            else:
-                high = middle
+            search = Search(self.problem, original + middle * (vehicles - original), self.search.seen)
+            low, high = (middle, high) if search.pareto_set(lambda one: 0.0) else (low, middle)
         return self.problem.promise.shrunk(low) if low else None
 
+    def exchange_rate(self, name: str, repairs: Sequence[Repair]) -> list[Exchange]:
+        """How much earlier the ADS has to brake for promises of a characteristic, from new to the end of its wear.
 
-def _all_open(count: int) -> tuple[list[Subset], dict[Subset, float], dict[Subset, float]]:
-    """Each parameter by itself and all together, without limits."""
-    subsets = list(dict.fromkeys([*((column,) for column in range(count)), tuple(range(count))]))
-    return subsets, dict.fromkeys(subsets, 1.0), {}
+        The parameters of the first repair change, or each by itself without a repair.
+        """
+        problem, seed = self.problem, self.problem.study.search.seed
+        names = [parameter.name for parameter in problem.parameters]
+        changed = tuple(names.index(value) for value in repairs[0].values) if repairs else ()
+        subsets = [changed] if changed else [(number,) for number in range(len(names))]
+        (one,) = (one for one in problem.promise.region.characteristics if one.name == name)
+        falls = one.original - one.lower >= one.upper - one.original
+        ends = np.linspace(one.original, one.lower if falls else one.upper, CURVE_PROMISES + 1)[1:].tolist()
+        exchanges = []
+        for end in ends:
+            worn = replace(one, lower=min(end, one.original), upper=max(end, one.original))
+            others = {other.name: other for other in problem.promise.worn}
+            members = tuple((others | {name: worn}).values())
+            part = replace(problem, promise=replace(problem.promise, worn=CharacteristicSet(members)))
+            vehicles = part.promise.spread(CURVE_VEHICLES, seed)
+            degrees = part.degrees(part.today[np.newaxis], vehicles, "exchange rate")[0][0]
+            vehicles = vehicles[np.argsort(degrees, kind="stable")]
+            if (degrees >= part.margin).all():
+                exchanges.append(Exchange(name, end, 0.0, True))
+                continue
+            search = Search(part, vehicles, range(self.points))
+            if part.repairable(vehicles).all():
+                search.search(dict.fromkeys(subsets, 1.0))
+            prices = [self.prices.of(part.changed_values(found)).worst for found in search.best.values()]
+            metres = min((price for price in prices if price is not None), default=None)
+            exchanges.append(Exchange(name, end, metres, bool(search.best)))
+        return exchanges

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,25 +16,24 @@ from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import MatrixTable, Study
-from safevar_sumo.sumo.matrix import PointResult, simulate_all_points
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
 NEEDLESS_BRAKE = 0.1
 """Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the speed."""
+Values = Mapping[str, float]
+"""The parameters that change, with their values in their units."""
 
 
 class NewCar(NamedTuple):
     """How a new vehicle drives with some parameters: by point, where and when it begins to brake [m, s], NaN if it does
-    not, its safety degree; the largest deceleration and jerk of all points [m/s^2, m/s^3]; the benign scenes in which
-    it brakes, None without any.
+    not, and its safety degree; the largest deceleration and jerk of all points [m/s^2, m/s^3].
     """
 
-    position: FloatArray
-    time: FloatArray
+    begins: FloatArray
     degrees: FloatArray
     deceleration: float
     jerk: float
-    needless: BoolArray | None
 
 
 class Price(NamedTuple):
@@ -50,7 +49,7 @@ class Price(NamedTuple):
     worst_point: str
     deceleration: float
     jerk: float
-    needless: tuple[int, int, int] | None
+    needless: tuple[int, int, int] | None = None
 
     def to_dict(self) -> JsonObject:
         """The entry `price` of a repair's JSON."""
@@ -65,36 +64,68 @@ class Price(NamedTuple):
         }
 
 
-def drive_new_car(study: Study, values: Mapping[str, float], benign: Sequence[Point]) -> NewCar:
-    """Drive the new vehicle through the study and its benign scenes, with some parameters of its ADS."""
-    system = assemble(with_parameters(study, values) if values else study)
-    original = system.characteristics.original[np.newaxis]
-    results = simulate_all_points(system, original)
-    onsets = [brake_onset(result.runs, 0) for result in results]
-    begins = np.full((2, len(results)), np.nan)
-    for column, (result, onset) in enumerate(zip(results, onsets, strict=True)):
+class Prices:
+    """Prices of changes of a study's ADS; the new vehicle drives once with each.
+
+    The benign scenes are those that the study names, else those like its shipped scenarios; there may be none.
+    """
+
+    def __init__(self, study: Study, system: System) -> None:
+        self._study, self._points = study, system.points
+        self._cars = dict[tuple[tuple[str, float], ...], NewCar]()
+        self.benign = benign_points(system.points)
+        if study.repair.benign:
+            named = msgspec.structs.replace(study, matrix=MatrixTable(tests=study.repair.benign))
+            self.benign = list(assemble(named).matrix)
+
+    def of(self, values: Values) -> Price:
+        """The price without needless braking."""
+        car, today = self._drive(values), self._drive({})
+        metres, seconds = today.begins - car.begins
+        braked = np.flatnonzero(np.isfinite(metres))
+        if not len(braked):
+            return Price(None, None, None, "", car.deceleration, car.jerk)
+        worst = int(braked[np.argmax(metres[braked])])
+        mean, name = float(np.mean(metres[braked])), self._points[worst].name
+        return Price(mean, float(metres[worst]), float(seconds[worst]), name, car.deceleration, car.jerk)
+
+    def with_needless_braking(self, values: Values) -> Price:
+        """The whole price."""
+        if not self.benign:
+            return self.of(values)
+        repaired, original = (_brakes_in(self._system(one), self.benign) for one in (values, {}))
+        return self.of(values)._replace(needless=(len(repaired), int(repaired.sum()), int(original.sum())))
+
+    def lost_points(self, values: Values, margin: float) -> int:
+        """The number of points that the new vehicle passes today and fails with the change."""
+        today, car = self._drive({}), self._drive(values)
+        return int(np.count_nonzero((today.degrees >= margin) & (car.degrees < margin)))
+
+    def _system(self, values: Values) -> System:
+        return assemble(with_parameters(self._study, values) if values else self._study)
+
+    def _drive(self, values: Values) -> NewCar:
+        key = tuple(values.items())
+        if key not in self._cars:
+            self._cars[key] = _drive_new_car(self._system(values))
+        return self._cars[key]
+
+
+def _drive_new_car(system: System) -> NewCar:
+    """Drive the new vehicle through all points of a study."""
+    results = simulate_all_points(system, system.characteristics.original[np.newaxis])
+    begins, deceleration, jerk = np.full((2, len(results)), np.nan), 0.0, 0.0
+    for column, result in enumerate(results):
+        trace, onset = result.runs.trace, brake_onset(result.runs, 0)
         if onset is not None:
-            begins[:, column] = result.runs.trace.position[onset, 0], result.runs.trace.time[onset]
-    jerk = OPTIONAL_METRICS["max_jerk"]
-    jerks = [float(jerk(result.runs, system.metrics_table)[0]) for result in results]
-    return NewCar(
-        begins[0],
-        begins[1],
-        np.array([float(result.evaluations.f_safe[0]) for result in results]),
-        max(_deceleration(result) for result in results),
-        max((value for value in jerks if np.isfinite(value)), default=0.0),
-        np.array(_brakes_in(system, benign)) if benign else None,
-    )
+            begins[:, column] = trace.position[onset, 0], trace.time[onset]
+        speed = trace.speed[trace.active[:, 0], 0]
+        deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))
+        jerk = float(np.fmax(jerk, OPTIONAL_METRICS["max_jerk"](result.runs, system.metrics_table)[0]))
+    return NewCar(begins, np.array([one.evaluations.f_safe[0] for one in results]), deceleration, jerk)
 
 
-def _deceleration(result: PointResult) -> float:
-    """The largest deceleration from one sample to the next [m/s^2]."""
-    trace = result.runs.trace
-    speed = trace.speed[trace.active[:, 0], 0]
-    return float(np.max(-np.diff(speed), initial=0.0) / trace.step)
-
-
-def _brakes_in(system: System, benign: Sequence[Point]) -> list[bool]:
+def _brakes_in(system: System, benign: list[Point]) -> BoolArray:
     """In which benign scenes the new vehicle brakes; with every speed also without anybody."""
     original = system.characteristics.original[np.newaxis]
     empty = {point.scenario.test_speed: point for point in benign}.values()
@@ -102,33 +133,5 @@ def _brakes_in(system: System, benign: Sequence[Point]) -> list[bool]:
         *simulate_all_points(replace(system, matrix=tuple(benign), rater=None), original),
         *simulate_all_points(replace(system, matrix=tuple(empty), rater=None, sees_nobody=True), original),
     ]
-    return [
-        bool((np.where(result.runs.trace.active, result.runs.trace.brake, 0.0) > NEEDLESS_BRAKE).any())
-        for result in results
-    ]
-
-
-def benign_scenes(study: Study, system: System) -> list[Point]:
-    """The benign scenes that the study names, else those like its shipped scenarios; empty if there are none."""
-    if study.repair.benign:
-        named = msgspec.structs.replace(study, matrix=MatrixTable(tests=study.repair.benign))
-        return list(assemble(named).matrix)
-    return benign_points(system.points)
-
-
-def price_of(system: System, car: NewCar, today: NewCar) -> Price:
-    """The price of a repair, from the new vehicle with and without it."""
-    metres, seconds = today.position - car.position, today.time - car.time
-    braked = np.flatnonzero(np.isfinite(metres))
-    worst = int(braked[np.argmax(metres[braked])]) if len(braked) else None
-    return Price(
-        mean=float(np.mean(metres[braked])) if len(braked) else None,
-        worst=None if worst is None else float(metres[worst]),
-        seconds=None if worst is None else float(seconds[worst]),
-        worst_point="" if worst is None else system.points[worst].name,
-        deceleration=car.deceleration,
-        jerk=car.jerk,
-        needless=None
-        if car.needless is None or today.needless is None
-        else (len(car.needless), int(car.needless.sum()), int(today.needless.sum())),
-    )
+    traces = [result.runs.trace for result in results]
+    return np.array([(np.where(one.active, one.brake, 0.0) > NEEDLESS_BRAKE).any() for one in traces])

@@ -1,4 +1,4 @@
-"""The problem of a repair: the promised part of the domain, and the parameters of the ADS that may change."""
+"""The problem of a repair: the promised wear, and the parameters of the ADS that may change."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from msgspec.structs import asdict, replace as replace_in
 
 from safevar_sumo.ads import ADS
@@ -17,13 +18,11 @@ from safevar_sumo.analysis.preventability import approach_parameters
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
-from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, ModelTable, Study, limits_of, unit_text
+from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
 from safevar_sumo.study.limits import limit_mistakes
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
-DEFAULT_MARGIN = 0.3
-"""Safety degree to keep of a study that states no error of its model [m]."""
 MAX_PARAMETERS = 8
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
@@ -45,97 +44,113 @@ class Parameter(NamedTuple):
     log: bool
     today: float
 
-    @property
-    def suffix(self) -> str:
-        """The unit as text after a number."""
-        return unit_text(self.unit)
-
 
 @dataclass(frozen=True)
 class Promise:
-    """The promised part of the domain: a box with the ends `lower` and `upper`, shape (n,)."""
+    """The promised wear: the characteristics that may wear, with the promised ends as their domains.
 
-    characteristics: CharacteristicSet
-    lower: FloatArray
-    upper: FloatArray
+    Worn vehicles are arrays of shape (M, w) of these; all other characteristics stay as in the original.
+    """
+
+    region: FeasibleRegion
+    worn: CharacteristicSet
 
     @classmethod
-    def of(cls, study: Study, texts: Sequence[str]) -> Promise:
+    def of(cls, study: Study, region: FeasibleRegion, texts: Sequence[str]) -> Promise:
         """The promise that texts such as "treadDepth >= 2" state, or the study's own without any.
 
         Raises
         ------
         InputError
-            If a promise cannot be read, names no characteristic, or lies outside its domain.
+            If a promise cannot be read, names no characteristic, lies outside its domain, or lets nothing wear.
         """
-        one, rows, promise = CharacteristicSet.of(study), study.vehicle.characteristics, study.repair.promise
-        if ALL in texts or (promise == ALL and not texts):
+        rows, stated = study.vehicle.characteristics, study.repair.promise
+        if ALL in texts or (stated == ALL and not texts):
             if len(texts) > 1:
                 raise InputError("promise", f"{ALL} beside another promise", f"{ALL} alone, or limits")
-            return cls(one, one.lower.copy(), one.upper.copy())
-        stated = promise if promise and isinstance(promise, dict) else study.limits
-        for mistake in limit_mistakes(study.source, rows, stated, "repair.promise."):
+            return cls(region, region.characteristics)
+        own = stated if stated and isinstance(stated, dict) else study.limits
+        for mistake in limit_mistakes(study.source, rows, own, "repair.promise."):
             raise mistake
-        limits = limits_of(texts, rows, None if texts else stated, "promise")
+        limits = limits_of(texts, rows, None if texts else own, "promise")
         if not limits:
-            raise InputError(
-                "promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(one.names)}; or {ALL}'
-            )
-        ends = np.array(
-            [limits[name].interval(row) if name in limits else (row.original,) * 2 for name, row in rows.items()]
-        )
-        return cls(one, *ends.T.copy())
+            raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
+        ends = {name: limit.interval(rows[name]) for name, limit in limits.items()}
+        worn = [
+            replace(one, lower=ends[one.name][0], upper=ends[one.name][1])
+            for one in region.characteristics
+            if one.name in ends and ends[one.name][0] < ends[one.name][1]
+        ]
+        if not worn:
+            raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
+        return cls(region, CharacteristicSet(tuple(worn)))
 
-    @property
+    @cached_property
     def columns(self) -> list[int]:
-        """Columns of the characteristics that may wear."""
-        return np.flatnonzero(self.upper > self.lower).tolist()
+        """Columns of the characteristics that may wear, among all."""
+        return [self.region.characteristics.names.index(name) for name in self.worn.names]
 
-    def settings(self, points: FloatArray) -> FloatArray:
-        """Settings at points of the unit cube of `columns`, shape (M, n)."""
-        settings = np.tile(self.characteristics.original, (len(points), 1))
-        lower, width = self.lower[self.columns], (self.upper - self.lower)[self.columns]
-        settings[:, self.columns] = lower + points * width
+    def settings(self, vehicles: FloatArray) -> FloatArray:
+        """Worn vehicles with all characteristics of the study, shape (M, n)."""
+        settings = np.tile(self.region.characteristics.original, (len(vehicles), 1))
+        settings[:, self.columns] = vehicles
         return settings
 
-    def corners(self, seed: int) -> FloatArray:
-        """The corners of the part, shape (M, n), or `MAX_CORNERS` of them."""
-        dimensions = len(self.columns)
-        if 2**dimensions <= MAX_CORNERS:
-            return self.settings(np.indices((2,) * dimensions).reshape(dimensions, -1).T.astype(float))
-        return self.settings(np.round(sobol_points(MAX_CORNERS, dimensions, seed)))
+    def at(self, points: FloatArray) -> FloatArray:
+        """Worn vehicles at points of the unit cube."""
+        return self.worn.lower + points * (self.worn.upper - self.worn.lower)
 
-    def holds(self, settings: FloatArray) -> BoolArray:
-        """Which settings lie in the part."""
-        return np.asarray(((settings >= self.lower) & (settings <= self.upper)).all(axis=1))
+    def feasible(self, vehicles: FloatArray) -> FloatArray:
+        """Those of M worn vehicles that keep the study's constraints."""
+        return vehicles[self.region.feasible(self.settings(vehicles))]
+
+    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+        """Vehicles drawn uniformly in the feasible part."""
+        size = len(self.worn)
+        settings = self.region.draw_feasible(lambda count: self.settings(self.at(rng.random((count, size)))), number)
+        return np.asarray(settings[:, self.columns])
+
+    def spread(self, number: int, seed: int) -> FloatArray:
+        """Distinct feasible vehicles: the corners, or `MAX_CORNERS` of them, and `number` Sobol points."""
+        size = len(self.worn)
+        if 2**size <= MAX_CORNERS:
+            corners = np.indices((2,) * size).reshape(size, -1).T.astype(float)
+        else:
+            corners = np.round(sobol_points(MAX_CORNERS, size, seed))
+        inner = self.feasible(self.at(sobol_points(4 * number if self.region else number, size, seed)))[:number]
+        return np.unique(np.concatenate([self.feasible(self.at(corners)), inner]), axis=0)
+
+    def of_solutions(self, settings: FloatArray) -> FloatArray:
+        """The worn vehicles among settings of all characteristics, shape (M, n)."""
+        vehicles = settings[:, self.columns]
+        is_within = ((vehicles >= self.worn.lower) & (vehicles <= self.worn.upper)).all(axis=1)
+        return np.asarray(vehicles[is_within & (self.settings(vehicles) == settings).all(axis=1)])
 
     def shrunk(self, share: float) -> Promise:
-        """The part whose ends lie at a share of the way from the original."""
-        original = self.characteristics.original
-        return replace(
-            self, lower=original + share * (self.lower - original), upper=original + share * (self.upper - original)
-        )
+        """The promise whose ends lie at a share of the way from the original."""
+        members = [
+            replace(
+                one,
+                lower=one.original + share * (one.lower - one.original),
+                upper=one.original + share * (one.upper - one.original),
+            )
+            for one in self.worn
+        ]
+        return replace(self, worn=CharacteristicSet(tuple(members)))
 
     def to_dict(self) -> dict[str, list[float]]:
         """The ends of every characteristic that may wear."""
-        return {
-            self.characteristics.names[column]: [float(self.lower[column]), float(self.upper[column])]
-            for column in self.columns
-        }
+        return {one.name: [one.lower, one.upper] for one in self.worn}
 
     @property
     def in_words(self) -> str:
         """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`."""
-        texts = []
-        for column in self.columns:
-            one = self.characteristics.members[column]
-            ends = [
-                f"{sign} {end:.5g}{one.suffix}"
-                for sign, end in ((">=", self.lower[column]), ("<=", self.upper[column]))
-                if end != one.original
-            ]
-            texts.append(f"{one.name} {' and '.join(ends)}")
-        return ", ".join(texts)
+        return ", ".join(
+            f"{one.name} {sign} {end:.5g}{one.suffix}"
+            for one in self.worn
+            for sign, end in ((">=", one.lower), ("<=", one.upper))
+            if end != one.original
+        )
 
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
@@ -176,14 +191,7 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     return parameters
 
 
-class Failure(NamedTuple):
-    """A vehicle, shape (n,), that a set of parameters does not keep safe, at the number of a point."""
-
-    setting: FloatArray
-    point: int
-
-
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """A study's ADS with parameters that may change, and the safety degree `margin` to keep within a promise.
 
@@ -218,15 +226,31 @@ class Problem:
             columns.append(np.where(share == today, one.today, np.clip(value, one.lower, one.upper)))
         return np.stack(columns, axis=1)
 
-    def evaluate(self, shares: FloatArray, wear: FloatArray, stage: str, points: Sequence[int] = ()) -> Evaluations:
-        """Row i: parameters i with vehicle i, at the worst of some points; without any, at the worst of all."""
-        return self._select(shares, wear, stage, points, arrays=self.takes_arrays)
+    def changed_values(self, one: FloatArray) -> dict[str, float]:
+        """The values of the parameters that a set, shape (P,), changes, by name."""
+        names, values = [parameter.name for parameter in self.parameters], self.values(one[np.newaxis])[0].tolist()
+        changed = one != self.today
+        return {name: value for name, value, flag in zip(names, values, changed, strict=True) if flag}
 
-    def _select(
-        self, shares: FloatArray, wear: FloatArray, stage: str, points: Sequence[int], *, arrays: bool
+    def evaluate(self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()) -> Evaluations:
+        """Row i: parameters i in vehicle i, at the worst of some points; without any, at the worst of all. The settings
+        are the worn characteristics.
+        """
+        evaluations = self._evaluate(shares, vehicles, stage, points, arrays=self.takes_arrays)
+        worn = self.promise.worn
+        return replace(
+            evaluations,
+            settings=vehicles,
+            f_diff=worn.largest_change(vehicles),
+            f_num_diff=worn.number_changed(vehicles),
+        )
+
+    def _evaluate(
+        self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int], *, arrays: bool
     ) -> Evaluations:
         selection = Selection(tuple(one.name for one in self.parameters), tuple(points), arrays)
-        return self.evaluator.evaluate_selection(np.concatenate([wear, self.values(shares)], axis=1), selection, stage)
+        rows = np.concatenate([self.promise.settings(vehicles), self.values(shares)], axis=1)
+        return self.evaluator.evaluate_selection(rows, selection, stage)
 
     @cached_property
     def takes_arrays(self) -> bool:
@@ -237,37 +261,51 @@ class Problem:
         if table.kind or table.model in ADS:
             return not table.kind
         shares = sobol_points(ARRAY_CHECKS, len(self.parameters), 0)
-        wear = self.promise.settings(sobol_points(ARRAY_CHECKS, len(self.promise.columns), 1))
+        vehicles = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.worn), 1))
         stage = "does the driving system take arrays?"
         try:
-            together = self._select(shares, wear, stage, (), arrays=True)
+            together = self._evaluate(shares, vehicles, stage, (), arrays=True)
         except UserCodeError:
             return False
-        return not any(differences(self._select(shares, wear, stage, (), arrays=False).results, together.results))
+        return not any(differences(self._evaluate(shares, vehicles, stage, (), arrays=False).results, together.results))
 
-    def degrees(self, shares: FloatArray, wear: FloatArray, stage: str, points: Sequence[int] = ()) -> FloatArray:
-        """Safety degrees as `evaluate`; infinite without a conflict, and minus infinity where nothing was simulated."""
-        return degrees_of(self.evaluate(shares, wear, stage, points))
+    def degrees(
+        self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()
+    ) -> tuple[FloatArray, npt.NDArray[np.intp]]:
+        """Safety degrees of each of M sets of parameters in each of L vehicles, shape (M, L), and the numbers of their
+        points among `points`.
+        """
+        shape = len(shares), len(vehicles)
+        rows = np.repeat(shares, len(vehicles), axis=0), np.tile(vehicles, (len(shares), 1))
+        evaluations = self.evaluate(*rows, stage, points)
+        worst = evaluations.worst_points
+        numbers = np.zeros(shape, dtype=np.intp) if worst is None else worst.reshape(shape)
+        return degrees_of(evaluations).reshape(shape), numbers
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Vehicles drawn uniformly in the feasible part of the promise, shape (number, n)."""
-        dimensions = len(self.promise.columns)
-        return self.feasible(lambda count: self.promise.settings(rng.random((count, dimensions))), number)
-
-    def feasible(self, draw: Any, number: int) -> FloatArray:
-        return self.evaluator.region.draw_feasible(draw, number) if self.evaluator.region else draw(number)
+    def failing(
+        self, one: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()
+    ) -> tuple[FloatArray, FloatArray, int]:
+        """The safety degrees and the vehicles that a set, shape (P,), does not keep safe and another driver could; and
+        the number of vehicles that no driver keeps safe.
+        """
+        degrees = self.degrees(one[np.newaxis], vehicles, stage, points)[0][0]
+        is_unsafe = degrees < self.margin
+        degrees, vehicles = degrees[is_unsafe], vehicles[is_unsafe]
+        can = self.repairable(vehicles)
+        return degrees[can], vehicles[can], int(np.count_nonzero(~can))
 
     @cached_property
     def best_driver(self) -> Evaluator:
+        """Full braking at the first possible moment."""
         ads = ModelTable(model="full_braking", parameters=approach_parameters(assemble(self.study)))
         return self.evaluator.for_study(replace_in(self.study, ads=ads), verified=0)
 
-    def repairable(self, wear: FloatArray, stage: str = "full braking") -> BoolArray:
+    def repairable(self, vehicles: FloatArray) -> BoolArray:
         """Which vehicles full braking at the first possible moment, or the ADS of today, keeps safe."""
-        is_safe = degrees_of(self.best_driver.evaluate(wear, stage)) >= self.margin
+        stage = "full braking"
+        is_safe = degrees_of(self.best_driver.evaluate(self.promise.settings(vehicles), stage)) >= self.margin
         rest = np.flatnonzero(~is_safe)
-        if len(rest):
-            is_safe[rest] = self.degrees(np.tile(self.today, (len(rest), 1)), wear[rest], stage) >= self.margin
+        is_safe[rest] = self.degrees(self.today[np.newaxis], vehicles[rest], stage)[0][0] >= self.margin
         return is_safe
 
 
@@ -275,8 +313,3 @@ def degrees_of(evaluations: Evaluations) -> FloatArray:
     """Safety degrees [m, or -m/s], shape (M,); infinite without a conflict, minus infinity without a valid result."""
     degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
     return np.where(evaluations.valid, degrees, -np.inf)
-
-
-def default_margin(study: Study) -> float:
-    """The model's error of a study that states one, else `DEFAULT_MARGIN` [m]."""
-    return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN)
