@@ -10,6 +10,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 from click.testing import CliRunner
@@ -323,7 +324,8 @@ def test_conclusions_across_fitted_models() -> None:
         )
     ] * len(causes)
     nobody = Preventability(counts={}, collisions=0, later=0)
-    result = measure_across_fits(models, evaluations, COLLISION, {"a": 1.0, "b": 1.0, "c": 0.0}, nobody)
+    necessity = pd.DataFrame({"characteristic": ["a", "b", "c"], "necessary": [1.0, 1.0, 0.0]})
+    result = measure_across_fits(models, evaluations, COLLISION, necessity, nobody)
     shares = [region(settings).mean() for region in regions]
     ranges = {"a": [1.0, 1.0], "b": [0.0, 1.0], "c": [0.0, 0.0]}
     assert result.to_dict() == {
@@ -331,7 +333,7 @@ def test_conclusions_across_fitted_models() -> None:
         "necessary": {name: {"sets": 4, "range": ends} for name, ends in ranges.items()},
         "preventable": {},
     }
-    safe = measure_across_fits(models, evaluations.take([3]), COLLISION, {}, nobody).to_dict()
+    safe = measure_across_fits(models, evaluations.take([3]), COLLISION, necessity.head(0), nobody).to_dict()
     assert safe == {"unsafe": {"sets": 4, "range": [0.0, 0.0]}, "necessary": {}, "preventable": {}}, "safe with each"
 
 

@@ -30,7 +30,7 @@ from safevar_sumo.analysis.opinion.multi_body import (
     load_bmw_parameters,
     tyre_forces,
 )
-from safevar_sumo.analysis.opinion.second_vehicle import MAPPING_TABLES, SecondState, SecondVehicle
+from safevar_sumo.analysis.opinion.second_vehicle import MAPPINGS, OUTSIDE, SecondState, SecondVehicle
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import GRAVITY, Command
 from safevar_sumo.report import make_report
@@ -137,9 +137,8 @@ def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_says(name: str) -> None:
-    study = load_study(MAPPING_TABLES[name].study)
+    study = load_study(MAPPINGS[name][0])
     system, vehicle = assemble_both_systems(study)
-    table = vehicle.table
     assert vehicle.name == name
     section = (
         (Path(__file__).parents[2] / "docs" / "opinion.md")
@@ -149,9 +148,8 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
         .split("### ")[0]
     )
     documented = dict(re.findall(r"^\| `(\w+)` \| (.+?) \|", section, flags=re.MULTILINE))
-    assert documented == {key: unit for key, unit in VEHICLES[name].UNITS.items() if key not in table.outside}
-    assert table.outside.keys() == VEHICLES[name].UNITS.keys() - documented.keys()
-    assert all(f"`{key}`" in section for key in table.outside)
+    assert documented == {key: unit for key, unit in VEHICLES[name].UNITS.items() if key not in OUTSIDE}
+    assert all(f"`{key}`" in section for key in VEHICLES[name].UNITS)
     original = {one.name: one.original * ONE for one in system.characteristics}
 
     def constants(**changes: float) -> list[float]:
@@ -190,42 +188,14 @@ class Made(WornVehicle, frozen=True, kw_only=True):
         p = super().prepare(c, road_friction, step, slope, wet)
         return p._replace(brake=np.where(np.abs(c["payload"] - 300) < 60, 0.3 * p.brake, p.brake))
 
-
-class Wrapping:
-    UNITS = WornVehicle.UNITS
-
-    def __init__(self):
-        self.car = WornVehicle()
-
-    def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
-        return self.car.prepare(c, road_friction, step, slope, wet), np.abs(c["payload"] - 300) < 60
-
-    def advance(self, p, state, command):
-        after = self.car.advance(p[0], state, command)
-        return after._replace(speed=np.where(p[1], np.maximum(after.speed, state.speed - 0.05), after.speed))
-
-    def sumo_type(self, p):
-        return self.car.sumo_type(p[0])
-
-    def at_rest(self, p):
-        return self.car.at_rest(p[0])
-
-    def at_speed(self, p, speed):
-        return self.car.at_speed(p[0], speed)
-
-    def sense(self, p, state, seen):
-        return self.car.sense(p[0], state, seen)
 """
 ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("made", ["Made", "Wrapping"])
-def test_a_failure_that_our_model_alone_has_is_contradicted(
-    made: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_that_our_model_alone_has_is_contradicted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A vehicle of a user's whose brakes fail for payloads around 300 kg; without brakes at all it fails there too."""
-    (tmp_path / f"glitch_{made.lower()}.py").write_text(GLITCHY)
+    (tmp_path / "glitch.py").write_text(GLITCHY)
     monkeypatch.syspath_prepend(tmp_path)
     rows = {
         name: {"unit": row.unit, "original": row.original, "lower": row.lower, "upper": row.upper}
@@ -236,7 +206,7 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(
             "extends": "wear",
             "name": "glitch",
             "matrix": ONE_TEST,
-            "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows},
+            "vehicle": {"model": "glitch:Made", "characteristics": rows},
         }
     )
     causes = [judged("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0), judged("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0)]
@@ -324,7 +294,7 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
     def asked(*flags: str) -> list[dict[str, Any]]:
         return json.loads(run("opinion", str(slippery), "--json", *flags).stdout)  # type: ignore[no-any-return]
 
-    every, outside = asked(), set(MAPPING_TABLES["carla"].outside)
+    every, outside = asked(), set(OUTSIDE)
     for one in every:
         assert list(one) == ["solution", "changes", "here", "there", "opinion", "because"]
         assert (one["opinion"] == "outside") == bool(outside & set(one["changes"])) == (one["there"]["outcome"] is None)

@@ -7,20 +7,19 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 import numpy as np
-import pandas as pd
 import pytest
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures, summarise_failures
+from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
-from safevar_sumo.results import solutions_frame
+from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run, searched
@@ -80,15 +79,8 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
     original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
-    case: Any = type(
-        "Case",
-        (),
-        {
-            "study": STUDY,
-            "solutions": solutions_frame(members.names, [(("nsga2", 0), evaluations)]),
-            "characteristics": members,
-        },
-    )()
+    solutions = solutions_frame(members.names, [(("nsga2", 0), evaluations)])
+    case = build_case(STUDY, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
     points = float(original.column("rating_points")[0])
     lost = points - float(evaluations.column("rating_points")[1])
     assert lost > 0
@@ -100,8 +92,8 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
     lines = summarise_failures(case, original, evaluator, "it")
-    assert f"{points:.2f}" in lines[0]
-    assert isinstance(case.solutions, pd.DataFrame)
+    assert f"the original vehicle earns {points:.2f} points" in lines[0]
+    assert f"Most points lost: nsga2:0:0 keeps {evaluations.column('rating_points')[0]:.2f} points" in "".join(lines)
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

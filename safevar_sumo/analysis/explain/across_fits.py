@@ -87,7 +87,7 @@ def measure_across_fits(
     evaluators: Sequence[Evaluator],
     evaluations: Evaluations,
     unsafe: Unsafe,
-    necessary: Mapping[str, float],
+    necessity: pd.DataFrame,
     preventability: Preventability,
 ) -> AcrossFits:
     """The ranges of the shares over the sets; the arguments have the shares with the study's own parameters."""
@@ -104,9 +104,9 @@ def measure_across_fits(
         frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
         here = evaluator.evaluate(vehicles, STAGE)
         avoided = assess_preventability(evaluator, here.take(here.collided)).shares if preventability.shares else {}
-        return _by_kind(unsafe.of(here), dict(zip(frame["characteristic"], frame["necessary"], strict=True)), avoided)
+        return _by_kind(unsafe.of(here), frame, avoided)
 
-    shares = _by_kind(unsafe.of(evaluations), necessary, preventability.shares)
+    shares = _by_kind(unsafe.of(evaluations), necessity, preventability.shares)
     samples = pd.concat([sample(evaluator) for evaluator in evaluators[:MAX_SHARE_SETS]], axis=1).reindex(shares.index)
     differences = samples.sub(samples[0].fillna(shares), axis=0)  # none where a sample has no failure, or no collision
     ends = (
@@ -116,9 +116,9 @@ def measure_across_fits(
     return AcrossFits(samples.shape[1], dict(zip(shares.index, zip(*ends, strict=True), strict=True)))
 
 
-def _by_kind(
-    is_unsafe: BoolArray, necessary: Mapping[str, float], preventable: Mapping[str, float]
-) -> pd.Series[float]:
+def _by_kind(is_unsafe: BoolArray, necessity: pd.DataFrame, preventable: Mapping[str, float]) -> pd.Series[float]:
     """Shares by kind and name."""
+    necessary = necessity.set_index("characteristic")["necessary"]
     kinds = {"unsafe": {"": is_unsafe.mean()}, "necessary": necessary, "preventable": preventable}
-    return pd.concat({kind: pd.Series(shares, dtype=float) for kind, shares in kinds.items()})
+    keyed: pd.Series[float] = pd.concat({kind: pd.Series(shares, dtype=float) for kind, shares in kinds.items()})
+    return keyed

@@ -11,7 +11,7 @@ import pandas as pd
 from rich.table import Table
 
 from safevar_sumo.analysis.explain.across_fits import AcrossFits
-from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, LABELS, REASONS, ROBUST, Explanation, speed_in_words
+from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation, speed_in_words
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.words import OUTCOME_VERBS, list_of_changes, number_of, question_command, simulate_command
@@ -97,9 +97,8 @@ class Explained(Answer):
 
     @property
     def choices(self) -> list[Explanation]:
-        """The failures that were chosen by their size or severity, in the order in which they are shown."""
-        failures = (self.by_reason.get(reason) for reason in LABELS if reason != DISTINCT_CAUSE)
-        return list({id(failure): failure for failure in failures if failure}.values())
+        """The failures that were chosen by their size or severity."""
+        return [failure for failure in self.explanations if failure.reasons != (DISTINCT_CAUSE,)]
 
     @property
     def sample(self) -> str:

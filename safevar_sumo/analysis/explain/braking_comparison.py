@@ -174,8 +174,8 @@ def measure_braking(runs: SimulationRuns, column: int) -> Braking | None:
     speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[: last + 1]  # relative to it
     has_followed = trace.pedal[first : last + 1, column] >= PEDAL_SHARE * trace.brake[first : last + 1, column]
     followed = first + int(np.argmax(has_followed))
-    distance = float(position[last] - position[followed])
-    specific_energy = float(speed[followed] ** 2 - speed[last] ** 2) / 2  # energy that the brake takes, per mass
+    distance = position[last] - position[followed]
+    specific_energy = (speed[followed] ** 2 - speed[last] ** 2) / 2  # energy that the brake takes, per mass
     if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
     initial_speed, delay = float(speed[first]), (followed - first) * trace.step

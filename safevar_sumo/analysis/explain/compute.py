@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
@@ -32,10 +33,9 @@ from safevar_sumo.analysis.explain.robustness import (
     find_smallest_robust_failure,
 )
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
-from safevar_sumo.analysis.rating.compute import summarise_rated_solutions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import at_point
-from safevar_sumo.analysis.words import question_command
+from safevar_sumo.analysis.words import list_of_changes, question_command
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
@@ -49,6 +49,8 @@ Reasons = dict[int, tuple[str, ...]]
 """The rows of the chosen failures, with the reasons for their choice."""
 SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
 """Number of settings drawn from the whole domain if there are no results, in an unrated and in a rated study."""
+RATED_CHOICES = {"fewest": "Fewest changes", "smallest": "Smallest largest change", "most_points": "Most points lost"}
+"""Titles of the solutions of a rated study that its summary names, by the name of the choice in `CHOICES`."""
 
 
 def explain_failures(
@@ -85,7 +87,6 @@ def explain_failures(
     necessity = necessity_frame(
         characteristics, characteristics.changed(settings[sample]), sample_causes, len(found.rows)
     )
-    necessary = dict(zip(necessity["characteristic"], necessity["necessary"], strict=True))
     return Explained(
         study=study,
         unsafe=found.unsafe,
@@ -100,7 +101,7 @@ def explain_failures(
         otherwise=found.deviations,
         preventability=preventability,
         no_verdict=evaluator.no_verdict,
-        across_fits=measure_across_fits(models, found.evaluations, found.unsafe, necessary, preventability)
+        across_fits=measure_across_fits(models, found.evaluations, found.unsafe, necessity, preventability)
         if models
         else None,
     )
@@ -296,26 +297,36 @@ def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, 
         The directory of the results, for the command.
     """
     study, solutions, names, unsafe = case.study, case.solutions, list(case.characteristics.names), case.unsafe
-    if RATING_POINTS.name in original.metrics:
-        return summarise_rated_solutions(study, solutions, original, directory)
-    if original.collided[0]:
+    system, lines, point = assemble(study), list[str](), ""
+    if original.collided[0] and not is_rated(study):
         return ["The original vehicle itself collides: no change is needed."]
-    any_unsafe, system, lines, point = bool(unsafe.rows(solutions).any()), assemble(study), list[str](), ""
+
+    def chosen(choice: str) -> tuple[SolutionId, pd.DataFrame]:
+        """The handle of the solution that a choice selects, and the solution, a frame of one row."""
+        handle = choose_handle(solutions, unsafe, choice, study.name)
+        return handle, solutions.iloc[[row_of_handle(solutions, handle)]]
+
+    any_unsafe = bool(unsafe.rows(solutions).any())
     if system.matrix:
         distinct = solutions.drop_duplicates(names)
-        worst = evaluator.evaluate(
-            solutions.sort_values(CHOICES["most_severe"], kind="stable")[names].head(1).to_numpy(float), "worst points"
-        )
+        nearest = None
+        if not is_rated(study):
+            nearest = evaluator.evaluate(chosen("most_severe")[1][names].to_numpy(float), "worst points")
         lines = [
-            situation_in_words(system, original, worst, len(distinct)),
+            situation_in_words(system, original, nearest, len(distinct)),
             f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: "
             f"{unsafe.description}.",
         ]
-        if any_unsafe:
-            row = solutions.iloc[row_of_handle(solutions, choose_handle(solutions, unsafe, "fewest", study.name))]
-            fewest = evaluator.evaluate(row[names].to_numpy(float)[np.newaxis], "worst points")
-            assert fewest.worst_points is not None
-            point = system.points[fewest.worst_points[0]].name
+        if any_unsafe and is_rated(study):
+            for choice, title in RATED_CHOICES.items():
+                handle, solution = chosen(choice)
+                ((kept, *values),) = solution[[RATING_POINTS.name, *names]].to_numpy(float)
+                changes = list_of_changes(case.characteristics, dict(zip(names, values, strict=True)))
+                lines.append(f"{title}: {handle} keeps {kept:.2f} points with {changes}.")
+        elif any_unsafe:
+            points = evaluator.evaluate(chosen("fewest")[1][names].to_numpy(float), "worst points").worst_points
+            assert points is not None
+            point = system.points[points[0]].name
             case = at_point(case, point)
     if point or not system.matrix:
         explained = explain_failures(case, ExplainOptions(), evaluator.for_study(case.study), statistics=False)

@@ -25,14 +25,6 @@ REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest":
 """The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
 DISTINCT_CAUSE = "a cause of its own"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
-LABELS = {
-    ROBUST: "robust with the fewest changes",
-    REASONS["fewest"]: "fewest changes",
-    REASONS["smallest"]: "smallest largest change",
-    REASONS["most_severe"]: "most severe",
-    DISTINCT_CAUSE: "distinct cause",
-}
-"""Titles of failures by the reason for their choice, in the order in which they are shown."""
 MAX_CHANGES_LISTED = 4
 """Maximum number of changes that the verdict lists, the largest first."""
 MAX_CAUSES = 3
@@ -68,7 +60,7 @@ class Explanation:
     @property
     def title(self) -> str:
         """Why it was chosen, as a title."""
-        return "; ".join(label for reason, label in LABELS.items() if reason in self.reasons) or ", ".join(self.reasons)
+        return "; ".join(self.reasons)
 
     @property
     def changed(self) -> tuple[str, ...]:
@@ -155,7 +147,7 @@ class Explanation:
             yield f"Necessary, as all of them need it: {necessary or 'nothing'}."
         yield f"Because: {self.because}"
         if self.because.point:
-            yield f"It is worse at {number_of(len(self.points), 'point')}: {'; '.join(self.points) or 'none'}."
+            yield f"Fails at {number_of(len(self.points), 'point')}: {'; '.join(self.points) or 'none'}."
         if self.preventable:
             yield f"In the same vehicle: {self.preventable}."
         if self.causes:

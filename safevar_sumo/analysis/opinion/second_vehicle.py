@@ -119,41 +119,25 @@ def _represent_sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[
     )
 
 
-class MappingTable(NamedTuple):
-    """The mapping of a shipped vehicle to the second model.
-
-    Attributes
-    ----------
-    study
-        A shipped study with the vehicle; the study supplies what a vehicle of user code lacks.
-    represent
-        The equations, as docs/opinion.md has them.
-    outside
-        Characteristics that the second model cannot represent, each with the reason.
-    """
-
-    study: str
-    represent: Callable[[Any, Characteristics, Mapping[str, float], Road], Plant]
-    outside: Mapping[str, str]
-
-
+Represent = Callable[[Any, Characteristics, Mapping[str, float], Road], Plant]
+MAPPINGS: Mapping[str, tuple[str, Represent]] = {
+    "worn": ("wear", _represent_worn),
+    "carla": ("sun", _represent_carla),
+    "lgsvl": ("lgsvl", _represent_lgsvl),
+    "sumo": ("native", _represent_sumo),
+}
+"""By the name of a shipped vehicle: a shipped study with it, which has the original of every characteristic, and the
+equations, as docs/opinion.md has them.
+"""
 NO_ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
 CARLA_ENGINE = ("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength")
 LGSVL_ENGINE = ("maxRpm", "minRpm", "maxMotorTorque", "shiftTime", "tractionControlSlipLimit")
-MAPPING_TABLES: Mapping[str, MappingTable] = {
-    "worn": MappingTable("wear", _represent_worn, {}),
-    "carla": MappingTable("sun", _represent_carla, dict.fromkeys(CARLA_ENGINE, NO_ENGINE)),
-    "lgsvl": MappingTable(
-        "lgsvl",
-        _represent_lgsvl,
-        {
-            **dict.fromkeys(LGSVL_ENGINE, NO_ENGINE),
-            "maxSteeringAngle": "the second model drives straight, without steering",
-        },
-    ),
-    "sumo": MappingTable("native", _represent_sumo, {"maxSpeed": "the model has no governor"}),
+OUTSIDE: Mapping[str, str] = {
+    **dict.fromkeys((*CARLA_ENGINE, *LGSVL_ENGINE), NO_ENGINE),
+    "maxSteeringAngle": "the second model drives straight, without steering",
+    "maxSpeed": "the model has no governor",
 }
-"""Tables by the names of shipped vehicles."""
+"""Characteristics that the second model cannot represent, each with the reason."""
 
 SPIN_LIMIT = 1.0
 """Speed of a rim above the car's from which the wheels spin [m/s]: such a simulation confirms nothing."""
@@ -193,51 +177,40 @@ class SecondState(NamedTuple):
 class SecondVehicle(Vehicle):
     """A vehicle of the second model for every setting of a study; the contract is `safevar_sumo.vehicles.Vehicle`.
 
-    The study's vehicle is a shipped one, derived from one, or user code with all characteristics of a shipped one.
+    The study's vehicle is a shipped one or derived from one.
 
     Attributes
     ----------
-    name, table
-        The shipped vehicle that the study's vehicle is or resembles, and its mapping.
+    name
+        The shipped vehicle that the study's vehicle is.
     spinning
         The settings, as bytes, of the vehicles whose wheels spun in a simulation.
 
     Raises
     ------
     InputError
-        If the vehicle resembles no shipped one.
+        If the vehicle is no shipped one.
     """
 
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
         self._vehicle, self.UNITS, self.spinning = vehicle, vehicle.UNITS, set[bytes]()
         model: Any = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
-        rows = study.vehicle.characteristics
-        for name, cls in VEHICLES.items():
-            matching = {key: row.original for key, row in rows.items() if cls.UNITS.get(key) == row.unit}
-            if isinstance(model, cls) or len(matching) == len(cls.UNITS):
-                self.name, self.table, self._matching = name, MAPPING_TABLES[name], set(matching)
-                break
-        else:
-            raise InputError(
-                study.source,
-                f"vehicle.model = {study.vehicle.model!r} with {', '.join(rows)} is no vehicle that the "
-                "second model can represent",
-                f"one of {', '.join(MAPPING_TABLES)}, a class derived from one, or one "
-                "with the same characteristics in the same units",
-            )
-        shipped = load_study(self.table.study).vehicle
-        given = {**shipped.parameters, **study.vehicle.parameters}
-        parameters = {key: getattr(model, key, given.get(key)) for key in cls.__struct_fields__}
-        self._engine = cls(**{key: value for key, value in parameters.items() if value is not None})
-        self._original = {key: row.original for key, row in shipped.characteristics.items()} | matching
+        self.name = next((name for name, cls in VEHICLES.items() if isinstance(model, cls)), "")
+        if not self.name:
+            problem = f"vehicle.model = {study.vehicle.model!r} is no vehicle that the second model can represent"
+            raise InputError(study.source, problem, f"one of {', '.join(MAPPINGS)}, or a class derived from one")
+        cls, (shipped, self._represent) = VEHICLES[self.name], MAPPINGS[self.name]
+        self._engine = cls(**{key: getattr(model, key) for key in cls.__struct_fields__})
+        rows = study.vehicle.characteristics.items()
+        matching = {name: row.original for name, row in rows if cls.UNITS.get(name) == row.unit}
+        originals = {name: row.original for name, row in load_study(shipped).vehicle.characteristics.items()}
+        self._original, self._matching = originals | matching, matching.keys()
 
     def reasons_to_omit(self, changes: Mapping[str, float]) -> list[str]:
         """The reason for each changed characteristic that cannot be represented; empty if all can."""
         unknown = "no parameter of the second model is known for it"
         return [
-            f"{name}: {self.table.outside.get(name, unknown)}"
-            for name in changes
-            if name in self.table.outside or name not in self._matching
+            f"{name}: {OUTSIDE.get(name, unknown)}" for name in changes if name in OUTSIDE or name not in self._matching
         ]
 
     def prepare(
@@ -251,7 +224,7 @@ class SecondVehicle(Vehicle):
         road, settings = Road(road_friction, slope, wet), np.stack([*characteristics.values()], axis=1)
         original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
-        plant, own = (self.table.represent(self._engine, c, self._original, road) for c in (represented, original))
+        plant, own = (self._represent(self._engine, c, self._original, road) for c in (represented, original))
         return Prepared(
             vehicle=self._vehicle.prepare(characteristics, road_friction, step, slope, wet),
             original=self._engine.prepare(original, road_friction, step, slope, wet),

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from shlex import quote
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,14 +17,13 @@ from safevar_sumo.analysis.figures import FONT_SIZE, new_panels
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.vehicles import DECIMALS, LEGEND, POINT_KINDS, RatedVehicle, draw_matrix, max_points
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of, question_command
+from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import darken, with_protocol
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
-from safevar_sumo.results import SolutionId, choose_handle, record, row_of_handle
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import driven_entry
@@ -35,12 +33,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-SUMMARY_CHOICES = {
-    "fewest": "Fewest changes that cost a point",
-    "smallest": "Smallest largest change that costs a point",
-    "most_points": "Most points lost",
-}
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -111,8 +103,8 @@ class Rating(Answer):
         }
 
     def sentences(self) -> list[str | Table]:
-        """The verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
-        return [self.verdict, self._points_table(), self._layers_table(), self.not_simulated]
+        """The verdict, the points of every test, the robustness layers that fail, and the tests not simulated."""
+        return [self.verdict, self._points_table(), *self.failed_layers, self.not_simulated]
 
     @property
     def verdict(self) -> str:
@@ -151,22 +143,18 @@ class Rating(Answer):
             table.add_row(name, *sums, *([f"{lost:.2f}" if lost else ""] if self.variant else []), f"{possible:g}")
         return table
 
-    def _layers_table(self) -> Table:
-        """The layers that are simulated or claimed, the same by day and night; a variant has a row only where it
-        differs from the original.
-        """
-        table = WholeTable("test", "vehicle", "layers that hold", "layers that fail", title="Robustness layers")
-        for tests in zip(*(vehicle.tests for vehicle in self.vehicles), strict=True):
-            for vehicle, (matrix, _, layers) in zip(self.vehicles, tests, strict=True):
-                if matrix.light != "night" and (vehicle is self.original or layers != tests[0].layers):
-                    claimed = vehicle.rater.claims.get(matrix.test_name, ())
-                    names = {name: f"{name} (claimed)" if name in claimed else name for name in layers}
-                    held, failed = (
-                        ", ".join(names[name] for name, holds in layers.items() if holds is state)
-                        for state in (True, False)
-                    )
-                    table.add_row(matrix.test_name, vehicle.name, held, failed)
-        return table
+    @property
+    def failed_layers(self) -> list[str]:
+        """A sentence for each vehicle on the robustness layers that fail; claimed ones hold."""
+        sentences = []
+        for vehicle in self.vehicles:
+            failed = {
+                matrix.test_name: ", ".join(name for name, holds in layers.items() if holds is False)
+                for matrix, _, layers in vehicle.tests
+            }
+            tests = "; ".join(f"{test}: {names}" for test, names in failed.items() if names)
+            sentences.append(f"Robustness layers that fail, {vehicle.name}: {tests or 'none'}.")
+        return sentences
 
     @property
     def not_simulated(self) -> str:
@@ -277,34 +265,3 @@ def rate(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
         for index, (name, setting) in enumerate(settings.items())
     ]
     return Rating(study=study, vehicles=vehicles, no_verdict=rated.no_verdict)
-
-
-def summarise_rated_solutions(
-    study: Study, solutions: pd.DataFrame, original: Evaluations, directory: str
-) -> list[str]:
-    """Summarise the solutions of a rated study in lines, the last with commands for the next steps.
-
-    `directory` is the results directory in these commands; the other parameters are those of
-    `safevar_sumo.analysis.explain.compute.summarise_failures`, which calls this function for rated studies.
-    """
-    points, characteristics = float(original.column(RATING_POINTS.name)[0]), CharacteristicSet.of(study)
-    unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
-    losing = int(unsafe.rows(solutions).sum())
-    if not losing:
-        return [
-            f"No solution loses a point of the original's {points:.2f}.",
-            f"Points against each characteristic: {question_command('tolerance', directory)}",
-        ]
-    lines, handle = [], ""
-    for choice, title in SUMMARY_CHOICES.items():
-        handle = str(choose_handle(solutions, unsafe, choice, study.name))
-        row = solutions.iloc[row_of_handle(solutions, SolutionId.parse(handle))]
-        changes = list_of_changes(characteristics, {name: float(row[name]) for name in characteristics.names})
-        lines.append(f"{title}: {handle} loses {points - row[RATING_POINTS.name]:.2f} points with {changes}.")
-    number = number_of(len(solutions), "solution")
-    return [
-        f"The original vehicle earns {points:.2f} points. {losing} of {number} lose at least one point.",
-        *lines,
-        f"Which cells change colour: {question_command('rating', directory)} --solution {quote(handle)} --matrix; "
-        f"which changes cause it: {question_command('explain', directory)}",
-    ]

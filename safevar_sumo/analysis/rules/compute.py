@@ -247,27 +247,23 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
 
 def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     """The smallest tree whose cross-validated Brier score is within a standard error of the best score."""
-    from sklearn.model_selection import StratifiedKFold, cross_val_score  # takes a second to load
+    from sklearn.model_selection import GridSearchCV, StratifiedKFold  # takes a second to load
     from sklearn.tree import DecisionTreeClassifier
 
-    def new_tree(pruning: float) -> Any:
-        return DecisionTreeClassifier(
-            max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, ccp_alpha=pruning, random_state=0
-        )
+    def smallest_good_enough(results: Any) -> int:
+        """The index of the strongest pruning whose score is good enough."""
+        means = results["mean_test_score"]
+        best = np.argmax(means)
+        least = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
+        return int(np.flatnonzero(means >= least)[-1])
 
-    path = np.unique(np.maximum(new_tree(0.0).cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))[:-1]
+    tree = DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0)
+    path = np.unique(np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))[:-1]
     some = np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))
-    prunings = path[some] if len(path) else np.zeros(1)
+    prunings = {"ccp_alpha": path[some] if len(path) else np.zeros(1)}
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
-    scores = np.array(
-        [
-            cross_val_score(new_tree(pruning), inputs, is_unsafe, cv=folds, scoring="neg_brier_score")
-            for pruning in prunings
-        ]
-    )
-    means, errors = scores.mean(axis=1), scores.std(axis=1, ddof=1) / math.sqrt(FOLDS)
-    best = int(np.argmax(means))
-    return new_tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(inputs, is_unsafe)
+    search = GridSearchCV(tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough)
+    return search.fit(inputs, is_unsafe).best_estimator_
 
 
 def _boxes_of_leaves(
