@@ -234,7 +234,7 @@ def _run_race(race: SearchRace, space: FitSpace, fit: FitTable, seed: int, from_
     searches = [_begin_at_random(race, dimension, fit.ensemble, max_trials, rng) for _ in range(fit.starts)]
     if not from_scratch:
         population = refining_population(fit.population, dimension)
-        searches.append(race.begin(space.own_place(), START_DEVIATION, seed=seed + 1, population=population))
+        searches.append(CmaSearch(race, space.own_place(), START_DEVIATION, seed=seed + 1, population=population))
     race.run(searches)
     return [search.lowest_loss for search in searches if search.lowest_loss < np.inf]
 
@@ -272,9 +272,9 @@ def _begin_at_random(
     """
     ensemble_size = min(ensemble_size, max_trials)
     if ensemble_size < 2:
-        return race.begin(rng.random(dimension), RANDOM_DEVIATION, seed=int(rng.integers(1, 2**31)))
+        return CmaSearch(race, rng.random(dimension), RANDOM_DEVIATION, seed=int(rng.integers(1, 2**31)))
     place, axes = invert(race, dimension, ensemble_size, max_trials, rng)
-    return race.begin(place, ENSEMBLE_DEVIATION, seed=int(rng.integers(1, 2**31)), axes=axes)
+    return CmaSearch(race, place, ENSEMBLE_DEVIATION, seed=int(rng.integers(1, 2**31)), axes=axes)
 
 
 def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:

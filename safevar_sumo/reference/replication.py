@@ -12,6 +12,7 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, are_collisions
+from safevar_sumo.analysis.research_questions.tables import TITLES
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject
 from safevar_sumo.reference.conclusions import (
@@ -33,17 +34,6 @@ from safevar_sumo.study import SAFETY_DEGREE
 NEAREST_ROWS = 5
 """Number of published rows that a solution is compared with."""
 VERDICT_PLURALS = {HOLDS: "hold", IN_DIRECTION: "hold in direction", DIFFERS: "differ", UNDECIDED: "cannot be decided"}
-TITLES = {
-    "rq1": "RQ1: solutions against the original vehicle",
-    "rq2": "RQ2: NSGA-II against the others",
-    "rq3.1": "RQ3.1: how many characteristics are changed [% of the critical solutions]",
-    "rq3.2": "RQ3.2: which characteristics are changed [% of the critical solutions]",
-    "rq3.3": "RQ3.3: how large the changes are",
-    "rq3.3-safety": "RQ3.3: how the changes affect safety",
-    "collisions": "Collisions",
-    "combinations": "Four changed together",
-    "weather": "One weather against another",
-}
 
 
 def replicate(
@@ -105,21 +95,16 @@ def replicate(
 
 
 def _lines_on_nearest_rows(cases: Sequence[Case], references: Mapping[str, Sequence[ReferenceData]]) -> list[str]:
-    near = [
-        row
-        for case in cases
-        if references.get(case.name)
-        for row in compare_with_nearest_rows(case, references[case.name])
-    ]
+    known = [case for case in cases if case.name in references]
+    near = [row for case in known for row in compare_with_nearest_rows(case, references[case.name])]
     if not near:
         return []
     return [
         "## Does the search exploit the model?",
         "",
-        f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths "
-        "of the domains. "
-        "If the search found holes in the model, the published rows next to its solutions would be as safe "
-        "as others.",
+        f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths of the "
+        "domains. If the search found holes in the model, the published rows next to its solutions would be as safe as "
+        "others.",
         "",
         _markdown_table(list(near[0]), [list(row.values()) for row in near]),
         "",

@@ -74,21 +74,6 @@ class SearchRace:
             self._done(self.lowest_loss, self.best_place)
         return misfits
 
-    def begin(
-        self,
-        place: FloatArray,
-        deviation: float,
-        seed: int,
-        population: int | None = None,
-        axes: FloatArray | None = None,
-    ) -> CmaSearch:
-        """Begin a search at a place, with `deviation` as initial standard deviation along `axes`, by default the
-        cube's.
-        """
-        return CmaSearch(
-            self, place, deviation, seed, population or self.population, np.eye(len(place)) if axes is None else axes
-        )
-
     def run(self, searches: Sequence[CmaSearch]) -> None:
         """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
 
@@ -109,20 +94,27 @@ class SearchRace:
 class CmaSearch:
     """One search by CMA-ES (Hansen 2016); `lowest_loss` is that of its trials so far.
 
-    Its first generation has the covariance `deviation`**2 * `axes` @ `axes`.T, where `axes` has the shape (n, n).
+    Its first generation, by default of the race's population, has the covariance `deviation`**2 * `axes` @ `axes`.T,
+    where `axes` has the shape (n, n); by default they are the cube's.
     """
 
     def __init__(
-        self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int, axes: FloatArray
+        self,
+        race: SearchRace,
+        place: FloatArray,
+        deviation: float,
+        seed: int,
+        population: int | None = None,
+        axes: FloatArray | None = None,
     ) -> None:
         import cma  # slow to import
 
-        self._race, self.lowest_loss, self.population = race, np.inf, population
-        self._axes, self._bounds = axes, cma.BoundTransform([0, 1])
+        self._race, self.lowest_loss, self.population = race, np.inf, population or race.population
+        self._axes, self._bounds = np.eye(len(place)) if axes is None else axes, cma.BoundTransform([0, 1])
         self._strategy: Any = cma.CMAEvolutionStrategy(
-            np.linalg.solve(axes, self._bounds.inverse(place)),
+            np.linalg.solve(self._axes, self._bounds.inverse(place)),
             deviation,
-            {"seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf},
+            {"seed": seed, "verbose": -9, "popsize": self.population, "maxstd": np.inf},
         )
 
     def advance(self, trials: int) -> None:

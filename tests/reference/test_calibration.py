@@ -15,7 +15,7 @@ from safevar_sumo.reference.calibration import Calibration, FitSubject, Profiles
 from safevar_sumo.reference.effects import error_beyond_spread, linear_effects
 from safevar_sumo.reference.fit_space import FitSpace, FittedParameter, ReferenceLoss
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.search import Misfit, SearchRace, invert
+from safevar_sumo.reference.search import CmaSearch, Misfit, SearchRace, invert
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -174,7 +174,7 @@ def test_the_worse_half_gives_up_after_every_round() -> None:
 def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     """Above a bottom of one, within 4 % of it is what is 0.2 from the bottom."""
     race, _ = race_in(Bowl(bottom=1.0), 8, 800)
-    race.run([race.begin(np.array([place, 0.6]), 0.3, 3) for place in (0.9, 0.5)])
+    race.run([CmaSearch(race, np.array([place, 0.6]), 0.3, 3) for place in (0.9, 0.5)])
     assert race.best_place == pytest.approx([0.2, 0.2], abs=0.01)
     bounds = [FreeParameter(lower=0.0, upper=upper, unit="-", meaning="place") for upper in (1.0, 10.0)]
     parameters = [FittedParameter("a", (0,), bounds[0]), FittedParameter("b", (1,), bounds[1])]
@@ -245,7 +245,7 @@ def test_last_digits_of_residuals_do_not_reach_the_search_that_follows() -> None
     tried = []
     for model in (LinearModel(noise=0.5), LinearModel(noise=0.5, last_digits=1e-12)):
         place, axes, race = inversion_of(model, 40, 1000)
-        race.begin(place, 0.05, seed=3, axes=axes).advance(160)
+        CmaSearch(race, place, 0.05, seed=3, axes=axes).advance(160)
         tried.append(np.array(model.places))
     assert len(tried[0]) > 200
     assert (tried[0] == tried[1]).all()
