@@ -143,6 +143,12 @@ def test_unknown_claims_and_protocols_are_refused_by_name(changes: dict[str, Any
         assemble(load_study("euro_ncap_rating", **changes))
 
 
+def test_a_claim_is_shown_as_a_claim() -> None:
+    claimed = rated(results(), claims={"CPNA": ["Type"]})
+    sentences = Rating(study=load_study("euro_ncap_rating"), vehicles=[claimed]).failed_layers
+    assert sentences[0] == "Robustness layers claimed, not simulated: CPNA: Type."
+
+
 def test_the_verdict_names_what_is_lost_and_where() -> None:
     impact = np.full(N, np.nan)
     impact[numbers("CPNCO", "standard", "night")] = 40.0

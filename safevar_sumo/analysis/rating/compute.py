@@ -145,8 +145,9 @@ class Rating(Answer):
 
     @property
     def failed_layers(self) -> list[str]:
-        """A sentence for each vehicle on the robustness layers that fail; claimed ones hold."""
-        sentences = []
+        """A sentence for each vehicle on the robustness layers that fail, and one on those that the study claims."""
+        claims = "; ".join(f"{test}: {', '.join(layers)}" for test, layers in self.original.rater.claims.items())
+        sentences = [f"Robustness layers claimed, not simulated: {claims}."] if claims else []
         for vehicle in self.vehicles:
             failed = {
                 matrix.test_name: ", ".join(name for name, holds in layers.items() if holds is False)
