@@ -218,7 +218,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
     ("old", "new", "change", "message"),
     [
         ("lower = 4.0", "lower = 14.0", "gap", "bounds that hold the value of today"),
-        ("", "", "colour", "colour: no simulation reads it"),
+        pytest.param("", "", "colour", "colour: no simulation reads it", marks=pytest.mark.slow),
         ("", "", "gape", "did you mean 'gap'?"),
         ("at_least = 5", "at_least = 3", "gap", "outside its domain"),
         ("gap = 12.0, always", "gap = true, always", "gap", "a number, the value of today"),
@@ -230,6 +230,7 @@ def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, c
         sv.repair(planted, change=[change], pool=InlinePool())
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_no_file(planted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
