@@ -195,8 +195,7 @@ def report(
     paper
         With the research questions, as tables and figures.
     point
-        Name of a point of the study's matrix: the page is about this point only, without the research questions, which
-        need whole studies.
+        Name of the only point of the study's matrix that the page is about; research questions need whole studies.
     jobs
         Worker processes for simulations, by default one for each core.
     progress
@@ -212,21 +211,14 @@ def report(
     Warns
     -----
     UserWarning
-        If a new simulation of a solution differs from the results; with `as_it_is_now`, for each change of a file or
-        version.
+        If a simulation differs from the results; with `as_it_is_now`, for each change of a file or version.
 
     Raises
     ------
     InputError
         If a directory holds no results, there is no such section or point, or the file cannot be written.
     """
-    if unknown := [name for name in only if name not in SECTIONS]:
-        hint = did_you_mean(unknown[0], SECTIONS)
-        raise InputError("only", f"there is no section {unknown[0]!r}{hint}", f"some of {','.join(SECTIONS)}")
-    if point is not None and (paper or "questions" in only):
-        raise InputError(
-            "point", "the research questions are about whole studies", "the page without them, or no `point`"
-        )
+    _check_sections(only, paper, point)
     directories = [source.directory if isinstance(source, Results) else source for source in results]
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     if len(inputs) != 2 and "compare" in only:
@@ -239,6 +231,16 @@ def report(
     if out is not None:
         write_whole(Path(out), page)
     return page
+
+
+def _check_sections(only: Sequence[str], paper: bool, point: str | None) -> None:
+    """Refuse unknown sections, and research questions about one point."""
+    if unknown := [name for name in only if name not in SECTIONS]:
+        hint = did_you_mean(unknown[0], SECTIONS)
+        raise InputError("only", f"there is no section {unknown[0]!r}{hint}", f"some of {','.join(SECTIONS)}")
+    if point is not None and (paper or "questions" in only):
+        problem = "the research questions are about whole studies"
+        raise InputError("point", problem, "the page without them, or no `point`")
 
 
 def make_report(

@@ -177,16 +177,8 @@ def _simulate(
         command, ads_memory = system.ads.drive(observation, ads_memory)
         _note_warnings(warning_ttc, system.ads.warns(ads_memory), outcomes.is_open, speed, scene)
         command, state = robot.drive(command, state, outcomes.is_open)
-        log.write(
-            sample,
-            world.vehicle_positions(VUT),
-            scene,
-            command,
-            speed=speed,
-            gear=state.gear,
-            active=active,
-            pedal=state.brake,
-        )
+        values = {"speed": speed, "gear": state.gear, "active": active, "pedal": state.brake}
+        log.write(sample, world.vehicle_positions(VUT), scene, command, **values)
         if not np.count_nonzero(outcomes.is_open):
             break
         if watch is None:

@@ -277,7 +277,8 @@ def direction_of(angle: float) -> FloatArray:
 def _vehicle_function(api: Api, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
-    return getattr(api.vehicle, name) if compiled is None else getattr(compiled, f"vehicle_{name}")  # type: ignore[no-any-return]
+    function: Callable[..., Any] = getattr(compiled or api.vehicle, f"vehicle_{name}" if compiled else name)
+    return function
 
 
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"

@@ -46,10 +46,10 @@ def compare_systems(
     orders = [[names.index(name) for name in one.characteristics.names] for one in evaluators]
     lower, upper = _common_domain(evaluators, orders)
     sample = pd.DataFrame(_common_sample(evaluators, orders, lower, upper, options.samples), columns=names)
-    settings = [
+    solutions = [
         _solutions_of(side, one, names) for side, one in zip("ab", subjects, strict=True) if isinstance(one, Case)
     ]
-    frame = pd.concat([*settings, sample.assign(source=SAMPLE)], ignore_index=True)
+    frame = pd.concat([*solutions, sample.assign(source=SAMPLE)], ignore_index=True)
     inside = ((frame[names] >= lower) & (frame[names] <= upper)).all(axis=1)
     outside, frame = int(np.count_nonzero(~inside)), frame[inside].reset_index(drop=True)
     values = frame[names].to_numpy(dtype=float)
@@ -67,20 +67,10 @@ def compare_systems(
         frame[f"unsafe_{side}"] = unsafe.of(one)
     quantities = [one.column(RATING_POINTS.name if both_rated else SAFETY_DEGREE) for one in evaluations]
     p, a12, unit, number = _test(frame.assign(**dict(zip("ab", quantities, strict=True)))[is_valid])
-    sides = [
-        Side(
-            study=one.study,
-            original=original,
-            limits=scan(one, range(len(names)), unsafe),
-            points=rate(one, {}).original.points if both_rated else None,
-            no_verdict=one.no_verdict,
-        )
-        for one, original in zip(evaluators, originals, strict=True)
-    ]
+    sides = [_side(one, original, unsafe, both_rated) for one, original in zip(evaluators, originals, strict=True)]
     remarks = {
-        f"{number_of(outside, 'solution')} outside the other system's domain left out": outside,
-        f"{number_of(failed := int(np.count_nonzero(~is_valid)), 'setting')} left out, which one of the systems could "
-        "not simulate": failed,
+        "solution": (outside, "outside the other system's domain left out"),
+        "setting": (int(np.count_nonzero(~is_valid)), "left out, which one of the systems could not simulate"),
     }
     return SystemComparison(
         a=sides[0],
@@ -92,7 +82,17 @@ def compare_systems(
         test_unit=unit,
         test_size=number,
         weather=_weather_table(subjects),
-        remarks=tuple(remark for remark, count in remarks.items() if count),
+        remarks=tuple(f"{number_of(count, noun)} {rest}" for noun, (count, rest) in remarks.items() if count),
+    )
+
+
+def _side(evaluator: Evaluator, original: Evaluations, unsafe: Unsafe, is_rated: bool) -> Side:
+    return Side(
+        study=evaluator.study,
+        original=original,
+        limits=scan(evaluator, range(len(evaluator.characteristics)), unsafe),
+        points=rate(evaluator, {}).original.points if is_rated else None,
+        no_verdict=evaluator.no_verdict,
     )
 
 
