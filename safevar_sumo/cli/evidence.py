@@ -69,7 +69,7 @@ def export(directory: str, solution: str, point: str | None, to: str, out: Path)
     "--reference",
     "references",
     multiple=True,
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE.csv",
     help="Validate each study with these published rows; may be repeated.",
 )

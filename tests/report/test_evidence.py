@@ -365,5 +365,5 @@ def test_bad_input_is_refused(slippery: Path, tmp_path: Path) -> None:
     (tmp_path / "rows.csv").write_text("a,b\n1,2\n")
     common = ("evidence", str(slippery), "--out", str(tmp_path / "it.zip"), "--reference")
     refused(*common, str(tmp_path / "rows.csv"), message=("rows.csv", "lacks the columns"))
-    refused(*common, str(tmp_path / "none.csv"), message=("none.csv", "cannot be read"))
+    refused(*common, str(tmp_path / "none.csv"), message=("--reference", "none.csv", "does not exist"))
     assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
