@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.ads.autoware import AutowareAeb
+from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.base import REACTION_PARAMETERS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
 from safevar_sumo.ads.fmu import FmuAds

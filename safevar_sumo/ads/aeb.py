@@ -1,5 +1,5 @@
-"""Automatic emergency braking by braking distance, as in production systems and Autoware, on top of a cruise
-control.
+"""Automatic emergency braking by braking distance on top of a cruise control, as in production systems; and a stand-
+in for Autoware's, with its published formula, parameters and stop operator.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from safevar_sumo.ads.base import (
     NonNegativeParameter,
     PositiveParameter,
     Trim,
+    blocks_the_way,
+    cruise_at,
     is_in_the_way,
     pedals_for,
     time_to_reach,
-    trim_at,
 )
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5
 """Smallest deceleration of an obstacle that counts as braking [m/s^2]."""
@@ -93,8 +94,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
-        speed_to_hold = seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
-        cruise_speed, cruise_trim = memory.cruise or (speed_to_hold, trim_at(nominal, seen))
+        cruise_speed, cruise_trim = memory.cruise or cruise_at(nominal, seen, self.cruise_speed)
         is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, is_threatened)
         has_intervened = memory.intervened | (stage > 0)
@@ -133,10 +133,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             is_threatened & (seen.gap < full_gap), 2.0, np.where(is_threatened & (seen.gap < partial_gap), 1.0, 0.0)
         )
         stays_in_way = (
-            np.isfinite(seen.gap)
-            & (seen.gap > 0)
-            & (closing_speed > 0)
-            & ((np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
+            np.isfinite(seen.gap) & (seen.gap > 0) & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
         )
         is_standing = speed <= 0
         return np.where(stays_in_way | is_standing, np.maximum(stage, memory.stage), stage)
@@ -144,3 +141,77 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 def _obstacle_speed(seen: Observation) -> FloatArray:
     return np.broadcast_to(seen.obstacle_speed, seen.speed.shape)
+
+
+class _AutowareMemory(NamedTuple):
+    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; time since the decision
+    to brake, negative before it [s].
+    """
+
+    nominal: Nominal
+    step: float
+    cruise: tuple[FloatArray, Trim] | None
+    since: FloatArray
+
+
+class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed until an obstacle in its way is nearer than the distance of Autoware's emergency braking; then
+    stops with a target acceleration, reached with a target jerk.
+
+    distance = v t_response + v^2 / (2 a_ego_min) - u^2 / (2 a_obj_min) + longitudinal_offset_margin, with the speeds v
+    and u of vehicle and obstacle. Once it has decided to brake, it brakes until it stands.
+
+    Parameters
+    ----------
+    cruise_speed, cruise_gain
+        Speed to hold [m/s], by default the initial speed, and acceleration per speed error [1/s].
+    t_response, longitudinal_offset_margin
+        Response time [s] and gap [m] in the distance.
+    a_ego_min, a_obj_min
+        Decelerations of vehicle and obstacle in the distance [m/s^2]; Autoware states them as negative accelerations.
+    target_acceleration, target_jerk
+        Deceleration of the emergency stop [m/s^2], and the rate at which it is reached [m/s^3].
+    command_delay
+        Time from the decision to the first command [s]: an assumption, two cycles of 10 Hz.
+    corridor
+        Half the width of the corridor that it watches [m].
+
+    Notes
+    -----
+    The formula is that of the README of autoware_autonomous_emergency_braking; the defaults are the values of
+    autoware_launch since commit 1ded9c3a of 2024-12-12. It is a stand-in for one module of several in that stack.
+    """
+
+    cruise_speed: PositiveParameter | None = None
+    cruise_gain: PositiveParameter = 1.0
+    t_response: NonNegativeParameter = 1.0
+    a_ego_min: PositiveParameter = 3.0
+    a_obj_min: PositiveParameter = 1.0
+    longitudinal_offset_margin: NonNegativeParameter = 1.0
+    target_acceleration: PositiveParameter = 2.5
+    target_jerk: PositiveParameter = 1.5
+    command_delay: NonNegativeParameter = 0.2
+    corridor: PositiveParameter = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _AutowareMemory:
+        return _AutowareMemory(nominal, step, cruise=None, since=np.full(n, -1.0))
+
+    def drive(self, seen: Observation, memory: _AutowareMemory) -> tuple[Command, _AutowareMemory]:
+        nominal, step, cruise, since = memory
+        cruise = cruise or cruise_at(nominal, seen, self.cruise_speed)
+        is_near = is_in_the_way(seen, self.corridor) & (seen.gap < self.distance(seen.speed, seen.obstacle_speed))
+        since = np.where(since >= 0, since + step, np.where(is_near, 0.0, -1.0))
+        ramp = self.target_jerk * np.maximum(since + step / 2 - self.command_delay, 0.0)
+        is_braking = since + TIME_ROUNDING >= self.command_delay
+        wanted = np.where(
+            is_braking & (since >= 0),
+            -np.minimum(ramp, self.target_acceleration),
+            self.cruise_gain * (cruise[0] - seen.speed),
+        )
+        return pedals_for(nominal, seen.speed, wanted, cruise[1]), _AutowareMemory(nominal, step, cruise, since)
+
+    def distance(self, speed: FloatArray, obstacle_speed: FloatArray) -> FloatArray:
+        """The gap below which it brakes [m], at speeds [m/s] of shape (N,)."""
+        own = speed * self.t_response + speed * speed / (2 * self.a_ego_min)
+        other = obstacle_speed * obstacle_speed / (2 * self.a_obj_min)
+        return np.asarray(own - other + self.longitudinal_offset_margin)

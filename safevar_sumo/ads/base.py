@@ -207,6 +207,11 @@ def trim_at(nominal: Nominal, seen: Observation) -> Trim:
     return Trim(throttle, np.where(is_rolling & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
 
 
+def cruise_at(nominal: Nominal, seen: Observation, speed: float | None) -> tuple[FloatArray, Trim]:
+    """The speed that a cruise control holds [m/s], by default that of now, and its trim."""
+    return seen.speed if speed is None else np.full_like(seen.speed, speed), trim_at(nominal, seen)
+
+
 def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a trim."""
     (coasting,) = interpolate_tables(nominal.speeds, speed, nominal.coasting)
@@ -243,3 +248,8 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
     lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
     lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
     return np.asarray(is_detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor)))
+
+
+def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
+    """Whether an obstacle is within `corridor` of the lane's middle [m], or comes nearer to it."""
+    return np.asarray((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))

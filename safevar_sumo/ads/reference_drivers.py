@@ -17,10 +17,11 @@ from safevar_sumo.ads.base import (
     NonNegativeParameter,
     PositiveParameter,
     Trim,
+    blocks_the_way,
+    cruise_at,
     is_in_the_way,
     pedals_for,
     time_to_reach,
-    trim_at,
 )
 from safevar_sumo.ads.car_following import KEEPING_GAINS
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
@@ -97,14 +98,12 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         nominal, step, cruise, last_speed = memory[:4]
         if cruise is None:
             last_speed = seen.speed
-            speed = seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
-            cruise = speed, trim_at(nominal, seen), seen.brake
+            cruise = *cruise_at(nominal, seen, self.cruise_speed), seen.brake
         speed_to_hold, initial_trim, initial_brake = cruise
-        blocks_the_way = (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)
         danger_lasts = (
             np.isfinite(seen.gap)
             & (seen.gap > 0)
-            & ((seen.closing_speed > 0) | ((seen.closing_speed >= 0) & blocks_the_way))
+            & ((seen.closing_speed > 0) | ((seen.closing_speed >= 0) & blocks_the_way(seen, self.corridor)))
         )
         is_aware, was_braking = memory.danger_time >= 0, memory.danger_time >= reaction_time - TIME_ROUNDING
         is_reacting = np.where(is_aware, danger_lasts, danger)

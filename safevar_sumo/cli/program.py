@@ -35,16 +35,16 @@ COMMANDS_BY_GROUP = {
             "Find the smallest change of the driving system that survives promised wear, and its price.",
         ),
         "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
-        "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
+        "report": ("handover", "Write one page about results: verdict, causes, replays, tables, figures."),
     },
     "More": {
         "status": (
             "study",
             "Show the progress of a study running in another process: runs, front, collisions, time left.",
         ),
-        "evidence": ("evidence", "Pack results, answers and a dossier, so that anybody can make every number again."),
-        "verify": ("evidence", "Make every claim of a pack of evidence again, and compare."),
-        "export": ("evidence", "Write a solution for CARLA, or as OpenSCENARIO and OpenDRIVE."),
+        "evidence": ("handover", "Pack results, answers and a dossier, so that anybody can make every number again."),
+        "verify": ("handover", "Make every claim of a pack of evidence again, and compare."),
+        "export": ("handover", "Write a solution for CARLA, or as OpenSCENARIO and OpenDRIVE."),
         "check": (
             "catalogue",
             "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
@@ -60,8 +60,8 @@ COMMANDS_BY_GROUP = {
             "questions",
             "Compare two studies or results: what is unsafe in one of them only, limits, ratings.",
         ),
-        "tables": ("report", "Answer the research questions as tables."),
-        "figures": ("report", "Draw the figures of results."),
+        "tables": ("handover", "Answer the research questions as tables."),
+        "figures": ("handover", "Draw the figures of results."),
     },
     "Published data": {
         "import": ("reference", "Import published CSV solutions as a results directory."),

@@ -29,7 +29,9 @@ from safevar_sumo.cli.arguments import (
     add_flags,
     as_it_is_now_option,
     check_output,
+    fail,
     file_option,
+    gated,
     jobs_option,
     json_option,
     load_results_or_study,
@@ -37,7 +39,6 @@ from safevar_sumo.cli.arguments import (
     read_changes,
     split_names,
 )
-from safevar_sumo.cli.gate import fail, gated
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole

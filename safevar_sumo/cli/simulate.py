@@ -24,12 +24,12 @@ from safevar_sumo.cli.arguments import (
     complete_changes,
     complete_study,
     file_option,
+    gated,
     json_option,
     load_target,
     point_option,
     read_changes,
 )
-from safevar_sumo.cli.gate import gated
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS

@@ -14,9 +14,8 @@ import pandas as pd
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.explain.causes import Cause
+from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause
 from safevar_sumo.analysis.explain.failure import Explanation
-from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE
 from safevar_sumo.analysis.model_spread import compute_model_spreads
 from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES

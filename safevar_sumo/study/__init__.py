@@ -5,7 +5,13 @@ from safevar_sumo.study.characteristics import (
     Constraint as Constraint,
     unit_text as unit_text,
 )
-from safevar_sumo.study.file import load_study as load_study, write_study as write_study
+from safevar_sumo.study.file import (
+    fmus_of as fmus_of,
+    load_study as load_study,
+    user_code_names as user_code_names,
+    user_code_packages as user_code_packages,
+    write_study as write_study,
+)
 from safevar_sumo.study.limits import Limit as Limit, limits_of as limits_of
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
@@ -28,11 +34,6 @@ from safevar_sumo.study.schema import (
     study_names as study_names,
     study_path as study_path,
     tables_of as tables_of,
-)
-from safevar_sumo.study.user_code import (
-    fmus_of as fmus_of,
-    user_code_names as user_code_names,
-    user_code_packages as user_code_packages,
 )
 from safevar_sumo.study.validation import (
     FITTED_TABLES as FITTED_TABLES,

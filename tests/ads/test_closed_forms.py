@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from msgspec.structs import force_setattr
 
-from safevar_sumo.ads.autoware import AutowareAeb
+from safevar_sumo.ads.aeb import AutowareAeb
 from safevar_sumo.ads.car_following import Krauss
 from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.records import Nominal, Observation, PedalTables

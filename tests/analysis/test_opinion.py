@@ -17,8 +17,7 @@ import pytest
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-from safevar_sumo.analysis.explain.causes import Cause
-from safevar_sumo.analysis.explain.robustness import Robustness
+from safevar_sumo.analysis.explain.causes import Cause, Robustness
 from safevar_sumo.analysis.opinion.compute import Verdict, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.opinion.multi_body import (
     MultiBodyState,

@@ -15,17 +15,17 @@ import scipy
 from safevar_sumo.ads.reference_drivers import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.causes import (
+    STEP_FACTORS,
+    Robustness,
+    estimate_robustness,
+    find_smallest_robust_failure,
+)
 from safevar_sumo.analysis.explain.compute import (
     PointComparison,
     compare_at_points,
     explain_failures,
     summarise_failures,
-)
-from safevar_sumo.analysis.explain.robustness import (
-    STEP_FACTORS,
-    Robustness,
-    estimate_robustness,
-    find_smallest_robust_failure,
 )
 from safevar_sumo.analysis.preventability import (
     Preventability,
@@ -85,7 +85,7 @@ def test_a_failure_is_robust_by_the_mean_of_all_time_steps(
             for setting in settings
         ]
 
-    monkeypatch.setattr("safevar_sumo.analysis.explain.robustness.estimate_robustness", estimates)
+    monkeypatch.setattr("safevar_sumo.analysis.explain.causes.estimate_robustness", estimates)
     failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")
     assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=1) == row
     candidates = sum(first > 0.39 for first, *_ in shares)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo import risk
-from safevar_sumo.analysis.risk import sensitivity
+from safevar_sumo.analysis.risk import variation
 from safevar_sumo.analysis.risk.answer import Risk
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
@@ -130,7 +130,7 @@ def test_independent_characteristics_have_sobol_indices_and_no_key_of_their_own(
 
 @pytest.mark.slow
 def test_the_command_draws_them_and_repeats_them_to_the_bit(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sensitivity, "PERMUTATIONS", 128)
+    monkeypatch.setattr(variation, "PERMUTATIONS", 128)
     typed = ("risk", "rain_realistic", "--samples", "200", "--json")
     one, two = (run(*typed, "--jobs", jobs, "--plot", "it.png").stdout for jobs in ("1", "2"))
     assert one == two

@@ -24,8 +24,7 @@ from safevar_sumo import cli
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.api.running import CampaignProgress
 from safevar_sumo.campaign import RunKey, RunProgress, all_runs
-from safevar_sumo.cli.arguments import read_changes
-from safevar_sumo.cli.gate import Condition
+from safevar_sumo.cli.arguments import Condition, read_changes
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study, load_study

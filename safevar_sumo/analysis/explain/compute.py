@@ -17,21 +17,19 @@ from safevar_sumo.analysis.explain.across_fits import count_holding, measure_acr
 from safevar_sumo.analysis.explain.answer import Explained, situation_in_words
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking
 from safevar_sumo.analysis.explain.causes import (
+    STEP_FACTORS,
     Cause,
+    Robustness,
     cause_key,
     count_distinct_causes,
     describe_causes,
+    estimate_robustness,
     find_minimal_causes,
+    find_smallest_robust_failure,
     necessity_frame,
     select_affordable_rows,
 )
 from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation
-from safevar_sumo.analysis.explain.robustness import (
-    STEP_FACTORS,
-    Robustness,
-    estimate_robustness,
-    find_smallest_robust_failure,
-)
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import at_point

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from rich.table import Table
 
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison
-from safevar_sumo.analysis.explain.causes import Cause
-from safevar_sumo.analysis.explain.robustness import Robustness
+from safevar_sumo.analysis.explain.causes import Cause, Robustness
 from safevar_sumo.analysis.words import list_of_changes, number_of, simulate_command, two_decimals
 from safevar_sumo.records import KMH_PER_MS, JsonObject, Outcome
 from safevar_sumo.results import SolutionId

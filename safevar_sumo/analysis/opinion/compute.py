@@ -15,9 +15,8 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.causes import Cause
+from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause, draw_neighbours
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE, draw_neighbours
 from safevar_sumo.analysis.figures import FONT_SIZE, new_figure
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters

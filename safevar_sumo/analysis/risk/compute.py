@@ -14,8 +14,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.answer import SOBOL, Estimate, Risk, effect_columns
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns
-from safevar_sumo.analysis.risk.sensitivity import compute_effects
-from safevar_sumo.analysis.risk.variation import VariationModel
+from safevar_sumo.analysis.risk.variation import VariationModel, compute_effects
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray

@@ -1,16 +1,26 @@
-"""How vehicles vary: the random variation of a study's characteristics."""
+"""How the characteristics of vehicles vary, and which of them decide: each one's share of a variance, as Sobol
+indices or, if they are correlated or constrained, as Shapley effects.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
+from itertools import permutations
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import pandas as pd
 import scipy
 
+from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
+from safevar_sumo.analysis.risk.answer import SHAPLEY, SOBOL, UNSAFE, effect_columns
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.characteristics import Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
 from safevar_sumo.vehicles import Characteristic, FeasibleRegion, region_of
 from safevar_sumo.vehicles.region import REJECTIONS
@@ -97,3 +107,188 @@ def _quantile_function(
             ends = (np.log(low) - mean) / deviation, (np.log(high) - mean) / deviation
             logarithm = scipy.stats.truncnorm(*ends, mean, deviation)
             return lambda p: np.exp(logarithm.ppf(p))
+
+
+BASE_POINTS = 512
+"""Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
+BOOTSTRAP_SAMPLES = 200
+"""Number of bootstrap samples for the intervals of Sobol indices."""
+PERMUTATIONS = 2048
+"""Number of permutations; each takes 1 + `DRAWS` (n - 1) settings of n characteristics that vary."""
+DRAWS = 3
+"""Number of conditional draws for each conditional variance, as Song, Nelson and Staum recommend."""
+MIN_OUTCOMES = 100
+"""Minimum number of unsafe settings, and of safe settings, in a design for indices of the unsafe outcome."""
+SMALLEST_PROBABILITY = 1e-12
+
+
+def compute_effects(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float) -> pd.DataFrame:
+    """What decides the safety degree, and the unsafe outcome: the frame `Risk.effects`.
+
+    Notes
+    -----
+    The Shapley effect of a characteristic is the mean, over the orders in which the characteristics may join a set J,
+    of the growth of c(J) = E[Var(Y | the others)] when it joins (Song, Nelson, Staum 2016, SIAM/ASA J. Uncertainty
+    Quantification 4, 1060-1083). Orders are drawn at random, or all taken equally often if there are few. Values of
+    J given the others are drawn by the Gaussian copula, and again where they violate a constraint. Sobol points replace
+    random numbers, the same for all sets of an order. The linear regression on the normal values behind the settings is
+    a control variate, because its conditional variances are known, unless there are constraints.
+    """
+    seed, names = evaluator.study.search.seed, evaluator.characteristics.names
+    indices: tuple[str, ...]
+    if model.is_correlated or model.region:
+        indices, stage, design = SHAPLEY, "Shapley effects", _design(model, seed)
+        settings = design.settings.reshape(-1, len(names))
+        effects_on = partial(_shapley_effects, design, model.varying, confidence)
+    else:
+        from SALib.sample import sobol  # takes a second to load
+
+        indices, stage, problem = SOBOL, "sensitivity analysis", {"num_vars": len(names), "names": list(names)}
+        problem["bounds"] = [[0.0, 1.0]] * len(names)
+        points = sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed % 2**32)
+        settings = model.settings(points)
+        effects_on = partial(_sobol_indices, problem, confidence, seed % 2**32)
+    evaluations = evaluator.evaluate(settings, stage)
+    degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
+    is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
+    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < MIN_OUTCOMES:
+        is_unsafe[:] = np.nan
+    frames = [
+        pd.DataFrame({"output": name, "characteristic": names, **effects_on(output)}, columns=effect_columns(indices))
+        for name, output in ((SAFETY_DEGREE, degree), (UNSAFE, is_unsafe))
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def _sobol_indices(
+    problem: JsonObject, confidence: float, seed: int, output: FloatArray
+) -> dict[str, FloatArray | float]:
+    """Sobol indices of an output over the design, without base points at which the output is undefined for any
+    setting.
+    """
+    from SALib.analyze import sobol
+
+    blocks = output.reshape(BASE_POINTS, -1)
+    outputs = blocks[np.isfinite(blocks).all(axis=1)].ravel()
+    if not outputs.size or np.ptp(outputs) == 0:
+        return dict.fromkeys(effect_columns(SOBOL)[2:], np.nan)
+    found = sobol.analyze(
+        problem, outputs, calc_second_order=False, num_resamples=BOOTSTRAP_SAMPLES, conf_level=confidence, seed=seed
+    )
+    columns = dict[str, FloatArray | float]()
+    for name, key in (("first_order", "S1"), ("total", "ST")):
+        index, half = found[key], found[f"{key}_conf"]
+        columns |= {name: index, f"{name}_lower": index - half, f"{name}_upper": index + half}
+    return columns
+
+
+class Design(NamedTuple):
+    """Orders of the d characteristics that vary, shape (M, d), and M times 1 + (d - 1) `DRAWS` settings of all n: one
+    at random, then draws for the sets of the first 1, 2, ... d - 1 characteristics given the other values of it.
+
+    `latent` are the correlated normal values behind the settings, shape (M, 1 + (d - 1) `DRAWS`, d). `sets` holds for
+    each set of characteristics the orders that begin with it, the set, and the covariance of its values given the
+    others; it ends with the set of all. It is empty if constraints make this covariance unknown.
+    """
+
+    orders: np.ndarray
+    settings: FloatArray
+    latent: FloatArray
+    sets: list[tuple[np.ndarray, BoolArray, FloatArray]]
+
+
+def _design(model: VariationModel, seed: int) -> Design:
+    varying, region = model.varying, model.region
+    d, rng = int(varying.sum()), np.random.default_rng(seed)
+    orders = _orders(d, rng)
+    probabilities = sobol_points(PERMUTATIONS, max(1, (1 + DRAWS) * d), seed)[:, : (1 + DRAWS) * d]
+    normal = scipy.stats.norm.ppf(np.clip(probabilities, SMALLEST_PROBABILITY, 1 - SMALLEST_PROBABILITY))
+    normal = normal.reshape(PERMUTATIONS, 1 + DRAWS, d)
+    correlation = model.correlation[np.ix_(varying, varying)]
+
+    def settings_of(latent: FloatArray) -> FloatArray:
+        points = np.zeros((*latent.shape[:-1], len(varying)))
+        points[..., varying] = latent
+        probabilities = scipy.stats.norm.cdf(points.reshape(-1, len(varying)))
+        return model.settings_at(probabilities).reshape(points.shape)
+
+    def redraw(latent: FloatArray, mean: FloatArray, factor: FloatArray, columns: BoolArray) -> None:
+        """Draw rows of K points, shape (K, d), again while they violate a constraint."""
+        if not region:
+            return
+        for _ in range(REJECTIONS):
+            bad = ~region.feasible(settings_of(latent))
+            if not bad.any():
+                return
+            latent[np.ix_(bad, columns)] = mean[bad] + rng.standard_normal((int(bad.sum()), len(factor))) @ factor.T
+
+    factor = np.linalg.cholesky(correlation)
+    base, everything = normal[:, 0] @ factor.T, np.ones(d, dtype=bool)
+    redraw(base, np.zeros_like(base), factor, everything)
+    latent = np.repeat(base[:, np.newaxis], 1 + max(0, d - 1) * DRAWS, axis=1)
+    sets = []
+    for size in range(1, d):
+        joined = np.zeros((PERMUTATIONS, d), dtype=bool)
+        np.put_along_axis(joined, orders[:, :size], True, axis=1)
+        for columns in np.unique(joined, axis=0):
+            rows = np.flatnonzero((joined == columns).all(axis=1))
+            others = ~columns
+            weights = np.linalg.solve(correlation[np.ix_(others, others)], correlation[np.ix_(others, columns)])
+            rest = correlation[np.ix_(columns, columns)] - correlation[np.ix_(columns, others)] @ weights
+            factor = np.linalg.cholesky(rest)
+            mean = np.repeat(base[rows][:, others] @ weights, DRAWS, axis=0)
+            points = np.repeat(base[rows], DRAWS, axis=0)
+            points[:, columns] = mean + normal[rows, 1:][:, :, columns].reshape(len(mean), -1) @ factor.T
+            redraw(points, mean, factor, columns)
+            start = 1 + (size - 1) * DRAWS
+            latent[rows, start : start + DRAWS] = points.reshape(len(rows), DRAWS, d)
+            sets.append((rows, columns, rest))
+    settings = settings_of(latent)
+    if region:  # a draw that found no feasible values keeps those of the setting that it varies
+        bad = ~region.feasible(settings.reshape(-1, len(varying))).reshape(settings.shape[:2])
+        settings = np.where(bad[..., np.newaxis], settings[:, :1], settings)
+    sets.append((np.arange(PERMUTATIONS), everything, correlation))
+    return Design(orders, settings, latent, [] if region else sets)
+
+
+def _orders(d: int, rng: np.random.Generator) -> np.ndarray:
+    """`PERMUTATIONS` orders of d characteristics, with their reverses: all as often as possible, and random ones."""
+    half, number = PERMUTATIONS // 2, math.factorial(d)
+    every = list(permutations(range(d))) * (half // number) if number <= half else []
+    chance = rng.permuted(np.tile(np.arange(d), (half - len(every), 1)), axis=1)
+    orders = rng.permutation(np.concatenate([np.array(every, dtype=np.intp).reshape(len(every), d), chance]))
+    return np.concatenate([orders, orders[:, ::-1]])
+
+
+def _shapley_effects(
+    design: Design, varying: BoolArray, confidence: float, output: FloatArray
+) -> dict[str, FloatArray | float]:
+    """Effects on an output of the design, without orders in which it is undefined anywhere."""
+    values = output.reshape(design.latent.shape[:2])
+    complete = np.isfinite(values).all(axis=1)
+    values, orders, latent = values[complete], design.orders[complete], design.latent[complete]
+    if len(values) < 2 or np.ptp(values) == 0 or not varying.any():
+        return dict.fromkeys(effect_columns(SHAPLEY)[2:], np.nan)
+    number, variances = len(values), _variances(values)
+    if design.sets:
+        slopes = np.linalg.lstsq(np.column_stack([latent[:, 0], np.ones(number)]), values[:, 0], rcond=None)[0][:-1]
+        known = np.zeros(design.orders.shape)
+        for rows, joined, covariance in design.sets:
+            known[rows, np.count_nonzero(joined) - 1] = slopes[joined] @ covariance @ slopes[joined]
+        error = _variances(latent @ slopes) - known[complete]
+        factor = np.sum(error * (variances - known[complete])) / max(np.sum(error**2), np.finfo(float).tiny)
+        variances = variances - factor * error
+    contributions = np.zeros((number, len(varying)))
+    growth = np.diff(variances, axis=1, prepend=0.0)
+    np.put_along_axis(contributions, np.flatnonzero(varying)[orders], growth, axis=1)
+    effect, variance = contributions.mean(axis=0), float(variances[0, -1])
+    half = scipy.stats.norm.ppf((1 + confidence) / 2) * contributions.std(axis=0, ddof=1) / math.sqrt(number)
+    ends = {"share": effect, "share_lower": effect - half, "share_upper": effect + half}
+    return {"effect": effect, **{name: end / variance for name, end in ends.items()}}
+
+
+def _variances(values: FloatArray) -> FloatArray:
+    """For each order the conditional variances of its first 1, 2, ... d - 1 characteristics, and the whole variance."""
+    draws = values[:, 1:].reshape(len(values), (values.shape[1] - 1) // DRAWS, DRAWS)
+    whole = np.full((len(values), 1), values[:, 0].var(ddof=1))
+    return np.concatenate([draws.var(axis=2, ddof=1), whole], axis=1)
