@@ -301,18 +301,17 @@ def describe_fit(subject: FitSubject, result: Calibration, studies: Sequence[Stu
         f"of which one in {study.fit.hold_out} is held back.",
     ]
     for name, data in references.items():
-        orders = f"{_order(result.used[name])}, held back {_order(result.held_back[name])}"
+        used, held_back = (
+            "-" if (rho := fits[name].spearman[SAFETY_DEGREE]) is None else f"{rho:.3f}"
+            for fits in (result.used, result.held_back)
+        )
         lines.append(
-            f"  {name}, SHA-256 {data.fingerprint}, {data.skipped} rows left out; rho of the safety degree {orders}"
+            f"  {name}, SHA-256 {data.fingerprint}, {data.skipped} rows left out; rho of the safety degree {used}, "
+            f"held back {held_back}"
         )
     if together:
         lines.append(f"Parameters of its own: {own_names}; it shares the others.")
     return "\n".join([*lines, *(f"{name} lies on its bound." for name, value in values if value.is_on_bound)])
-
-
-def _order(result: Agreement) -> str:
-    rho = result.spearman[SAFETY_DEGREE]
-    return "-" if rho is None else f"{rho:.3f}"
 
 
 def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> None:

@@ -170,8 +170,7 @@ class StudyFit:
 
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study = study
-        self._losses = [ReferenceLoss(data, study) for data in references.values()]
-        self._inputs, self.pool = inputs_of(study, pool), pool
+        self._references, self._inputs, self.pool = list(references.values()), inputs_of(study, pool), pool
         original = CharacteristicSet.of(study).original
         settings = [original[np.newaxis], *(data.settings for data in references.values())]
         self._ends = [0, *np.cumsum([len(rows) for rows in settings])]
@@ -187,20 +186,15 @@ class StudyFit:
 
     def misfit(self, batches: Sequence[Evaluations]) -> Misfit:
         """The loss and the residuals, from the evaluations of all batches."""
-        distinct_evaluations = Evaluations.concatenate(batches)
-        evaluations = distinct_evaluations.take(self._row_of.ravel())
+        evaluations = Evaluations.concatenate(batches).take(self._row_of.ravel())
         original, *files = [evaluations.take(np.arange(start, end)) for start, end in pairwise(self._ends)]
-        loss, residuals = original_misfit(original, self.study.published, self.study.fit)
-        residuals = np.concatenate(
-            [residuals, *(loss.residuals(file) for loss, file in zip(self._losses, files, strict=True))]
-        )
-        if not evaluations.valid.all():
-            return Misfit(MAX_LOSS, residuals)
-        reference_losses = [loss.of(file) for loss, file in zip(self._losses, files, strict=True)]
-        return Misfit(loss + sum(reference_losses) / max(len(files), 1), residuals)
+        own = original_misfit(original, self.study.published, self.study.fit)
+        fits = [reference_misfit(data, self.study, rows) for data, rows in zip(self._references, files, strict=True)]
+        loss = own.loss + sum(fit.loss for fit in fits) / max(len(fits), 1) if evaluations.valid.all() else MAX_LOSS
+        return Misfit(loss, np.concatenate([fit.residuals for fit in (own, *fits)]))
 
 
-def original_misfit(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> tuple[float, FloatArray]:
+def original_misfit(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> Misfit:
     """Loss and residuals of the original vehicle's metrics, which deviate from the published values.
 
     The loss is a mean, weighted by metric, in halves of a tolerance beyond the tolerance. Deviations within the
@@ -210,16 +204,18 @@ def original_misfit(original: Evaluations, published: Mapping[str, float], fit: 
     """
     names = [name for name in published if name in METRICS]
     if not names or not fit.original:
-        return 0.0, np.empty(0)
+        return Misfit(0.0, np.empty(0))
     deviations = np.array([original.metrics[name][0] / published[name] - 1 for name in names]) / fit.tolerance
     deviations = np.nan_to_num(np.clip(deviations, -MAX_DEVIATION, MAX_DEVIATION), nan=MAX_DEVIATION)
     weights = np.array([fit.weights.get(name, 0.0) for name in names])
     excess = 2 * np.maximum(np.abs(deviations) - 1, 0.0)
-    return fit.original * float(np.mean(weights * excess)), np.asarray(deviations * np.sqrt(weights))
+    return Misfit(fit.original * float(np.mean(weights * excess)), np.asarray(deviations * np.sqrt(weights)))
 
 
-class ReferenceLoss:
-    """The loss of a study in comparison with one reference, the sum of:
+def reference_misfit(data: ReferenceData, study: Study, evaluations: Evaluations) -> Misfit:
+    """Loss and residuals of a study in comparison with one reference, from evaluations of the reference's settings.
+
+    The loss is the sum of:
 
     - 1 minus the rank correlation, and the mean absolute error, both weighted by metric;
     - differences between the effects of characteristics;
@@ -227,43 +223,28 @@ class ReferenceLoss:
 
     The unit of errors is the standard deviation of repeats of one setting in the reference or, if the study does not
     give it, of all values in the reference.
+
+    The residuals are differences in standard deviations of their noise; their squares are weighted by metric. An
+    undefined difference is 0; a row that cannot be simulated has differences of `MAX_DEVIATION`.
     """
-
-    def __init__(self, data: ReferenceData, study: Study) -> None:
-        self._data, self._study = data, study
-        defined_values = {name: data.metrics[name][~np.isnan(data.metrics[name])] for name in study.fit.weights}
-        self._deviations = {
-            name: float(np.std(values)) for name, values in defined_values.items() if values.size and np.ptp(values) > 0
-        }
-        self._characteristics = CharacteristicSet.of(study)
-        self._effects = self._effects_of(data.metrics[SAFETY_DEGREE])
-
-    def _effects_of(self, values: FloatArray) -> FloatArray:
-        return linear_effects(self._characteristics, self._data.settings, values)
-
-    def of(self, evaluations: Evaluations) -> float:
-        """The loss, from evaluations of the settings of the reference."""
-        fit, loss = self._study.fit, 0.0
-        for name, deviation in self._deviations.items():
-            unit = self._study.repeatability.get(name) or deviation
-            there, here = defined_pairs(self._data.metrics[name], evaluations.metrics[name])
-            error = float(np.mean(np.abs(here - there))) if here.size else np.inf
-            loss += fit.weights[name] * (fit.rank * (1 - (rank_correlation(there, here) or 0.0)) + error / unit)
-            if name == SAFETY_DEGREE and fit.effects:
-                differences = np.nan_to_num(self._effects_of(evaluations.f_safe) - self._effects)
-                loss += fit.effects * float(np.mean(np.abs(differences))) / unit
-        one_sided = np.count_nonzero(self._data.collided != evaluations.collided)
-        return min(loss, MAX_LOSS) + fit.collisions * one_sided / max(len(evaluations), 1)
-
-    def residuals(self, evaluations: Evaluations) -> FloatArray:
-        """Differences from the reference in standard deviations of their noise; their squares are weighted by metric.
-
-        An undefined difference is 0; a row that cannot be simulated has differences of `MAX_DEVIATION`.
-        """
-        differences = [np.empty(0)]
-        for name, deviation in self._deviations.items():
-            errors = np.nan_to_num((evaluations.metrics[name] - self._data.metrics[name]) / (ROW_NOISE * deviation))
-            differences.append(
-                np.sqrt(self._study.fit.weights[name]) * np.where(evaluations.valid, errors, MAX_DEVIATION)
-            )
-        return np.concatenate(differences)
+    fit, loss, residuals = study.fit, 0.0, [np.empty(0)]
+    for name, weight in fit.weights.items():
+        published, simulated = data.metrics[name], evaluations.metrics[name]
+        defined = published[~np.isnan(published)]
+        if not defined.size or np.ptp(defined) == 0:
+            continue
+        deviation = float(np.std(defined))
+        unit, (there, here) = study.repeatability.get(name) or deviation, defined_pairs(published, simulated)
+        error = float(np.mean(np.abs(here - there))) if here.size else np.inf
+        loss += weight * (fit.rank * (1 - (rank_correlation(there, here) or 0.0)) + error / unit)
+        if name == SAFETY_DEGREE and fit.effects:
+            characteristics = CharacteristicSet.of(study)
+            effects = [
+                linear_effects(characteristics, data.settings, values) for values in (evaluations.f_safe, published)
+            ]
+            loss += fit.effects * float(np.mean(np.abs(np.nan_to_num(effects[0] - effects[1])))) / unit
+        errors = np.nan_to_num((simulated - published) / (ROW_NOISE * deviation))
+        residuals.append(np.sqrt(weight) * np.where(evaluations.valid, errors, MAX_DEVIATION))
+    one_sided = np.count_nonzero(data.collided != evaluations.collided)
+    loss = min(loss, MAX_LOSS) + fit.collisions * one_sided / max(len(evaluations), 1)
+    return Misfit(loss, np.concatenate(residuals))

@@ -1,5 +1,5 @@
-"""Crossing pedestrians: their position over time, the point of impact, occlusion by parked cars, and agreement with
-SUMO.
+"""The shipped scenarios in an artificial world, crossing pedestrians above all: position over time, point of impact,
+occlusion by parked cars, gaps, ends of encounters, and agreement with SUMO.
 """
 
 from __future__ import annotations
@@ -14,13 +14,16 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import Outcome, Trace
+from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, SpeedProfile
+from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
+from tests.made_up import made_up_runs
 from tests.scenarios.holding import Hold, at_contact, driven
 
 NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5 / 3.6, 4.0, 1.0)}
@@ -131,3 +134,113 @@ def test_a_skewed_crossing_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match=r"lane 'footpath_0' leads [\d.]+ m along the road"):
         simulate(system, system.characteristics.original[np.newaxis])
+
+
+STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
+
+
+class ArtificialWorld:
+    """One vehicle and one pedestrian at positions that the test sets; the constants define lengths and widths."""
+
+    def __init__(self, front: float, lateral: float) -> None:
+        self.front, self.lateral = front, lateral
+        self.turned_at: float | None = None
+
+    def vehicle_positions(self, actor: str) -> np.ndarray:
+        return np.array([[self.front if actor == "vut" else 100.0, LANE]])
+
+    def person_positions(self, actor: str) -> np.ndarray:
+        return np.array([[PATH, LANE + self.lateral]])
+
+    def vehicle_length(self, actor: str) -> float:
+        return LENGTH if actor == "vut" else 7.0
+
+    def lane(self, lane: str) -> Lane:
+        return Lane((PATH, 20.0), (PATH, 10.0))
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return Lane((0.0, LANE), (90.0, LANE))
+
+    def person_width(self, actor: str) -> float:
+        return WIDTH
+
+    def turn_back(self, person: str) -> None:
+        self.turned_at = self.lateral
+
+
+def test_the_gap_to_a_parked_vehicle_ends_at_its_rear() -> None:
+    scenario, world = LeadVehicleStopped(), ArtificialWorld(60.0, 0.0)
+    scene, _ = scenario.observe(world, STEP, scenario.begin(world))
+    assert scene.gap[0] == 100.0 - 7.0 - 60.0
+    assert not scene.over[0]
+
+
+def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
+    scenario, world = PedestrianCrossing(), ArtificialWorld(30.0, -5.0)
+    memory = scenario.begin(world)
+    world.lateral = -4.91
+    scene, _ = scenario.observe(world, STEP, memory)
+    assert scene.gap[0] == pytest.approx(PATH - WIDTH / 2 - 30.0)
+    assert scene.lateral[0] == pytest.approx(-4.91)
+    assert scene.lateral_speed[0] == pytest.approx(1.8)
+
+
+@pytest.mark.parametrize(
+    ("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)]
+)
+def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
+    scenario, world = PedestrianCrossing(), ArtificialWorld(front, 0.0)
+    scene, _ = scenario.observe(world, STEP, scenario.begin(world))
+    assert scene.over[0] == over
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "over"),
+    [(1.70, 1.79, True), (1.60, 1.74, False), (1.90, 1.81, False), (-1.90, -1.80, False), (-1.70, -1.79, True)],
+)
+def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
+    before: float, now: float, over: bool
+) -> None:
+    scenario, world = PedestrianCrossing(turns_after=None, lane_width=3.5), ArtificialWorld(0.0, before)
+    memory = scenario.begin(world)
+    world.lateral = now
+    assert scenario.observe(world, STEP, memory)[0].over[0] == over
+
+
+def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> None:
+    """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next would lead beyond
+    0.7 m.
+    """
+    scenario, world = PedestrianCrossing(), ArtificialWorld(0.0, 0.0)
+    memory, turns = scenario.begin(world), []
+    for k in range(1, 12):
+        world.lateral = 0.09 * k
+        _, memory = scenario.observe(world, STEP, memory)
+        if world.turned_at is not None:
+            turns.append(k)
+            world.turned_at = None
+    assert turns == [7], "0.63 m; 0.72 m would be beyond"
+
+
+def trace(gap: list[float], speed: list[float], lateral: list[float], lateral_speed: list[float]) -> Trace:
+    columns = (np.array(values)[:, np.newaxis] for values in (speed, gap, lateral, lateral_speed))
+    v, gaps, across, across_speed = columns
+    return made_up_runs(STEP, v, gaps, lateral=across, lateral_speed=across_speed).trace
+
+
+def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
+    """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 +
+    0.6 * 1.5.
+    """
+    encounter = PedestrianCrossing().encounter(trace([4.0 - LENGTH / 2], [6.0], [-3.0], [1.5]))
+    assert encounter.distance[0, 0] == pytest.approx(5.0 - LENGTH / 2)
+    assert encounter.closing_speed[0, 0] == pytest.approx(0.8 * 6 + 0.6 * 1.5)
+    assert encounter.separation[0, 0] == pytest.approx(4.0 - LENGTH / 2)
+
+
+def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() -> None:
+    encounter = LeadVehicleStopped().encounter(trace([3.0, -0.1], [2.0, 2.0], [0.0, 0.0], [0.0, 0.0]))
+    assert encounter.separation[:, 0].tolist() == [3.0 + LENGTH, -0.1 + LENGTH]
+    assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
+    assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]
+    assert encounter.in_conflict[:, 0].tolist() == [True, False]
