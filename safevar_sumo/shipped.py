@@ -18,4 +18,6 @@ def _find_folder(name: str) -> Path:
 
 
 STUDIES = _find_folder("studies")
+STUDY_SCHEMA = STUDIES / "study.schema.json"
+"""The JSON schema of study files, for editors; the shipped studies name it in their first line."""
 NETWORKS = _find_folder("sumo_nets")

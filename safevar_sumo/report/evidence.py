@@ -262,7 +262,7 @@ def make_pack(
 def _begin(folder: str, directory: Path, case: Case, questions: Collection[str], code: Mapping[str, bytes]) -> Subject:
     """A subject with the files that are not made of others."""
     name, manifest, answers = case.study.name, read_manifest(directory), list[PackedAnswer]()
-    del manifest["folders"]  # of this machine
+    manifest.pop("folders", None)  # of this machine
     for question, (options, _) in QUESTIONS.items():
         if question in questions:
             values = msgspec.to_builtins(options())
@@ -279,7 +279,7 @@ def study_text(study: Study) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"{study.name}.toml")
         write_study(path, study, "The study as it was run, with all that it extends.")
-        return path.read_bytes()
+        return path.read_bytes().partition(b"\n")[2]  # without the path of the schema on this machine
 
 
 def _files_of_user(study: Study, directory: Path) -> dict[str, bytes]:

@@ -178,7 +178,7 @@ def read_journal(path: Path, head: JsonObject) -> JournalContent:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     lines, end = _parse(data, path)
     if lines and lines[0] != head:
-        raise InputError(path, ANOTHER_OWNER, "only journals of this study")
+        raise InputError(path, ANOTHER_OWNER, "the manifest.json and journals of one study, as it was run")
     return _content_of(lines, path, head)._replace(tail_size=len(data) - end)
 
 

@@ -14,10 +14,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import DESCRIPTION_KEYS, Study, tables_of
+from safevar_sumo.study import DESCRIPTION_KEYS, Study, convert_table, tables_of
 from safevar_sumo.study.schema import Tables
 
 FORMAT = 4
@@ -206,20 +208,29 @@ def write_manifest(directory: Path, manifest: JsonObject) -> None:
     write_whole(directory / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
 
 
+class _Manifest(Struct):
+    """What a reader of a manifest relies on; imported results have neither `sources` nor `folders`."""
+
+    study: Study
+    versions: dict[str, str]
+    original: dict[str, bool | float | str | None]
+    sources: dict[str, str] = {}
+    folders: list[str] = []
+
+
 def read_manifest(directory: Path) -> JsonObject:
     """The manifest of a results directory.
 
     Raises
     ------
     InputError
-        If there is no manifest, or it is damaged or of another format.
+        If there is no manifest, or it is damaged, was edited, or is of another format.
     """
     file = directory / MANIFEST
     try:
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
-        manifest["study"]["name"]
         written_by, number = manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         likely_path = Path("results") / directory.name
         hint = f"; did you mean {likely_path}?" if likely_path != directory and likely_path.is_dir() else ""
         problem = f"is not a results directory: there is no {MANIFEST}{hint}"
@@ -235,6 +246,7 @@ def read_manifest(directory: Path) -> JsonObject:
             f"holds results in format {number}; this version reads format {FORMAT}",
             f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
         )
+    convert_table(file, manifest, _Manifest)
     return dict(manifest)
 
 

@@ -6,6 +6,7 @@ from safevar_sumo.study.characteristics import (
     unit_text as unit_text,
 )
 from safevar_sumo.study.file import (
+    SCHEMA_LINE as SCHEMA_LINE,
     fmus_of as fmus_of,
     load_study as load_study,
     user_code_names as user_code_names,

@@ -16,7 +16,7 @@ import tomli_w
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
-from safevar_sumo.shipped import STUDIES
+from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     Origin,
@@ -43,6 +43,10 @@ SYSTEM_KEYS = ("title", "published", "repeatability")
 """Keys for one combination of vehicle, ADS, scenario, network, weather and matrix; a study with another one does not
 inherit them.
 """
+
+
+SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
+"""First line of a written study file, by which editors find the schema on this machine."""
 
 
 class _RawStudy(NamedTuple):
@@ -247,8 +251,8 @@ def drop_nulls(raw: Any) -> Any:
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file that begins with a comment; the study takes the file's name if that is a legal name
-    of a study.
+    """Write a complete study file that begins with `SCHEMA_LINE` and a comment; the study takes the file's name if that
+    is a legal name of a study.
 
     Raises
     ------
@@ -261,7 +265,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     lines = (
         "".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines()
     )
-    text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
+    text = SCHEMA_LINE + "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
 

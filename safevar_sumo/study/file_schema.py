@@ -9,13 +9,11 @@ import json
 import re
 from typing import Any
 
-from safevar_sumo.shipped import STUDIES
+from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.study.file import WHOLE_TABLES
 from safevar_sumo.study.schema import Parameters, Study
 from safevar_sumo.study.validation import json_schema
 
-SCHEMA_FILE = "study.schema.json"
-"""Name of the shipped schema, beside the shipped studies, which name it in their first line."""
 DRAFT = "http://json-schema.org/draft-07/schema#"
 """The latest draft that editors for TOML support."""
 EXTENDS = {
@@ -119,4 +117,4 @@ def schema_text() -> str:
 
 
 if __name__ == "__main__":
-    (STUDIES / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
+    STUDY_SCHEMA.write_text(schema_text(), encoding="utf-8")

@@ -19,6 +19,7 @@ from safevar_sumo.analysis.model_spread import with_values
 from safevar_sumo.cli import calibrate
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference.calibration import FitSubject
+from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -118,6 +119,7 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
 
     monkeypatch.setattr(calibrate, "calibrate", interrupted)
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--repeats", "1", "--out", "best.toml"])
+    assert Path("best.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# ")
     assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
 

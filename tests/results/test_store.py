@@ -31,6 +31,7 @@ from safevar_sumo.results import (
 )
 from safevar_sumo.results.manifest import differences, identity_digest
 from safevar_sumo.study import Study, load_study
+from tests.in_process import refused
 from tests.made_up import made_up_evaluations
 
 NAMES = ("a", "b")
@@ -254,6 +255,39 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
         assert f"in format {number}" in error.problem
         assert f"the release that wrote them, safevar_sumo {release}" in str(error.legal)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "told"),
+    [
+        ("study", None, "'study' is a required property"),
+        ("original", None, "'original' is a required property"),
+        ("versions", None, "'versions'"),
+        ("versions.safevar_sumo", 3, "versions.safevar_sumo = 3"),
+        ("sources", "x", "sources = 'x'"),
+        ("study.vehicle", None, "study: 'vehicle' is a required property"),
+        ("study.ads", 3, "study.ads = 3"),
+        ("study.search.runs", None, "study.search: 'runs' is a required property"),
+        ("study.search.algorithms", [None], "study.search.algorithms[0] = None"),
+        ("study.vehicle.characteristics.mass.lower", "x", "study.vehicle.characteristics.mass.lower = 'x'"),
+    ],
+)
+def test_an_edited_manifest_is_refused_with_its_key(
+    keys: str, value: object, told: str, slippery: Path, tmp_path: Path
+) -> None:
+    """A value of None deletes the key."""
+    shutil.copytree(slippery, tmp_path / "it")
+    manifest = table = json.loads((slippery / "manifest.json").read_text())
+    *parents, key = keys.split(".")
+    for parent in parents:
+        table = table[parent]
+    if value is None:
+        del table[key]
+    else:
+        table[key] = value
+    (tmp_path / "it/manifest.json").write_text(json.dumps(manifest))
+    for command in ("status", "explain", "tables"):
+        refused(command, str(tmp_path / "it"), message=(f"{tmp_path}/it/manifest.json: ", told))
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:

@@ -15,9 +15,9 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.manifest import evaluation_keys
-from safevar_sumo.shipped import STUDIES
+from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study import Limit, limits_of, load_study, study_names, tables_of, write_study
-from safevar_sumo.study.file_schema import SCHEMA_FILE, schema_text
+from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
 
 
@@ -208,7 +208,7 @@ def test_another_system_inherits_neither_title_nor_published_values(text: str, i
     assert not own.origin.remarks
 
 
-SCHEMA = json.loads((STUDIES / SCHEMA_FILE).read_text())
+SCHEMA = json.loads(STUDY_SCHEMA.read_text())
 VALIDATOR = jsonschema.Draft7Validator(SCHEMA)
 NOT_OF_FORM = (
     *("lower = ", "original = 5800.0", "original = 0", "there is no study", "nothing", "leads back", "is no FMU"),
@@ -224,7 +224,7 @@ def is_accepted(text: str) -> bool:
 
 
 def test_the_shipped_schema_is_that_of_the_code_and_describes_every_key() -> None:
-    assert schema_text() == (STUDIES / SCHEMA_FILE).read_text(encoding="utf-8")
+    assert schema_text() == STUDY_SCHEMA.read_text(encoding="utf-8")
     jsonschema.Draft7Validator.check_schema(SCHEMA)
     for table in (SCHEMA, *SCHEMA["$defs"].values()):
         assert all(key["description"] for key in table["properties"].values())
@@ -234,10 +234,12 @@ def test_the_shipped_schema_is_that_of_the_code_and_describes_every_key() -> Non
 @pytest.mark.parametrize("name", study_names())
 def test_a_shipped_study_names_the_schema_which_accepts_it_and_all_that_it_extends(name: str, tmp_path) -> None:  # type: ignore[no-untyped-def]
     text = (STUDIES / f"{name}.toml").read_text()
-    assert text.startswith(f"#:schema ./{SCHEMA_FILE}\n")
+    assert text.startswith(f"#:schema ./{STUDY_SCHEMA.name}\n")
     assert is_accepted(text)
     write_study(tmp_path / "whole.toml", load_study(name), "")
-    assert is_accepted((tmp_path / "whole.toml").read_text())
+    whole = (tmp_path / "whole.toml").read_text()
+    assert whole.startswith(f"#:schema {STUDY_SCHEMA}\n")
+    assert is_accepted(whole)
 
 
 @pytest.mark.parametrize(

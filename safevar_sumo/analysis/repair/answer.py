@@ -22,7 +22,7 @@ from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import Study, unit_text
+from safevar_sumo.study import SCHEMA_LINE, Study, unit_text
 from safevar_sumo.study.schema import NAME_PATTERN
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.terminal import WholeTable, answer_as_html
@@ -271,7 +271,7 @@ def write_repair(path: Path, result: Repairs) -> None:
     base = os.path.abspath(study.origin.called) if study.origin.called else study.name
     name = {"name": path.stem} if re.fullmatch(NAME_PATTERN, path.stem) else {"name": f"{study.name}-repaired"}
     tables = {"extends": base, **name, "ads": {"parameters": values}}
-    text = f"# {result.verdict}\n\n{tomli_w.dumps(tables)}"
+    text = f"{SCHEMA_LINE}# {result.verdict}\n\n{tomli_w.dumps(tables)}"
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
 

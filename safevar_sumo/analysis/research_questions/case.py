@@ -16,9 +16,9 @@ import pandas as pd
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
+from safevar_sumo.results import Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Origin, Study, Weather, convert_table
+from safevar_sumo.study import Origin, Study, Weather
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
@@ -178,7 +178,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     for path in paths:
         try:
             manifest, evaluations, solutions, finished, failures = load_runs(path)
-            study = convert_table(path / MANIFEST, manifest["study"], Study, "study")
+            study = msgspec.convert(manifest["study"], Study)
             study = msgspec.structs.replace(study, origin=Origin(places=folders_of(path, manifest)))
             scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
             has_runs = "imported" not in manifest
