@@ -376,7 +376,7 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
     options = RatingOptions(solution=data.select_handles("fewest")[0] if data.any_unsafe else None)
     rating = answer_question(rate_variant, data.case, options, jobs=jobs, progress=progress)
     return {
-        "answer": Markup(answer_as_html(rating)),
+        "answer": Markup(answer_as_html(rating, "h2")),
         "notes": rating.remarks,
         "picture": _picture("matrices", rating.figure()),
         "names": [vehicle.name for vehicle in rating.vehicles],

@@ -143,7 +143,7 @@ class World(Protocol):
         """Length of a vehicle [m]."""
 
     def lane(self, lane: str) -> Lane:
-        """A lane by its id, the same in all copies."""
+        """A lane by its id, the same in all copies; take its `start` and `end` by name, as it has a third field."""
 
     def lane_of(self, vehicle: str) -> Lane:
         """The lane that a vehicle is on, the same in all copies."""

@@ -5,6 +5,7 @@ process.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -110,9 +111,11 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_a_rating_is_packed_and_made_again(in_tmp: Path) -> None:
+def test_a_rating_has_a_page_and_is_packed_and_made_again(in_tmp: Path) -> None:
     search = {"population": 4, "evaluations": 8}
     searched(load_study("euro_ncap_rating", search=search), Path("results"))
+    run("report", "results", "--out", "it.html")
+    assert re.findall("<h([1-6])", Path("it.html").read_text()) == ["1", "2", "3", "3"]
     run("evidence", "results", "--out", "it.zip", "--rating")
     result = json.loads(run("verify", "it.zip", "--json").stdout)
     assert result["same"] == result["claims"]
