@@ -170,14 +170,6 @@ def constraints_in_words(study: Study) -> list[str]:
     return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
 
 
-def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
-    """Print a table of names."""
-    table = WholeTable(*heads, title=title)
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
-
-
 def show_no_progress(stage: str, done: int, total: int) -> None:
     """Show no progress."""
 

@@ -31,6 +31,8 @@ hypothesis.settings.load_profile("default")
 # Programs that tests start need not compile the package each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 WORKER_PROCESSES = local.LocalPool
+FITS = 4
+"""Number of fitted vehicle models with which `explained` repeats its conclusions."""
 SLIPPERY = """
 extends = "smoke"
 name = "slippery"
@@ -99,4 +101,4 @@ def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def explained(slippery: Path) -> Explained:
     """Explanations of the failures in the results `slippery`."""
     (case,) = load_cases([slippery])
-    return explain_failures(case, ExplainOptions(top=3), Evaluator(case.study, InlinePool()))
+    return explain_failures(case, ExplainOptions(top=3, fits=FITS), Evaluator(case.study, InlinePool()))

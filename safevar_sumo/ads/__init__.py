@@ -1,7 +1,6 @@
 """Automated driving systems by name."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.base import REACTION_PARAMETERS, Ads, GuardedAds, PerVehicleAds, ScalarAds
@@ -10,7 +9,7 @@ from safevar_sumo.ads.fmu import FmuAds
 from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FullBraking, FuzzySafety, Rss
 
-ADS: Mapping[str, type[Any]] = {
+ADS: Mapping[str, type] = {
     "acc": Acc,
     "aeb": Aeb,
     "apollo": Apollo,

@@ -233,7 +233,8 @@ def _run_race(race: SearchRace, space: FitSpace, fit: FitTable, seed: int, from_
     max_trials = race.trials_left // (2 * max(fit.starts, 1))
     searches = [_begin_at_random(race, dimension, fit.ensemble, max_trials, rng) for _ in range(fit.starts)]
     if not from_scratch:
-        population = refining_population(fit.population, dimension)
+        default_population = 4 + int(3 * math.log(dimension))  # of CMA-ES (Hansen 2016)
+        population = min(fit.population, max(fit.population // POPULATION_DIVISOR, default_population))
         searches.append(CmaSearch(race, space.own_place(), START_DEVIATION, seed=seed + 1, population=population))
     race.run(searches)
     return [search.lowest_loss for search in searches if search.lowest_loss < np.inf]
@@ -257,11 +258,6 @@ def _check_subjects(subjects: Sequence[FitSubject], from_scratch: bool) -> None:
                 )
     if from_scratch and not first.fit.starts:
         raise InputError(first.source, "fit.starts = 0", "at least 1 for a fit from scratch")
-
-
-def refining_population(population: int, parameter_count: int) -> int:
-    """A population `POPULATION_DIVISOR` times smaller, but at least the default population of CMA-ES (Hansen 2016)."""
-    return min(population, max(population // POPULATION_DIVISOR, 4 + int(3 * math.log(parameter_count))))
 
 
 def _begin_at_random(

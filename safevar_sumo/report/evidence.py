@@ -185,7 +185,7 @@ def count_found(
     }
 
 
-def command_of(question: str, options: Mapping[str, Any], study_name: str) -> str:
+def command_of(question: str, options: JsonObject, study_name: str) -> str:
     """The command that prints an answer."""
     return f"{QUESTIONS[question][0](**options).command_line(f'results/{study_name}')} --json"
 

@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import msgspec
 from msgspec import Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS
 from safevar_sumo.results.manifest import PACKAGES, SIMULATORS
 
@@ -33,7 +34,7 @@ class PackedAnswer(Struct, frozen=True, forbid_unknown_fields=True):
     """An answer's question, the options with which it was computed, and the command that prints the same bytes."""
 
     question: str
-    options: dict[str, Any]
+    options: JsonObject
     command: str
 
 

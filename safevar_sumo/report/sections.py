@@ -232,7 +232,7 @@ def _describe_search(data: ReportInput) -> str:
     )
 
 
-def _name_and_sentence(models: Mapping[str, Any], name: str) -> str:
+def _name_and_sentence(models: Mapping[str, type], name: str) -> str:
     """A model's name with the first sentence of its description; user code has the name alone."""
     if name not in models:
         return name

@@ -3,7 +3,6 @@
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -25,7 +24,7 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.study import Weather
 
-SCENARIOS: Mapping[str, type[Any]] = {
+SCENARIOS: Mapping[str, type] = {
     "pedestrian_crossing": PedestrianCrossing,
     "along": Along,
     "car_to_car": CarToCar,

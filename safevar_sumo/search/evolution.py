@@ -6,7 +6,7 @@ import random
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated
 
 import moocore
 import numpy as np
@@ -29,7 +29,7 @@ MAX_MISSES = 50
 
 
 @cache
-def fitness_class(objective_count: int) -> type[Any]:
+def fitness_class(objective_count: int) -> type:
     """The class of a fitness with this number of objectives, all minimised."""
 
     def initialise(self: base.Fitness, values: tuple[float, ...] = ()) -> None:

@@ -96,7 +96,9 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             settings[used : used + number] = evaluated.settings
             valid = np.flatnonzero(problem.scoring.valid(evaluated))
             if len(valid):
-                quality[used + valid] = _qualities(evaluated, problem)[valid]
+                # Collisions by their largest change; other settings, all worse, by the first objective:
+                severity = -problem.scoring.values(evaluated)[:, 0]
+                quality[used + valid] = np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, severity)[valid]
                 cells = self._cell_numbers(evaluated, problem)[valid, np.newaxis]
                 archive.add((used + valid)[:, np.newaxis].astype(float), quality[used + valid], cells)
             used += number
@@ -148,13 +150,6 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         )
         further_changes = np.maximum(changed.sum(axis=1) - 1, 0)
         return np.asarray(further_changes * (self.speeds + 1) + interval.astype(int))
-
-
-def _qualities(evaluated: Evaluations, problem: Problem) -> FloatArray:
-    """Quality of M settings, more is better: collisions by their largest change; other settings, all worse, by the
-    first objective.
-    """
-    return np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])
 
 
 def _elites_in(archive: GridArchive) -> IntArray:

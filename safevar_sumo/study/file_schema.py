@@ -37,7 +37,9 @@ def file_schema() -> Parameters:
     complete["properties"]["vehicle"] = {**vehicle, "if": FMU, "else": {"properties": rows}}
     complete["properties"]["vehicle"]["required"].remove("characteristics")
     complete["properties"]["vehicle"]["else"]["required"] = ["characteristics"]
-    lasting = _whole_tables(study)
+    # What a file states as a whole: elements of lists, and tables that no study refines.
+    wholes = [part for name, part in study["properties"].items() if name in WHOLE_TABLES or part.get("type") == "array"]
+    lasting = {"MatrixTest", *re.findall(r'"#/\$defs/(\w+)"', json.dumps(wholes))}
     for name, table in tables.items():
         _describe_keys(table, tables)
         if name not in lasting:
@@ -88,12 +90,6 @@ def _requirements(schema: Parameters, tables: Parameters) -> Parameters:
     if isinstance(rows, dict) and (of_rows := _requirements(rows, tables)):
         found["additionalProperties"] = of_rows
     return found
-
-
-def _whole_tables(study: Parameters) -> set[str]:
-    """Names of the tables that a file states as a whole: elements of lists, and tables that no study refines."""
-    parts = [part for name, part in study["properties"].items() if name in WHOLE_TABLES or part.get("type") == "array"]
-    return set(re.findall(r'"#/\$defs/(\w+)"', json.dumps(parts))) | {"MatrixTest"}
 
 
 def _describe_keys(table: Parameters, tables: Parameters) -> None:

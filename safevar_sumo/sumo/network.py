@@ -148,7 +148,9 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
     EnvironmentFault
         If netconvert fails for another reason, or the cache cannot be written.
     """
-    size, traffic_file = round_up(n), network.path(TRAFFIC_FILE)
+    # Few sizes of networks serve all batches: 1, 2, 5, 10, 20, 50, ...
+    size = next(size for power in count() for factor in (1, 2, 5) if (size := factor * 10**power) >= n)
+    traffic_file = network.path(TRAFFIC_FILE)
 
     def copy_roads(into: Path) -> None:
         source = network.path(network.roads_file) if network.is_built else network.folder
@@ -194,11 +196,6 @@ def number_of_lanes(network: Network) -> int:
 @cache
 def sumo_version() -> str:
     return version("eclipse-sumo")
-
-
-def round_up(n: int) -> int:
-    """Round up to 1, 2, 5, 10, 20, 50, ..., so that few sizes of networks serve all batches."""
-    return int(next(size for power in count() for factor in (1, 2, 5) if (size := factor * 10**power) >= n))
 
 
 def cache_folder_name(network: Network, n: int, digests: Sequence[str]) -> str:

@@ -26,6 +26,11 @@ ONE_TEST = {"matrix": {"tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}
 POOL = InlinePool()
 
 
+@pytest.fixture(autouse=True)
+def _coarse_scans(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+
+
 @pytest.mark.slow
 def test_the_collisions_that_another_version_avoids_are_those_of_single_simulations() -> None:
     wear, earlier = sv.load_study("wear", **ONE_TEST), sv.load_study("wear", **ONE_TEST, **LONGER)
@@ -61,8 +66,7 @@ def test_the_collisions_that_another_version_avoids_are_those_of_single_simulati
     assert "The original vehicles differ: passed, SD" in text
 
 
-def test_a_system_does_not_differ_from_itself(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
     answer = json.loads(run("compare", "smoke", "smoke", "--samples", "100", "--json").stdout)
     assert list(answer) == KEYS
     assert (answer["only_a_unsafe"], answer["only_b_unsafe"]) == (0, 0)

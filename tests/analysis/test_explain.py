@@ -42,6 +42,7 @@ from safevar_sumo.results import handles_of
 from safevar_sumo.sumo import assemble, evaluate
 from safevar_sumo.terminal import print_answer
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
+from tests.conftest import FITS
 from tests.in_process import InlinePool
 
 CAUSE_KEYS = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
@@ -99,7 +100,7 @@ def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained
         for cause in one["minimal_causes"]:
             assert list(cause) == [*CAUSE_KEYS, "across_fits"]
             assert cause["changes"].items() <= one["setting"].items()
-            assert 0 <= cause["across_fits"]["holds"] <= cause["across_fits"]["sets"] == 20
+            assert 0 <= cause["across_fits"]["holds"] <= cause["across_fits"]["sets"] == FITS
     assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable", "across_fits"]
     preventable = last["summary"]["preventable"]
     shares = ["competent_driver", "full_braking", "nobody"]
@@ -119,10 +120,10 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -
 
 @pytest.mark.slow
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
-    safe = case.solutions["f_safe"].idxmax()
+    safe = case.solutions["f_num_diff"].where(case.solutions["f_safe"] > 1).idxmin()  # few changes have few subsets
     handle = str(handles_of(case.solutions)[safe])
     (one,) = explain_failures(
-        case, ExplainOptions(solutions=(handle,), unsafe="collision"), Evaluator(case.study, InlinePool())
+        case, ExplainOptions(solutions=(handle,), unsafe="collision", fits=0), Evaluator(case.study, InlinePool())
     ).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("requested",))
     with pytest.raises(InputError, match="nsga2:7:0"):

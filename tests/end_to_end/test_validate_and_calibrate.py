@@ -109,32 +109,24 @@ def small_fit() -> tuple[str, ...]:
     return "calibrate", "mine.toml", "--trials", "5", "--out", "found.toml"
 
 
-def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(
+@pytest.mark.parametrize(
+    ("end", "told"), [(KeyboardInterrupt, "Best of 2 of 9 trials, then"), (SystemExit, "Best of 2 of 9 trials, while")]
+)
+def test_the_best_so_far_is_saved_now_and_then_and_if_a_calibration_is_interrupted(
+    end: type[BaseException], told: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(
         subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *, from_scratch: bool
     ) -> None:
         done(2.0, (subjects[0].study,))
         done(1.0, (with_values(subjects[0].study, {"ads.parameters.brake_gap": 5.5}),))
-        raise KeyboardInterrupt
+        raise end
 
-    monkeypatch.setattr(calibrate, "calibrate", interrupted)
+    monkeypatch.setattr(calibrate, "calibrate", ended)
+    monkeypatch.setattr(calibrate, "SECONDS_BETWEEN_SAVES", 60.0 if end is KeyboardInterrupt else 0.0)
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--repeats", "1", "--out", "best.toml"])
     assert Path("best.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# ")
-    assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
-    assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
-
-
-def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def killed(
-        subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *, from_scratch: bool
-    ) -> None:
-        done(1.0, (with_values(subjects[0].study, {"ads.parameters.brake_gap": 5.5}),))
-        raise SystemExit
-
-    monkeypatch.setattr(calibrate, "calibrate", killed)
-    monkeypatch.setattr(calibrate, "SECONDS_BETWEEN_SAVES", 0.0)
-    CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--repeats", "1", "--out", "best.toml"])
-    assert "Best of 1 of 9 trials, while more are tried" in Path("best.toml").read_text()
+    assert told in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
 
 

@@ -19,6 +19,7 @@ from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_fail
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
+from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
@@ -51,6 +52,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     protocol = msgspec.structs.replace(WHOLE, matrices=tuple(matrices), layers=layers)
     monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
+
+
+@pytest.mark.slow
+def test_what_is_shipped_passes_the_check() -> None:
+    report = check("euro_ncap_rating")
+    assert report.passed, report.findings
 
 
 @pytest.mark.slow

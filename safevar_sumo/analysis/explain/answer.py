@@ -22,7 +22,6 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Answer, WholeTable, constraints_in_words
-from safevar_sumo.vehicles import Characteristic
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -150,7 +149,10 @@ class Explained(Answer):
         if not self.explanations:
             return sentences
         first = self.explanations[0]
-        full_names = {item.name: _full_name(item) for item in first.characteristics}
+        full_names = {
+            item.name: item.name if item.short_name == item.name else f"{item.name} ({item.short_name})"
+            for item in first.characteristics
+        }
         sentences.append(f"Why {first.name} fails: {first.because}")
         if first.cause and first.cause.changes:
             limits = ", ".join(
@@ -286,12 +288,6 @@ def _necessary_share(row: Mapping[Any, Any]) -> str:
     low, high = row["necessary_lower"], row["necessary_upper"]
     interval = f" ({100 * low:.0f} % to {100 * high:.0f} %)" if low < high else ""
     return f"{100 * row['necessary']:.0f} %{interval}"
-
-
-def _full_name(characteristic: Characteristic) -> str:
-    """A characteristic's name, with its short name if that differs."""
-    name, short_name = characteristic.name, characteristic.short_name
-    return name if short_name == name else f"{name} ({short_name})"
 
 
 def situation_in_words(

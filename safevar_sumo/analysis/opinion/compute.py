@@ -200,7 +200,7 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, evaluator: E
             "a directory that the command `study` has written",
         )
     assemble_both_systems(source.study)
-    explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
+    explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT, fits=0)
     explained = explain_failures(source, explain_options, evaluator)
     causes = [(failure.name, cause) for failure in explained.explanations for cause in failure.causes]
     return replace(

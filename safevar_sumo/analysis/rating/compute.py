@@ -19,7 +19,7 @@ from safevar_sumo.analysis.rating.vehicles import DECIMALS, LEGEND, POINT_KINDS,
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import EURO_NCAP_2026, CellMatrix, Protocol
+from safevar_sumo.protocol import EURO_NCAP_2026, Protocol
 from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import darken, with_protocol
 from safevar_sumo.records import FloatArray, JsonObject
@@ -65,7 +65,12 @@ class Rating(Answer):
     def losses(self) -> dict[str, float]:
         """Points that the variant loses in each test, the largest loss first; only tests with a loss."""
         pairs = zip(self.original.tests, self.variant.tests if self.variant else (), strict=False)
-        losses = {test_in_words(before.matrix): round(before.total - after.total, DECIMALS) for before, after in pairs}
+        losses = {
+            " by ".join(filter(None, (before.matrix.test_name, before.matrix.light))): round(
+                before.total - after.total, DECIMALS
+            )
+            for before, after in pairs
+        }
         return {test: loss for test, loss in sorted(losses.items(), key=lambda item: -item[1]) if loss > 0}
 
     @property
@@ -211,10 +216,6 @@ class Rating(Answer):
         )
         figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT_SIZE)
         return figure
-
-
-def test_in_words(matrix: CellMatrix) -> str:
-    return f"{matrix.test_name} by {matrix.light}" if matrix.light else matrix.test_name
 
 
 def rate_variant(subject: Study | Case, options: RatingOptions, evaluator: Evaluator) -> Rating:

@@ -23,6 +23,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import DECIMALS, passing_cells, round_half_up
+from safevar_sumo.records import JsonObject
 
 PARAMETERS, VERSION = "Input parameters", "Version"
 NOT_ASSESSED_MARK, SELF_CLAIMED_MARK = "N/A", "Self claimed"
@@ -122,7 +123,7 @@ class PreprocessedFile(_Spreadsheet):
         sheets = dict.fromkeys(matrix.sheet.removesuffix("pred.") for matrix in self.protocol.matrices)
         self._drawn_cells = [drawn_cell for sheet in sheets for drawn_cell in self._read_drawn_cells(f"{sheet}verif.")]
 
-    def _read_drawn_cells(self, name: str) -> Iterator[tuple[dict[str, Any], int]]:
+    def _read_drawn_cells(self, name: str) -> Iterator[tuple[JsonObject, int]]:
         """The spreadsheet's cells by heading, and the cell number, of every drawn cell of a simulated test."""
         headings, matrices = list[str](), {matrix.name for matrix in self.protocol.matrices}
         for row in self._sheet(name).iter_rows():
