@@ -214,6 +214,19 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
     assert not out.exists()
 
 
+def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without attacks and fresh wear: of the worst brakes promised, those in between and the best."""
+    monkeypatch.setattr(compute, "SOBOL_VEHICLES", 3)
+    monkeypatch.setattr(compute, "attack", lambda *_: [np.zeros((0, 1))])
+    monkeypatch.setattr(compute, "prove", lambda *_: (attack.Proof(5, 0, 0.45), np.zeros((0, 1))))
+    kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
+    assert kept.worst_today == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
+    assert f"has a safety degree of {kept.worst_today:.2f} m, and 5 fresh worn cars, 0 unsafe" in kept.verdict
+    assert "  not searched       no simulation reads colour" in list(replace(kept, unread=("colour",)).sentences())
+
+
 @pytest.mark.parametrize(
     ("old", "new", "change", "message"),
     [
