@@ -19,8 +19,10 @@ from safevar_sumo.sumo import Engine, assemble, is_recorded, settings_per_batch
 
 BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""
-SMALLEST_BATCH = 1 / 20
-"""Smallest batch, as a share of the most economical one: a smaller batch takes as long."""
+SMALLEST_BATCH, SMALLEST_BATCH_IN_SUMO = 1 / 4, 1 / 20
+"""Smallest batch, as a share of the most economical one, in recorded scenes, where steps cost more than the vehicles of
+a smaller batch, and in SUMO.
+"""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
 """Results of `choose_batch_size`, by packed study."""
 _verified_counts: dict[bytes, int] = {}
@@ -59,7 +61,8 @@ def evaluate_all(
         _batch_sizes[work] = choose_batch_size(study, selection)
     best_size, is_recorded = _batch_sizes[work]
     share = len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers)
-    size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
+    smallest = best_size * (SMALLEST_BATCH if is_recorded else SMALLEST_BATCH_IN_SUMO)
+    size = min(best_size, math.ceil(max(share, smallest)))
     batches = [Batch(work, distinct_settings[start : start + size]) for start in range(0, len(distinct_settings), size)]
     sample_size = max(min(verified - _verified_counts.get(work, 0), len(distinct_settings)), 0)
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)

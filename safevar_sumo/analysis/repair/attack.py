@@ -1,4 +1,6 @@
-"""Attacks on sets of parameters with the search that broke today's, and proof on fresh wear (steps 3 and 5)."""
+"""Attacks on sets of parameters, near known failures and by the search that broke today's (step 3), and proof on fresh
+wear (step 5).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,11 @@ from safevar_sumo.search import Problem as SearchProblem
 ATTACKS = 3
 """Runs of the search, each with a seed of its own, that must find nothing."""
 RANDOM_ATTACKS = 1024
-"""Random vehicles that attack where the search has found nothing: they find failures far from the worst."""
+"""Random vehicles that attack first, with the counterexamples: they find failures far from the worst."""
+GENERATIONS, PARENTS, CHILDREN, STEP = 10, 32, 512, 0.1
+"""Generations of an attack near the worst vehicles, which become parents; simulations of children in each; step of a
+characteristic, as a share of the way to a random value.
+"""
 MAX_NEW = 32
 """Failures at which an attack ends, and which become counterexamples."""
 MAX_UNSAFE_SHARE = 0.001
@@ -38,10 +44,60 @@ class Proof(NamedTuple):
     confidence: float = CONFIDENCE
 
 
-def attack(problem: Problem, sets: Sequence[FloatArray], points: Sequence[int], number: int) -> list[FloatArray]:
+def attack(
+    problem: Problem, sets: Sequence[FloatArray], known: FloatArray, points: Sequence[int], number: int
+) -> list[FloatArray]:
     """For each set of parameters the vehicles within the promise that it does not keep safe at some points, and a
-    driving system could, worst first, shape (M, w). `number` counts the attacks.
+    driving system could, worst first, shape (M, w). `known` are vehicles that broke other sets; `number` counts the
+    attacks.
     """
+    failures = [
+        _failures_near(problem, one, known, points, np.random.default_rng((problem.study.search.seed, number, row)))
+        for row, one in enumerate(sets)
+    ]
+    rest = [row for row, vehicles in enumerate(failures) if not len(vehicles)]
+    for row, vehicles in zip(rest, _search_failures(problem, [sets[row] for row in rest], points, number), strict=True):
+        failures[row] = vehicles
+    shares = np.linspace(0.0, 1.0, MAX_NEW) ** 2  # more of the worst
+    rows = [np.unique((shares * max(len(vehicles) - 1, 0)).astype(int))[: len(vehicles)] for vehicles in failures]
+    return [vehicles[chosen] for vehicles, chosen in zip(failures, rows, strict=True)]
+
+
+def _failures_near(
+    problem: Problem, one: FloatArray, known: FloatArray, points: Sequence[int], rng: np.random.Generator
+) -> FloatArray:
+    """The failures of a set among known and random vehicles and their offspring, worst first.
+
+    A child has each characteristic of one of two parents; one in expectation is anew, or a step away.
+    """
+    promise, stage, size = problem.promise, "attack near the worst", len(problem.promise.worn)
+    number = max(CHILDREN // max(len(points), 1), PARENTS)
+    children = np.concatenate([known, promise.draw(RANDOM_ATTACKS, rng)])
+    parents, worst, failures = children[:0], np.zeros(0), np.zeros((0, 1 + size))
+    for _ in range(GENERATIONS):
+        degrees = problem.degrees(one[np.newaxis], children, stage, points)[0][0]
+        is_unsafe = degrees < problem.margin
+        is_unsafe[is_unsafe] = problem.repairable(children[is_unsafe])
+        failures = np.concatenate([failures, np.column_stack([degrees, children])[is_unsafe]])
+        is_rival = is_unsafe | (degrees >= problem.margin)
+        worst, parents = np.append(worst, degrees[is_rival]), np.concatenate([parents, children[is_rival]])
+        order = np.argsort(worst, kind="stable")[:PARENTS]
+        worst, parents = worst[order], parents[order]
+        pairs = parents[rng.integers(len(parents), size=(2, number))]
+        children = np.where(rng.random((number, size)) < 0.5, *pairs)
+        fresh = promise.at(rng.random((number, size)))
+        draw = rng.random((number, size)) * size
+        children = np.select([draw < 0.5, draw < 1.0], [fresh, children + STEP * (fresh - children)], children)
+        children = promise.region.repaired(promise.settings(children), filtered=False)[:, promise.columns]
+    return np.unique(failures, axis=0)[:, 1:]
+
+
+def _search_failures(
+    problem: Problem, sets: Sequence[FloatArray], points: Sequence[int], number: int
+) -> list[FloatArray]:
+    """The failures of each set that runs of the search find, worst first."""
+    if not sets:
+        return []
     shares, worn, search = np.array(sets), problem.promise.worn, problem.study.search
     label = next(iter(search.labels))
     originals = problem.evaluate(shares, np.tile(worn.original, (len(shares), 1)), "attack", points)
@@ -65,16 +121,7 @@ def attack(problem: Problem, sets: Sequence[FloatArray], points: Sequence[int], 
                 with suppress(StopIteration):
                     wanted[key] = next(runs[key]) if answer is None else runs[key].send(answer)
         answers = dict(zip(wanted, _judge(problem, shares, wanted, found, points), strict=True))
-    rng = np.random.default_rng((search.seed, number))
-    random = problem.promise.draw(RANDOM_ATTACKS, rng)
-    failures = []
-    for one, rows in zip(shares, found, strict=True):
-        vehicles = rows[:, 1:]
-        if not len(rows):
-            degrees, vehicles, _ = problem.failing(one, random, "attack by random wear", points)
-            vehicles = vehicles[np.argsort(degrees, kind="stable")]
-        failures.append(vehicles[np.linspace(0, len(vehicles) - 1, min(len(vehicles), MAX_NEW)).astype(int)])
-    return failures
+    return [rows[:, 1:] for rows in found]
 
 
 def _judge(

@@ -176,11 +176,12 @@ class _Finder:
 
     def _attack(self, sets: Sequence[FloatArray], points: Sequence[int]) -> list[FloatArray]:
         self.attacks += len(sets)
-        return attack(self.problem, sets, points, self.attacks) if sets else []
+        return attack(self.problem, sets, self.search.vehicles, points, self.attacks) if sets else []
 
     def find(self) -> list[Repair]:
         """Search, attack and prove in turns until the repairs kept survive everything."""
         survived, attempt = set[bytes](), 0
+        self.search.add(np.concatenate(self._attack([self.problem.today], self.search.seen)))
         for _ in range(MAX_ROUNDS):
             # 2. The smallest changes that survive all counterexamples.
             kept = self.search.pareto_set(self._mean_price)

@@ -115,27 +115,28 @@ class Search:
                 self._shrink([everything])
 
     def search(self, limits: Mapping[Subset, float]) -> None:
-        """Find the smallest change below a limit of each subset, if there is one."""
-        half = {subset: min(limit, self._bounds.get(subset, 1.0) + EARLIER_BOX) for subset, limit in limits.items()}
+        """Find the smallest change below a limit of each subset, if there is one; none lies below its bound."""
+        bounds = {subset: self._bounds.get(subset, 0.0) for subset in limits}
+        half = {one: min(limit, bounds[one] + EARLIER_BOX) if bounds[one] else limit for one, limit in limits.items()}
         open_subsets = list(limits)
         for number in range(MAX_BOXES):
             if not open_subsets:
                 break
             boxes = [self._box(subset, half[subset], number) for subset in open_subsets]
-            remaining = []
-            for subset, box, row in zip(open_subsets, boxes, self._least(boxes), strict=True):
-                if row is not None:
-                    self.best[subset] = box[row]
-                    half[subset] = float(self.change(box[row])) - LEAST_GAIN
-                    if len(subset) > 1 and half[subset] > 0:
-                        remaining.append(subset)
-                elif subset not in self.best and half[subset] < limits[subset]:
-                    half[subset] = limits[subset]
-                    remaining.append(subset)
-            open_subsets = remaining
-        found = [subset for subset in limits if subset in self.best]
-        self._shrink(found)
-        self._bounds |= {**limits, **{subset: float(self.change(self.best[subset])) for subset in found}}
+            boxes = [box[self.change(box) >= bounds[subset]] for box, subset in zip(boxes, open_subsets, strict=True)]
+            better = {
+                subset: box[row]
+                for subset, box, row in zip(open_subsets, boxes, self._least(boxes), strict=True)
+                if row is not None
+            }
+            self.best |= better
+            self._shrink(list(better))
+            wider = [one for one in open_subsets if one not in self.best and half[one] < limits[one]]
+            half |= {one: limits[one] for one in wider}
+            half |= {subset: float(self.change(self.best[subset])) - LEAST_GAIN for subset in better}
+            open_subsets = [*wider, *(one for one in better if len(one) > 1 and half[one] > bounds[one])]
+        found = {one: float(self.change(self.best[one])) for one in limits if one in self.best}
+        self._bounds |= {**limits, **found}
 
     def first_failures(self, shares: FloatArray, most: int | None = None) -> list[Failure | None]:
         """The first failure of each of M sets of parameters, shape (M, P); None if it survives all vehicles, or the
