@@ -3,9 +3,15 @@
 from collections.abc import Mapping
 
 from safevar_sumo.ads.aeb import Aeb, AutowareAeb
-from safevar_sumo.ads.base import REACTION_PARAMETERS, Ads, GuardedAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads.base import (
+    REACTION_PARAMETERS as REACTION_PARAMETERS,
+    Ads as Ads,
+    GuardedAds as GuardedAds,
+    PerVehicleAds as PerVehicleAds,
+    ScalarAds as ScalarAds,
+)
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
-from safevar_sumo.ads.fmu import FmuAds
+from safevar_sumo.ads.fmu import FmuAds as FmuAds
 from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FullBraking, FuzzySafety, Rss
 
@@ -23,5 +29,3 @@ ADS: Mapping[str, type] = {
     "rss": Rss,
     "world_on_rails": WorldOnRails,
 }
-
-__all__ = ["ADS", "REACTION_PARAMETERS", "Ads", "FmuAds", "GuardedAds", "PerVehicleAds", "ScalarAds"]

@@ -1,5 +1,3 @@
 """The commands: parse, call, print; one module for each kind of command, loaded when one of its commands is called."""
 
-from safevar_sumo.cli.program import main
-
-__all__ = ["main"]
+from safevar_sumo.cli.program import main as main

@@ -1,18 +1,27 @@
 """Metrics by name: the safety metrics of method section 4, and metrics of comfort."""
 
-from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, guard_metric
+from safevar_sumo.metrics.base import (
+    F_DIFF as F_DIFF,
+    F_NUM_DIFF as F_NUM_DIFF,
+    F_SAFE as F_SAFE,
+    Metric as Metric,
+    MetricFacts as MetricFacts,
+    Objective as Objective,
+    Scoring as Scoring,
+    guard_metric as guard_metric,
+)
 from safevar_sumo.metrics.measures import (
     AVE_DECE,
     BRAKE_HARSHNESS,
     MAX_JERK,
-    RATING_POINTS,
+    RATING_POINTS as RATING_POINTS,
     RMS_ACCELERATION,
     SAFETY_DEGREE_METRIC,
     TET,
     TIT,
-    time_to_collision,
+    time_to_collision as time_to_collision,
 )
-from safevar_sumo.metrics.unsafe import Criterion, Unsafe
+from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
 OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS)}
@@ -23,22 +32,3 @@ PUBLISHED_SCORING = Scoring(
     metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF)
 )
 """Metrics and objectives of the published study (method sections 3 and 4)."""
-
-__all__ = [
-    "F_DIFF",
-    "F_NUM_DIFF",
-    "F_SAFE",
-    "METRICS",
-    "METRIC_OF_OBJECTIVE",
-    "OPTIONAL_METRICS",
-    "PUBLISHED_SCORING",
-    "RATING_POINTS",
-    "Criterion",
-    "Metric",
-    "MetricFacts",
-    "Objective",
-    "Scoring",
-    "Unsafe",
-    "guard_metric",
-    "time_to_collision",
-]

@@ -9,16 +9,16 @@ import msgspec
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import (
-    LOCATION_DIMENSION,
-    SPEED_DIMENSION,
-    VUT,
-    GuardedScenario,
-    Lane,
-    Point,
-    PreCrash,
-    Scenario,
-    Scene,
-    World,
+    LOCATION_DIMENSION as LOCATION_DIMENSION,
+    SPEED_DIMENSION as SPEED_DIMENSION,
+    VUT as VUT,
+    GuardedScenario as GuardedScenario,
+    Lane as Lane,
+    Point as Point,
+    PreCrash as PreCrash,
+    Scenario as Scenario,
+    Scene as Scene,
+    World as World,
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
@@ -36,26 +36,6 @@ _TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encod
 _PHRASES: dict[str, str] = {name: table.pop("phrase") for name, table in _TABLES.items()}
 WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
 """Weathers by name."""
-
-__all__ = [
-    "LOCATION_DIMENSION",
-    "SCENARIOS",
-    "SPEED_DIMENSION",
-    "VUT",
-    "WEATHERS",
-    "GuardedScenario",
-    "Lane",
-    "Point",
-    "PreCrash",
-    "Scenario",
-    "Scene",
-    "World",
-    "distance_in_words",
-    "equals_clear",
-    "pre_crash_sentence",
-    "weather_in_words",
-    "weather_of",
-]
 
 
 def weather_of(choice: str | Weather, source: object) -> Weather:

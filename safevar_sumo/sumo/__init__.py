@@ -1,18 +1,12 @@
 """Simulation: many settings of a study in one SUMO process."""
 
-from safevar_sumo.sumo.batch import is_recorded, reason_for_sumo
-from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate, settings_per_batch, simulate, simulate_all_points, vehicle_remarks
-from safevar_sumo.sumo.system import assemble
-
-__all__ = [
-    "Engine",
-    "assemble",
-    "evaluate",
-    "is_recorded",
-    "reason_for_sumo",
-    "settings_per_batch",
-    "simulate",
-    "simulate_all_points",
-    "vehicle_remarks",
-]
+from safevar_sumo.sumo.batch import is_recorded as is_recorded, reason_for_sumo as reason_for_sumo
+from safevar_sumo.sumo.engine import Engine as Engine
+from safevar_sumo.sumo.matrix import (
+    evaluate as evaluate,
+    settings_per_batch as settings_per_batch,
+    simulate as simulate,
+    simulate_all_points as simulate_all_points,
+    vehicle_remarks as vehicle_remarks,
+)
+from safevar_sumo.sumo.system import assemble as assemble

@@ -9,37 +9,31 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
-from safevar_sumo.vehicles.base import LEVEL, GuardedVehicle, Sensors, Slope, SumoType, Vehicle, VehicleState, slope_of
-from safevar_sumo.vehicles.carla import Carla
-from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, guard_change
-from safevar_sumo.vehicles.fmu import FmuVehicle
+from safevar_sumo.vehicles.base import (
+    LEVEL as LEVEL,
+    GuardedVehicle as GuardedVehicle,
+    Sensors as Sensors,
+    Slope as Slope,
+    SumoType as SumoType,
+    Vehicle as Vehicle,
+    VehicleState as VehicleState,
+    slope_of as slope_of,
+)
+from safevar_sumo.vehicles.carla import Carla as Carla
+from safevar_sumo.vehicles.characteristics import (
+    CHANGES as CHANGES,
+    Change as Change,
+    Characteristic as Characteristic,
+    CharacteristicSet as CharacteristicSet,
+    guard_change as guard_change,
+)
+from safevar_sumo.vehicles.fmu import FmuVehicle as FmuVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
-from safevar_sumo.vehicles.region import FeasibleRegion, region_of
+from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {"carla": Carla, "lgsvl": Lgsvl, "sumo": SumoVehicle, "worn": WornVehicle}
 
-__all__ = [
-    "CHANGES",
-    "LEVEL",
-    "VEHICLES",
-    "Carla",
-    "Change",
-    "Characteristic",
-    "CharacteristicSet",
-    "FeasibleRegion",
-    "FmuVehicle",
-    "GuardedVehicle",
-    "Sensors",
-    "Slope",
-    "SumoType",
-    "Vehicle",
-    "VehicleState",
-    "calibration_drive",
-    "guard_change",
-    "region_of",
-    "slope_of",
-]
 
 DRY_ROAD_FRICTION, STEP = 1.0, 0.1  # -, s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables

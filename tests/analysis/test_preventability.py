@@ -160,28 +160,28 @@ def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
 
 @pytest.mark.slow
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
-    """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings
+    """Of 30 collisions, the 20 of the lowest engine speeds are the brakeless ones: those that come first when settings
     are sorted.
     """
     here = evaluator(test="CPFA", speed=30)
-    brakeless = (vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40))
-    every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(20)))
+    brakeless = (vehicle(0.1, 1 - (30 - k) / 1e6) for k in range(20))
+    every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10)))
     whole = assess_preventability(here, Evaluations.concatenate([every, every])).to_dict()
     later = whole.pop("later")
     assert whole == {
         "competent_driver": pytest.approx(1 / 3),
         "full_braking": 0,
         "nobody": pytest.approx(2 / 3),
-        "looked_at": 60,
+        "looked_at": 30,
         "interval_competent_driver": [pytest.approx(1 / 3)] * 2,
     }
     assert (later["reaction"], later["competent_driver"]) == (pytest.approx(1.15), pytest.approx(1 / 3))
-    sample = assess_preventability(here, every, max_simulations=90).to_dict()
-    assert sample["looked_at"] == 30
-    reverse = every.take(np.arange(60)[::-1])
-    assert sample == assess_preventability(here, reverse, max_simulations=90).to_dict()
-    hits = round(sample["competent_driver"] * 30)
-    expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
+    sample = assess_preventability(here, every, max_simulations=45).to_dict()
+    assert sample["looked_at"] == 15
+    reverse = every.take(np.arange(30)[::-1])
+    assert sample == assess_preventability(here, reverse, max_simulations=45).to_dict()
+    hits = round(sample["competent_driver"] * 15)
+    expected = scipy.stats.beta.ppf(0.025, hits, 16 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 15 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)
     assert expected[0] < 1 / 3 < expected[1]
 
