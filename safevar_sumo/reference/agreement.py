@@ -133,8 +133,8 @@ def measure_agreement(
             name: {"reference": study.published.get(name), "here": finite_or_none(values[0])}
             for name, values in original.metrics.items()
         },
-        precision=counts["both"] / counts["here"] if counts["here"] else None,
-        recall=counts["both"] / counts["reference"] if counts["reference"] else None,
+        precision=_share_of(counts, "here"),
+        recall=_share_of(counts, "reference"),
         collision_speed={
             "reference": _mean(-degrees[both_collide]),
             "here": _mean(evaluations.collision_speed[both_collide]),
@@ -177,6 +177,11 @@ def rank_correlation(values: FloatArray, other_values: FloatArray) -> float | No
     if len(values) < 2 or np.ptp(values) == 0 or np.ptp(other_values) == 0:
         return None
     return float(np.corrcoef(scipy.stats.rankdata(values), scipy.stats.rankdata(other_values))[0, 1])
+
+
+def _share_of(collisions: Mapping[str, int], side: str) -> float | None:
+    """Share of the collisions on a side that happen on both."""
+    return collisions["both"] / collisions[side] if collisions[side] else None
 
 
 def _mean(values: FloatArray) -> float | None:
@@ -268,12 +273,12 @@ class Totals(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def recall(self) -> float | None:
         """Share of the published collisions that collide here; None if there are none."""
-        return self.collisions["both"] / self.collisions["reference"] if self.collisions["reference"] else None
+        return _share_of(self.collisions, "reference")
 
     @property
     def precision(self) -> float | None:
         """Share of the collisions here that the published data has too; None if there are none."""
-        return self.collisions["both"] / self.collisions["here"] if self.collisions["here"] else None
+        return _share_of(self.collisions, "here")
 
 
 def shipped_totals_of(study: Study) -> dict[str, Totals]:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.changes import ANY, change_numbers, changes_of, critical_solutions
+from safevar_sumo.analysis.research_questions.changes import ANY, change_numbers, count_changes
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.reference.agreement import rank_correlation
@@ -81,7 +81,7 @@ def _tabulate_change_numbers(cases: Sequence[Case]) -> pd.DataFrame:
     rows: list[JsonObject] = []
     for case in cases:
         try:
-            counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
+            counts = count_changes(case)
         except UnanswerableError:
             continue
         shares = {j: 100 * float(np.mean(counts == j)) if len(counts) else None for j in change_numbers(case)}

@@ -112,11 +112,16 @@ def variation_mistakes(
     yield from _correlation_mistakes(source, list(rows), correlations)
 
 
+def stated_values(distribution: Distribution) -> dict[str, float]:
+    """The parameters of a distribution that a study states."""
+    return {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
+
+
 def _distribution_mistakes(
     source: object, key: str, row: CharacteristicTable, distribution: Distribution
 ) -> Iterator[InputError]:
     unit = unit_text(row.unit)
-    stated = {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
+    stated = stated_values(distribution)
     lower, upper = stated.get("lower", row.lower), stated.get("upper", row.upper)
     mode = stated.get("mode", row.original)
     for field, value in stated.items():

@@ -12,6 +12,7 @@ from itertools import permutations, product
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from safevar_sumo.ads import REACTION_PARAMETERS
@@ -58,6 +59,11 @@ def change_numbers(case: Case) -> list[str]:
     return [str(j) for j in range(1, len(case.characteristics) + 1)]
 
 
+def count_changes(case: Case) -> npt.NDArray[np.str_]:
+    """The number j of changed characteristics of each critical solution, "1".."n"."""
+    return np.asarray(np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str))
+
+
 def _means_by_change_count(
     case: Case, labels: Sequence[str], name: str, values: Iterable[tuple[tuple[str, ...], FloatArray]]
 ) -> pd.DataFrame:
@@ -65,7 +71,7 @@ def _means_by_change_count(
 
     Columns setting, the `labels` of the keys, j ("1".."n", "any"), `name`, n.
     """
-    change_counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
+    change_counts = count_changes(case)
     rows = list[tuple[str | float, ...]]()
     for (key, column), j in product(values, (*change_numbers(case), ANY)):
         sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
@@ -78,8 +84,7 @@ def rq31(case: Case) -> pd.DataFrame:
     count.
     """
     solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
-    change_counts = np.count_nonzero(changes_of(case, solutions), axis=1).astype(str)
-    counts = solutions.groupby([solutions["run"], change_counts]).size()
+    counts = solutions.groupby([solutions["run"], count_changes(case)]).size()
     index = pd.MultiIndex.from_product([runs, change_numbers(case)], names=["run", "j"])
     frame = counts.reindex(index, fill_value=0).reset_index(name="count")
     frame.insert(0, "setting", case.name)

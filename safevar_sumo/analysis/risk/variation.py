@@ -10,7 +10,6 @@ from functools import partial
 from itertools import permutations
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import pandas as pd
 import scipy
@@ -21,7 +20,15 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.study.characteristics import Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
+from safevar_sumo.study.characteristics import (
+    Distribution,
+    Fixed,
+    Lognormal,
+    Normal,
+    Triangular,
+    Uniform,
+    stated_values,
+)
 from safevar_sumo.vehicles import Characteristic, FeasibleRegion, region_of
 from safevar_sumo.vehicles.region import REJECTIONS
 
@@ -86,7 +93,7 @@ def _quantile_function(
 ) -> Callable[[FloatArray], FloatArray]:
     """Turns probabilities into values in the characteristic's unit."""
     low, high, original = characteristic.lower, characteristic.upper, characteristic.original
-    stated = {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
+    stated = stated_values(distribution)
     match distribution:
         case Fixed():
             return lambda p: np.full_like(p, stated.get("value", original))
