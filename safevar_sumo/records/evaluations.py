@@ -12,6 +12,8 @@ import numpy.typing as npt
 from safevar_sumo.records.driving import BoolArray, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE
 
+COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
+"""The arrays of `Evaluations` that all evaluations have, with one row for each setting."""
 Results = Mapping[str, npt.NDArray[np.generic]]
 """Results by name, one element for each setting."""
 ROUNDING = 1e-9
@@ -108,12 +110,8 @@ class Evaluations:
         """The evaluations of `rows`, in that order."""
         return replace(
             self,
-            settings=self.settings[rows],
-            outcome=self.outcome[rows],
-            collision_speed=self.collision_speed[rows],
+            **{name: getattr(self, name)[rows] for name in COLUMNS},
             metrics={name: values[rows] for name, values in self.metrics.items()},
-            f_diff=self.f_diff[rows],
-            f_num_diff=self.f_num_diff[rows],
             cells=None if self.cells is None else self.cells.of(rows),
             worst_points=None if self.worst_points is None else self.worst_points[rows],
         )
@@ -137,25 +135,17 @@ class Evaluations:
 
         There are `cells` only if all batches have them; the worst point of a batch without `worst_points` is the first.
         """
-
-        def join(name: str) -> np.ndarray:
-            return np.concatenate([getattr(batch, name) for batch in batches])
-
         cells = [batch.cells for batch in batches if batch.cells is not None]
         points = [
             np.zeros(len(batch), dtype=np.intp) if batch.worst_points is None else batch.worst_points
             for batch in batches
         ]
         return cls(
-            settings=join("settings"),
-            outcome=join("outcome"),
-            collision_speed=join("collision_speed"),
+            **{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS},
             metrics={
                 name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
                 for name in dict.fromkeys(name for batch in batches for name in batch.metrics)
             },
-            f_diff=join("f_diff"),
-            f_num_diff=join("f_num_diff"),
             reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
             files={name: digest for batch in batches for name, digest in batch.files.items()},
             worst_points=None if all(batch.worst_points is None for batch in batches) else np.concatenate(points),
