@@ -179,6 +179,7 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
         return CommandTarget(study_in(_load_subject(source)), source)
     case = load_results_or_study(source, results_only=True)
     assert not isinstance(case, Study)
+    case.require_solutions()
     handle = (
         choose_handle(case.solutions, case.unsafe, str(choice), source)
         if solution is None

@@ -241,7 +241,7 @@ def _parse(data: bytes, path: Path) -> tuple[list[JsonObject], int]:
         end += len(text)
     is_journal = "format" in lines[0] if lines else data.strip(b"\0")[:9] in b'{"format"'
     if not is_journal:
-        raise InputError(path, "is no journal", "another `out`")
+        raise InputError(path, "is no journal", "a file that the command `study` has written, or another directory")
     return lines, end
 
 

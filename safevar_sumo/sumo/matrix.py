@@ -235,10 +235,9 @@ def system_at_point(system: System, name: str, source: object) -> System:
 def _find_point(system: System, name: str, source: object) -> Point:
     points = {point.name: point for point in system.matrix}
     if name not in points:
-        similar = (
-            f"one of {len(points)} points, such as {'; '.join(get_close_matches(name, points, N_SIMILAR_POINTS, 0))}"
-        )
-        raise InputError(source, repr(name), similar if points else "a study with a matrix")
+        similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)
+        legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
+        raise InputError(source, repr(name), legal if points else "a study with a matrix")
     return points[name]
 
 

@@ -232,3 +232,10 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
         path.write_bytes(path.read_bytes()[:-20])
     refused("tables", "part", message=("no finished run",))
     refused("figures", "part", "--out", "pictures", message=("no finished run",))
+    assert "no finished run" in run("simulate", "part", "--fewest", expect=2).stderr
+    for path in Path("part/runs").glob("nsga2-*"):
+        path.unlink()
+    answer = run("explain", "part", "--jobs", "1")
+    assert "0 of 0 different vehicles are unsafe" in answer.stdout
+    assert "nan %" not in answer.stdout
+    assert "warning" not in answer.stderr

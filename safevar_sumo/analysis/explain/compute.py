@@ -80,7 +80,7 @@ def explain_failures(
     distinct = count_distinct_causes(characteristics, sample_causes)
     if not options.solutions:
         reasons = _add_distinct_causes(found, sample, reasons, causes, distinct["cause"], options.top)
-    models = evaluator.for_sets(options.fits if statistics else 0)
+    models = evaluator.for_sets(options.fits if statistics and len(found.evaluations) else 0)
     preventability = assess_preventability(evaluator, _collisions(study, found.evaluations))
     necessity = necessity_frame(
         characteristics, characteristics.changed(settings[sample]), sample_causes, len(found.rows)

@@ -120,7 +120,7 @@ def find_subject(name: str, study: str | None = None) -> Subject:
     if member.guard:
         kind, folder = _kind_of(member.target), Path(member.guard.folder).absolute()
     elif not shipped_kind and not name.endswith(".fmu"):
-        names = [*study_names(), *METRIC_OF_OBJECTIVE, *(member for each in KINDS.values() for member in each.members)]
+        names = {*study_names(), *METRIC_OF_OBJECTIVE, *(member for each in KINDS.values() for member in each.members)}
         otherwise = ", package.module:Name, or the path of a study file"
         raise unknown_name("check", f"there is nothing called {name!r}", name, names, otherwise)
     candidates: Iterable[Study] = map(load_study, study_names())
