@@ -16,8 +16,10 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.analysis.repair import attack, compute, smallest
+from safevar_sumo.analysis.repair.answer import write_repair
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.benign import benign_points
+from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
@@ -215,7 +217,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
 
 
 def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_searched(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Without attacks and fresh wear: of the worst brakes promised, those in between and the best."""
     monkeypatch.setattr(compute, "SOBOL_VEHICLES", 3)
@@ -225,6 +227,11 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_sea
     assert kept.worst_today == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     assert f"has a safety degree of {kept.worst_today:.2f} m, and 5 fresh worn cars, 0 unsafe" in kept.verdict
     assert "  not searched       no simulation reads colour" in list(replace(kept, unread=("colour",)).sentences())
+    name = kept.parameters[0].name
+    changed: Any = SimpleNamespace(values={name: kept.parameters[0].today})
+    write_repair(tmp_path / "it.toml", replace(kept, repairs=(changed,)))
+    assert (tmp_path / "it.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# The driving system of today")
+    assert sv.load_study(tmp_path / "it.toml").ads.parameters[name] == kept.parameters[0].today
 
 
 @pytest.mark.parametrize(
