@@ -22,6 +22,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
+from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.cli.program import commands
 from safevar_sumo.report import input as report_input
 from safevar_sumo.results.manifest import (
@@ -57,7 +58,8 @@ def blocks(page: str) -> list[Block]:
     "page",
     [pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.slow]) for page in PAGES if blocks(page)],
 )
-def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path) -> None:
+def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scans, "SCAN_VALUES", 21)  # coarse limits, to save time
     names: dict[str, Any] = {}
     for block in blocks(page):
         if block.title:
