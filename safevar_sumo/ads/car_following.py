@@ -4,7 +4,6 @@ them.
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from typing import Annotated
 
@@ -114,7 +113,7 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """dv/dt [m/s^2]."""
         speed_ratio = speed / self.cruise_speed
-        closing_term = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
+        closing_term = speed * (speed - leader_speed) / (2 * np.sqrt(self.acceleration * self.deceleration))
         desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
         positive_gap = np.maximum(gap, LEAST_GAP)
         free_road = 1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio

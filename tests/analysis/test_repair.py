@@ -14,13 +14,13 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
-from safevar_sumo.ads.varied import CHANGEABLE
+from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.analysis.repair import attack, compute, smallest
 from safevar_sumo.analysis.repair.answer import write_repair
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.shipped import STUDY_SCHEMA
-from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
 
@@ -266,6 +266,25 @@ def test_every_changeable_parameter_is_a_number_of_its_driving_system() -> None:
     for ads, table in CHANGEABLE.items():
         assert set(table) <= set(ADS[ads].__struct_fields__)
         assert all(row.lower < row.upper and row.unit and row.meaning for row in table.values())
+
+
+@pytest.mark.parametrize("model", CHANGEABLE)
+def test_one_driving_system_drives_vehicles_with_different_parameters(model: str) -> None:
+    shipped = {"world_on_rails": "sun", "apollo": "lgsvl"}
+    parameters = sv.load_study(shipped[model]).ads.parameters if model in shipped else {}
+    study = sv.load_study("wear", ads={"model": model, "parameters": parameters})
+    names, system = tuple(CHANGEABLE[model]), replace(assemble(study), matrix=assemble(study).points[-1:])
+    ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
+    values = (
+        np.clip(np.random.default_rng(1).random((5, len(names))), 0.02, 0.98) @ np.diag(np.diff(ends)[:, 0])
+        + ends[:, 0]
+    )
+    settings = np.tile(system.characteristics.original, (len(values), 1))
+    together = evaluate(replace(system, ads=VariedAds(system.ads, names, values)), settings)
+    for row, one in enumerate(values):
+        ads = ADS[model](**{**parameters, **dict(zip(names, one.tolist(), strict=True))})
+        alone = evaluate(replace(system, ads=ads), settings[:1])
+        assert not list(differences(together.take([row]).results, alone.results)), dict(zip(names, one, strict=True))
 
 
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
