@@ -1,0 +1,77 @@
+"""Every shipped driving system under the same wear: how far each part may wear, alone and together, and the repair.
+
+`python docs/systems.py` prints the two tables of the page on repair, in Markdown. A system has the parameters of a
+shipped study that it drives in, or else its defaults; its repair has to survive `PROMISE`.
+"""
+
+from __future__ import annotations
+
+import time
+
+import safevar_sumo as sv
+from safevar_sumo.ads import ADS
+from safevar_sumo.ads.varied import CHANGEABLE
+
+STUDIES = {"aeb": "wear", "apollo": "lgsvl", "autoware_aeb": "autoware_july", "world_on_rails": "sun"}
+"""Studies with the parameters of driving systems."""
+PROMISE = "treadDepth >= 2", "brakeTorque >= 0.8"
+
+
+def limits_of(study: sv.Study) -> dict[str, str]:
+    """The limit of each part alone, how far all may wear together, and the safety degree of the new car."""
+    new = sv.simulate(study)
+    degree = new.metrics["safety_degree"]
+    if degree < 0:
+        return {"new": f"collides at {-degree:.1f} m/s"}
+    row = {"new": f"keeps {degree:.2f} m"}
+    answer = sv.tolerance(study, unsafe="collision", fits=0)
+    for one in answer.to_frame().itertuples():
+        end = one.safe_from if one.safe_from > one.lower else one.safe_to
+        is_limited = one.lower < one.safe_from or one.safe_to < one.upper
+        row[f"{one.characteristic} [{one.unit}]"] = f"{end:.4g}" if is_limited else "any"
+    return row | {"all together": f"{answer.joint.factor:.0%} of the way"}
+
+
+def repair_of(study: sv.Study) -> tuple[str, str, str]:
+    """The smallest repair, how much earlier it brakes on a new car, and needless braking before and after."""
+    answer = sv.repair(study, promise=PROMISE)
+    if not answer.repairs:
+        return ("none is needed" if answer.proof_of_today else "none"), "-", "-"
+    first = answer.repairs[0]
+    changes = ", ".join(
+        f"{one.name} {one.today:.4g} -> {first.values[one.name]:.4g}"
+        for one in answer.parameters
+        if one.name in first.values
+    )
+    worst, needless = first.price.worst, first.price.needless
+    scenes = f"{needless[2]} -> {needless[1]} of {needless[0]}" if needless else "unknown"
+    return changes, "-" if worst is None else f"{worst:.2f} m", scenes
+
+
+def main() -> None:
+    """Print both tables, row by row."""
+    begin, studies = time.perf_counter(), dict[str, sv.Study]()
+    for name in ADS:
+        parameters = sv.load_study(STUDIES[name]).ads.parameters if name in STUDIES else {}
+        studies[name] = sv.load_study("wear", ads={"model": name, "parameters": parameters})
+    limits = {name: limits_of(study) for name, study in studies.items()}
+    heads = max((list(row) for row in limits.values()), key=len)
+    print_row("driving system", *heads)
+    print_row(*["---"] * (1 + len(heads)))
+    for name, row in limits.items():
+        print_row(f"`{name}`", *(row.get(head, "-") for head in heads))
+    print()
+    print_row("driving system", "smallest repair", "brakes earlier, at most", "brakes needlessly")
+    print_row(*["---"] * 4)
+    for name, study in studies.items():
+        if name in CHANGEABLE:
+            print_row(f"`{name}`", *repair_of(study))
+    print(f"\n{(time.perf_counter() - begin) / 60:.0f} minutes")
+
+
+def print_row(*cells: str) -> None:
+    print("|", " | ".join(cells), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
