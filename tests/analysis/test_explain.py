@@ -131,7 +131,7 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
 
 
 def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
-    done = CliRunner().invoke(commands, ["explain", str(slippery), "--unsafe", "below=-9", "--jobs", "1", "--json"])
+    done = CliRunner().invoke(commands, ["explain", str(slippery), "--unsafe", "below=-9", "--fits", "0", "--json"])
     (only,) = json.loads(done.stdout)
     assert (done.exit_code, only["summary"]["necessary"], only["summary"]["changed"]) == (0, {}, {})
 
