@@ -21,7 +21,7 @@ ATTACKS = 3
 """Runs of the search, each with a seed of its own, that must find nothing."""
 RANDOM_ATTACKS = 1024
 """Random vehicles that attack first, with the counterexamples: they find failures far from the worst."""
-GENERATIONS, PARENTS, CHILDREN, STEP = 10, 32, 512, 0.1
+GENERATIONS, PARENTS, CHILDREN, STEP = 8, 32, 512, 0.1
 """Generations of an attack near the worst vehicles, which become parents; simulations of children in each; step of a
 characteristic, as a share of the way to a random value.
 """

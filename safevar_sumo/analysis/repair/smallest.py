@@ -27,13 +27,13 @@ THINNING = 16
 """Factor by which an ADS has fewer sets that needs an own instance for each."""
 CHUNK, BATCH = 512, 2048
 """Candidates of a subset that are tried at a time, the smallest changes first; candidates times vehicles of a batch."""
-MAX_BOXES, LEAST_GAIN = 12, 0.004
+MAX_BOXES, LEAST_GAIN = 12, 0.006
 """Boxes that are searched in turn, each smaller than the smallest change so far by the least gain that counts."""
 EARLIER_BOX = 0.05
 """A change that failed is sought again in a box that is larger by this share of the ranges."""
 FIRST_VEHICLES, WORST_VEHICLES = 16, 80
-"""Vehicles with which a candidate is tried first, then with four times as many, and so on; and those that it survives
-before it counts as the smallest change. The result is tried with all.
+"""Vehicles with which a candidate is tried first, at least, then with four times as many, and so on; and those that it
+survives before it counts as the smallest change. The result is tried with all.
 """
 GENERATIONS = 60
 """Generations of CMA-ES."""
@@ -143,7 +143,8 @@ class Search:
         first `most`.
         """
         first: list[Failure | None] = [None] * len(shares)
-        start, size, alive = 0, FIRST_VEHICLES, np.arange(len(shares))
+        start, alive = 0, np.arange(len(shares))
+        size = max(FIRST_VEHICLES, CHUNK // max(len(shares) * len(self.seen), 1))
         while start < len(self.vehicles[:most]) and len(alive):
             vehicles = self.vehicles[start : start + size]
             degrees, points = self.problem.degrees(shares[alive], vehicles, "candidates with all vehicles", self.seen)
