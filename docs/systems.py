@@ -37,15 +37,9 @@ def repair_of(study: sv.Study) -> tuple[str, str, str]:
     answer = sv.repair(study, promise=PROMISE)
     if not answer.repairs:
         return ("none is needed" if answer.proof_of_today else "none"), "-", "-"
-    first = answer.repairs[0]
-    changes = ", ".join(
-        f"{one.name} {one.today:.4g} -> {first.values[one.name]:.4g}"
-        for one in answer.parameters
-        if one.name in first.values
-    )
-    worst, needless = first.price.worst, first.price.needless
+    first, needless = answer.to_frame().iloc[0], answer.repairs[0].price.needless
     scenes = f"{needless[2]} -> {needless[1]} of {needless[0]}" if needless else "unknown"
-    return changes, "-" if worst is None else f"{worst:.2f} m", scenes
+    return first["parameters"], f"{first['metres_earlier_worst']:.2f} m", scenes
 
 
 def main() -> None:

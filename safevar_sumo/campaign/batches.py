@@ -18,11 +18,9 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, assemble, is_recorded, settings_per_batch
 
 BATCHES_PER_CALL_AND_WORKER = 4
-"""Largest number of batches per worker: with several small batches, no worker waits long for another."""
-ECONOMICAL_BATCH, SMALLEST_BATCH = 1 / 4, 1 / 10
-"""Sizes of batches, as shares of the largest: that of which a worker may get several, as steps cost more than the
-vehicles of a smaller one; and the smallest, which takes as long as one that is smaller still.
-"""
+"""Number of batches per worker: with several small batches, no worker waits long for another."""
+SMALLEST_BATCH = 1 / 20
+"""Smallest batch, as a share of the most economical one: a smaller batch takes as long."""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
 """Results of `choose_batch_size`, by packed study."""
 _verified_counts: dict[bytes, int] = {}
@@ -60,9 +58,9 @@ def evaluate_all(
     if work not in _batch_sizes:
         _batch_sizes[work] = choose_batch_size(study, selection)
     best_size, is_recorded = _batch_sizes[work]
-    number = len(distinct_settings)
-    per_worker = min(number / (ECONOMICAL_BATCH * best_size * pool.workers), BATCHES_PER_CALL_AND_WORKER)
-    share = number / (max(int(per_worker), 1) * pool.workers)
+    # Of a selection, calls are many and short: then steps cost more than the vehicles of a small batch.
+    per_worker = BATCHES_PER_CALL_AND_WORKER if selection == EVERYTHING else 1
+    share = len(distinct_settings) / (per_worker * pool.workers)
     size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
     batches = [Batch(work, distinct_settings[start : start + size]) for start in range(0, len(distinct_settings), size)]
     sample_size = max(min(verified - _verified_counts.get(work, 0), len(distinct_settings)), 0)
