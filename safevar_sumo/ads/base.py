@@ -202,8 +202,8 @@ class Trim(NamedTuple):
 def trim_at(nominal: Nominal, seen: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle."""
     is_rolling = seen.speed > 0
-    throttle = np.where(is_rolling, seen.throttle - _throttle_for(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
-    (coasting,) = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting)
+    coasting, full_throttle = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
+    throttle = np.where(is_rolling, seen.throttle - coasting / (full_throttle + coasting), 0.0)
     return Trim(throttle, np.where(is_rolling & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
 
 
@@ -214,16 +214,11 @@ def cruise_at(nominal: Nominal, seen: Observation, speed: float | None) -> tuple
 
 def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a trim."""
-    (coasting,) = interpolate_tables(nominal.speeds, speed, nominal.coasting)
+    coasting, full_throttle = interpolate_tables(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
     brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
-    throttle = np.minimum(np.maximum(_throttle_for(nominal, speed, acceleration) + pedal_trim.throttle, 0.0), 1.0)
-    return Command(np.where(excess < 0, 0.0, throttle), brake)
-
-
-def _throttle_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray) -> FloatArray:
-    coasting, full_throttle = interpolate_tables(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
-    return (acceleration + coasting) / (full_throttle + coasting)
+    throttle = (acceleration + coasting) / (full_throttle + coasting) + pedal_trim.throttle
+    return Command(np.where(excess < 0, 0.0, np.minimum(np.maximum(throttle, 0.0), 1.0)), brake)
 
 
 LEAST_CLOSING_SPEED = 0.1

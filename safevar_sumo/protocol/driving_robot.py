@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, Command, FloatArray
+from safevar_sumo.records import BoolArray, Command
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
@@ -64,6 +64,7 @@ class DrivingRobot:
         """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN
         without a test.
         """
+        self._error_share = np.zeros(n)  # the error divided by the tolerance in its direction [-]
 
     def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
         """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while
@@ -74,7 +75,10 @@ class DrivingRobot:
         if not self._is_needed:
             return command, state
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
-        self.error = np.where(is_open & (_tolerance_share(error) > _tolerance_share(self.error)), error, self.error)
+        share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
+        is_larger = is_open & (share > self._error_share)
+        np.copyto(self.error, error, where=is_larger)
+        np.copyto(self._error_share, share, where=is_larger)
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
@@ -95,9 +99,4 @@ class DrivingRobot:
     @property
     def invalid(self) -> BoolArray:
         """Which vehicles left the tolerance before the system acted; shape (N,)."""
-        return self.has_test_speed & (_tolerance_share(self.error) > 1)
-
-
-def _tolerance_share(error: FloatArray) -> FloatArray:
-    """A speed error divided by the tolerance in the error's direction [-]; 0 without a test."""
-    return np.nan_to_num(np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR))
+        return self._error_share > 1

@@ -53,7 +53,7 @@ class RecordedWorld:
         self._lane_position = np.repeat([recording.start for recording in recordings], size)
         self._lanes, self._is_frozen = self._vut.way.at(self._lane_number), np.zeros(self.n, dtype=bool)
         self._fronts: FloatArray | None = None
-        self._struck_bodies: dict[int, Body] = {}
+        self._struck: dict[int, int] = {}
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
         self._last_coordinates = self._last_fronts @ self._vut.along
         self._motion, self._sizes = _joined_tracks(recordings)
@@ -110,24 +110,23 @@ class RecordedWorld:
         SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
         moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
         """
-        self._struck_bodies, collision_speeds = {}, dict[int, float]()
+        self._struck = {}
         scenes, actors = self._adjacent_pairs(is_open).T
         if not len(scenes):
-            return collision_speeds
+            return {}
         motion, (length, width, is_person) = self._motion[self.sample, scenes, actors], self._sizes[scenes, actors].T
-        others = Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
+        others = self._others = Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
         is_open = is_open.reshape(-1, self._size)[scenes]
         checks = (
             (self._last_fronts, self._last_speeds, is_open & (is_person != 0)[:, np.newaxis]),
             (self.vehicle_positions(VUT), self._speeds, is_open),
         )
         hits = [self._overlap(fronts, candidates, scenes, others, is_person) for fronts, _, candidates in checks]
-        for body, check, vehicle_in_scene in np.argwhere(np.stack(hits, axis=1)).tolist():
-            vehicle = int(scenes[body]) * self._size + vehicle_in_scene
-            if vehicle not in collision_speeds:
-                collision_speeds[vehicle] = float(checks[check][1][vehicle])
-                self._struck_bodies[vehicle] = Body._make(column[body] for column in others)
-        return dict(sorted(collision_speeds.items()))
+        bodies, numbers, vehicles_in_scene = np.argwhere(np.stack(hits, axis=1)).T
+        vehicles, first = np.unique(scenes[bodies] * self._size + vehicles_in_scene, return_index=True)
+        speeds = np.where(numbers[first] == 0, checks[0][1][vehicles], checks[1][1][vehicles])
+        self._struck = dict(zip(vehicles.tolist(), bodies[first].tolist(), strict=True))
+        return dict(zip(vehicles.tolist(), speeds.tolist(), strict=True))
 
     def _overlap(
         self, fronts: FloatArray, candidates: BoolArray, scenes: IntArray, others: Body, is_person: FloatArray
@@ -194,7 +193,7 @@ class RecordedWorld:
                 np.full(n, vut.width),
                 self._speeds[copies],
             ),
-            Body.columns([self._struck_bodies[copy] for copy in copies]),
+            Body._make(column[[self._struck[copy] for copy in copies]] for column in self._others),
         )
 
 

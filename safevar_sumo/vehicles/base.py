@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Guard, Legal, open_rows, read_only_copy
-from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, IntArray, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
@@ -58,37 +58,42 @@ LONGEST_DELAY = 3600.0
 """Longest delay [s]."""
 
 
-def start_history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
-    """A history for delays up to `longest_delay` [s], filled with the first sample, shape (..., N); the newest sample
-    comes first.
-
-    Raises
-    ------
-    InputError
-        If the delay is longer than any run.
+class DelayedSignal(NamedTuple):
+    """The last samples of a signal, newest first, shape (L, ..., N), and where each vehicle finds the two between which
+    its delay ends: numbers of the newer one, shape (..., N), and the share of the older one, shape (N,).
     """
-    if not longest_delay <= LONGEST_DELAY:
-        raise InputError("vehicle", f"one of its delays is {longest_delay:g} s", f"up to {LONGEST_DELAY:g} s")
-    length = int(longest_delay / step) + 2
-    return np.repeat(sample[np.newaxis], length, axis=0)
 
+    samples: FloatArray
+    newer: IntArray
+    share: FloatArray
 
-def extend_history(past: FloatArray, sample: FloatArray) -> FloatArray:
-    """The history with a new sample at its front and the oldest one dropped."""
-    return np.concatenate([sample[np.newaxis], past[:-1]])
+    @classmethod
+    def of(cls, sample: FloatArray, delay: FloatArray, step: float) -> DelayedSignal:
+        """A history for delays [s], shape (N,), filled with the first sample, shape (..., N).
 
+        Raises
+        ------
+        InputError
+            If a delay is longer than any run.
+        """
+        longest, age = float(np.max(delay)), delay / step
+        if not longest <= LONGEST_DELAY:
+            raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s")
+        whole_steps = np.floor(age)
+        newer = whole_steps.astype(np.intp) * sample.size + np.arange(sample.size).reshape(sample.shape)
+        return cls(np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0), newer, age - whole_steps)
 
-def delay_signal(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
-    """The signal of each vehicle i as it was `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
-    age = delay / step
-    whole_steps = np.floor(age)
-    share = age - whole_steps
-    size = past[0].size
-    index = whole_steps.astype(np.intp) * size + np.arange(size).reshape(past.shape[1:])
-    newer, older = past.take(index), past.take(index + size)
-    with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
-        signal = newer * (1 - share) + older * share
-    return np.asarray(np.where(np.isnan(signal), newer, signal))
+    def extended(self, sample: FloatArray) -> DelayedSignal:
+        """The history with a new sample at its front and the oldest one dropped."""
+        return self._replace(samples=np.concatenate([sample[np.newaxis], self.samples[:-1]]))
+
+    def delayed(self) -> FloatArray:
+        """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (..., N)."""
+        newer, older = self.samples.take(self.newer), self.samples[1:].take(self.newer)
+        with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
+            signal = newer * (1 - self.share) + older * self.share
+        np.copyto(signal, newer, where=np.isnan(signal))
+        return signal
 
 
 class Sensors(NamedTuple):
@@ -109,15 +114,15 @@ class Sensors(NamedTuple):
 
 
 def sensed_observation(
-    seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray, step: float
-) -> tuple[Observation, FloatArray]:
+    seen: Observation, past: DelayedSignal | None, latency: FloatArray, reach: FloatArray, step: float
+) -> tuple[Observation, DelayedSignal]:
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history
     for the next call.
     """
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
     sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
-    past = start_history(float(np.max(latency)), step, sample) if past is None else extend_history(past, sample)
-    gap, closing_speed, lateral, lateral_speed, obstacle_speed = delay_signal(past, latency, step)
+    past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
+    gap, closing_speed, lateral, lateral_speed, obstacle_speed = past.delayed()
     is_detected = gap <= reach * seen.visibility
     return seen._replace(
         gap=np.where(is_detected, gap, np.inf),

@@ -18,6 +18,7 @@ from safevar_sumo.vehicles.base import (
     LEVEL,
     SPEED_ROUNDING,
     Characteristics,
+    DelayedSignal,
     Sensors,
     Slope,
     SumoType,
@@ -63,7 +64,7 @@ class _State(NamedTuple):
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    seen: FloatArray | None
+    seen: DelayedSignal | None
     history: History
 
 
@@ -248,7 +249,7 @@ class FmuVehicle(Vehicle):
         return next_state
 
     def _state(
-        self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History
+        self, outputs: Mapping[str, FloatArray], command: Command, seen: DelayedSignal | None, history: History
     ) -> _State:
         n, speed = command.throttle.shape, outputs["speed"]
         values = {"gear": np.ones(n), **command._asdict(), **outputs}

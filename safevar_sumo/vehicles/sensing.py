@@ -14,16 +14,14 @@ from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import (
     LEVEL,
     Characteristics,
+    DelayedSignal,
     Positive,
     Prepared,
     Sensors,
     Slope,
     SumoType,
     Vehicle,
-    delay_signal,
-    extend_history,
     sensed_observation,
-    start_history,
 )
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
@@ -47,8 +45,8 @@ class SensingState(NamedTuple):
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    seen: FloatArray | None
-    brake_commands: FloatArray
+    seen: DelayedSignal | None
+    brake_commands: DelayedSignal
     acceleration: FloatArray
 
 
@@ -72,7 +70,7 @@ class SensingVehicle(Vehicle):
 
     def at_rest(self, prepared: Prepared) -> SensingState:
         zeros = np.zeros_like(prepared.mass)
-        commands = start_history(float(np.max(prepared.brake_delay)), prepared.step, zeros)
+        commands = DelayedSignal.of(zeros, prepared.brake_delay, prepared.step)
         return SensingState(zeros, zeros, zeros, zeros + 1, None, commands, zeros)
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
@@ -81,14 +79,13 @@ class SensingVehicle(Vehicle):
         throttle, brake = (
             np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / prepared.drive, -back / prepared.brake)
         )
-        return SensingState(
-            speed, throttle, brake, rest.gear, None, rest.brake_commands + brake, rest.acceleration + back
-        )
+        commands = DelayedSignal.of(brake, prepared.brake_delay, prepared.step)
+        return SensingState(speed, throttle, brake, rest.gear, None, commands, rest.acceleration + back)
 
     def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
         p = prepared
-        commands = extend_history(state.brake_commands, command.brake)
-        brake = delay_signal(commands, p.brake_delay, p.step)
+        commands = state.brake_commands.extended(command.brake)
+        brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
         highest_speed = np.maximum(p.max_speed, state.speed)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed)

@@ -19,7 +19,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, VEHICLES, slope_of
-from safevar_sumo.vehicles.base import delay_signal
+from safevar_sumo.vehicles.base import DelayedSignal
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from tests.vehicles.runs import (
@@ -216,9 +216,9 @@ def test_every_characteristic_is_tested_to_act(model: str) -> None:
 
 
 def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
-    past = np.array([[5.0], [np.inf], [np.inf]])  # newest first
-    assert delay_signal(past, np.array([0.0]), 0.1).tolist() == [5.0]
-    assert delay_signal(past, np.array([0.1]), 0.1).tolist() == [np.inf]
+    for delay, sensed in ((0.0, 5.0), (0.1, np.inf)):
+        unseen = DelayedSignal.of(np.array([np.inf]), np.array([delay]), 0.1)
+        assert unseen.extended(np.array([5.0])).delayed().tolist() == [sensed]
 
 
 def sensed_gaps(model: str, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, GuardedVehicle, Sensors, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.base import Characteristics, delay_signal, extend_history, start_history
+from safevar_sumo.vehicles.base import Characteristics, DelayedSignal
 from safevar_sumo.vehicles.carla import AIR_DENSITY, FRONTAL_AREA, WHEEL_MASS
 from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
@@ -171,7 +171,7 @@ class SecondState(NamedTuple):
     vehicle: Any
     original: Any
     body: MultiBodyState
-    brake_commands: FloatArray
+    brake_commands: DelayedSignal
 
 
 class SecondVehicle(Vehicle):
@@ -245,7 +245,7 @@ class SecondVehicle(Vehicle):
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SecondState:
         """The state in which the pedals hold the original vehicle's speed, which may be 0."""
         original = self._engine.at_start(prepared.original, speed)
-        commands = start_history(float(np.max(prepared.plant.brake_delay)), prepared.step, original.brake)
+        commands = DelayedSignal.of(original.brake, prepared.plant.brake_delay, prepared.step)
         vehicle, body = self._vehicle.at_start(prepared.vehicle, speed), balanced_state(prepared.plant, speed)
         return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, body, commands)
 
@@ -262,8 +262,8 @@ class SecondVehicle(Vehicle):
     def advance(self, prepared: Prepared, state: SecondState, command: Command) -> SecondState:
         plant, body, brake = prepared.plant, state.body, state.brake
         original, drive_torque = self._advance_engine(prepared, state, command.throttle)
-        commands = extend_history(state.brake_commands, command.brake)
-        demand = delay_signal(commands, plant.brake_delay, prepared.step)
+        commands = state.brake_commands.extended(command.brake)
+        demand = commands.delayed()
         step_count = math.ceil(prepared.step / LONGEST_STEP)
         step = prepared.step / step_count
         lag_share = step / (step + plant.brake_lag)
