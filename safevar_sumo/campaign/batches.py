@@ -17,10 +17,12 @@ from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, assemble, is_recorded, settings_per_batch
 
-BATCHES_PER_CALL_AND_WORKER = 4
-"""Number of batches per worker: with several small batches, no worker waits long for another."""
-SMALLEST_BATCH = 1 / 20
-"""Smallest batch, as a share of the most economical one: a smaller batch takes as long."""
+BATCHES_PER_WORKER = 4
+"""Largest number of batches per worker: with several, no worker waits long for another, and the time left is known."""
+ECONOMICAL_SHARE = 1 / 4
+"""Size of a batch, as a share of the most economical one, from which the steps of a simulation cost no more than its
+vehicles: smaller batches are one for each worker.
+"""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
 """Results of `choose_batch_size`, by packed study."""
 _verified_counts: dict[bytes, int] = {}
@@ -58,10 +60,8 @@ def evaluate_all(
     if work not in _batch_sizes:
         _batch_sizes[work] = choose_batch_size(study, selection)
     best_size, is_recorded = _batch_sizes[work]
-    # Of a selection, calls are many and short: then steps cost more than the vehicles of a small batch.
-    per_worker = BATCHES_PER_CALL_AND_WORKER if selection == EVERYTHING else 1
-    share = len(distinct_settings) / (per_worker * pool.workers)
-    size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
+    share = len(distinct_settings) / pool.workers
+    size = math.ceil(min(best_size, max(share / BATCHES_PER_WORKER, min(share, ECONOMICAL_SHARE * best_size))))
     batches = [Batch(work, distinct_settings[start : start + size]) for start in range(0, len(distinct_settings), size)]
     sample_size = max(min(verified - _verified_counts.get(work, 0), len(distinct_settings)), 0)
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)

@@ -283,11 +283,11 @@ def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
     assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
 
 
-def test_a_few_settings_in_a_long_matrix_are_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_most_of_a_largest_batch_is_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that the time left is known before the end."""
     shows: list[tuple[str, int, int]] = []
     study = load_study("euro_ncap_pedestrian")
     evaluator = Evaluator(study, InlinePool(), lambda *values: shows.append(values), verified=0)
-    evaluator.evaluate(evaluator.feasible_settings(32), "settings")
+    evaluator.evaluate(evaluator.feasible_settings(192), "settings")
     assert len(shows) == 5
-    assert shows[-1][1:] == (32, 32)
+    assert shows[-1][1:] == (192, 192)
