@@ -5,7 +5,7 @@ wear (step 5).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ import numpy as np
 from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.repair.problem import Problem, degrees_of
 from safevar_sumo.campaign.run import algorithm_of
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import Problem as SearchProblem
 
 ATTACKS = 3
@@ -31,6 +31,10 @@ MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
 PROOF_PARTS = 4
 """Parts of the fresh wear, after each of which a failure ends the proof."""
+
+
+Runs = dict[tuple[int, int], Generator[FloatArray, Evaluations, object]]
+"""Runs that ask for evaluations of vehicles, by the number of their set of parameters and their own."""
 
 
 class Proof(NamedTuple):
@@ -51,36 +55,45 @@ def attack(
     driving system could, worst first, shape (M, w). `known` are vehicles that broke other sets; `number` counts the
     attacks.
     """
-    failures = [
-        _failures_near(problem, one, known, points, np.random.default_rng((problem.study.search.seed, number, row)))
-        for row, one in enumerate(sets)
-    ]
+    shares, worn, search = np.array(sets), problem.promise.worn, problem.study.search
+    size = max(CHILDREN // max(len(points), 1), PARENTS)
+    rngs = [np.random.default_rng((search.seed, number, row)) for row in range(len(sets))]
+    near: Runs = {(row, 0): _breed(problem, known, size, rng) for row, rng in enumerate(rngs)}
+    failures = _carry_out(problem, shares, near, points)
     rest = [row for row, vehicles in enumerate(failures) if not len(vehicles)]
-    for row, vehicles in zip(rest, _search_failures(problem, [sets[row] for row in rest], points, number), strict=True):
-        failures[row] = vehicles
-    shares = np.linspace(0.0, 1.0, MAX_NEW) ** 2  # more of the worst
-    rows = [np.unique((shares * max(len(vehicles) - 1, 0)).astype(int))[: len(vehicles)] for vehicles in failures]
+    originals = problem.evaluate(shares[rest], np.tile(worn.original, (len(rest), 1)), "attack", points)
+    runs: Runs = {}
+    for place, row in enumerate(rest):
+        task = SearchProblem(
+            characteristics=worn,
+            original=originals.take([place]),
+            evaluations=search.evaluations,
+            population=search.population,
+        )
+        for seed in range(ATTACKS):
+            rng = np.random.default_rng((search.seed, number, place, seed))
+            runs[row, seed] = algorithm_of(next(iter(search.labels)), problem.study).search(task, rng)
+    found = _carry_out(problem, shares, runs, points, MAX_NEW)
+    failures = [one if len(one) else other for one, other in zip(failures, found, strict=True)]
+    ways = np.linspace(0.0, 1.0, MAX_NEW) ** 2  # more of the worst
+    rows = [np.unique((ways * max(len(vehicles) - 1, 0)).astype(int))[: len(vehicles)] for vehicles in failures]
     return [vehicles[chosen] for vehicles, chosen in zip(failures, rows, strict=True)]
 
 
-def _failures_near(
-    problem: Problem, one: FloatArray, known: FloatArray, points: Sequence[int], rng: np.random.Generator
-) -> FloatArray:
-    """The failures of a set among known and random vehicles and their offspring, worst first.
+def _breed(
+    problem: Problem, known: FloatArray, number: int, rng: np.random.Generator
+) -> Generator[FloatArray, Evaluations, None]:
+    """Attack with known and random vehicles and their offspring.
 
     A child has each characteristic of one of two parents; one in expectation is anew, or a step away.
     """
-    promise, stage, size = problem.promise, "attack near the worst", len(problem.promise.worn)
-    number = max(CHILDREN // max(len(points), 1), PARENTS)
+    promise, size = problem.promise, len(problem.promise.worn)
     children = np.concatenate([known, promise.draw(RANDOM_ATTACKS, rng)])
-    parents, worst, failures = children[:0], np.zeros(0), np.zeros((0, 1 + size))
+    parents, worst = children[:0], np.zeros(0)
     for _ in range(GENERATIONS):
-        degrees = problem.degrees(one[np.newaxis], children, stage, points)[0][0]
-        is_unsafe = degrees < problem.margin
-        is_unsafe[is_unsafe] = problem.repairable(children[is_unsafe])
-        failures = np.concatenate([failures, np.column_stack([degrees, children])[is_unsafe]])
-        is_rival = is_unsafe | (degrees >= problem.margin)
-        worst, parents = np.append(worst, degrees[is_rival]), np.concatenate([parents, children[is_rival]])
+        evaluations = yield children
+        feasible = evaluations.take(~evaluations.infeasible)
+        worst, parents = np.append(worst, degrees_of(feasible)), np.concatenate([parents, feasible.settings])
         order = np.argsort(worst, kind="stable")[:PARENTS]
         worst, parents = worst[order], parents[order]
         pairs = parents[rng.integers(len(parents), size=(2, number))]
@@ -88,36 +101,18 @@ def _failures_near(
         fresh = promise.at(rng.random((number, size)))
         draw = rng.random((number, size)) * size
         children = np.select([draw < 0.5, draw < 1.0], [fresh, children + STEP * (fresh - children)], children)
-        children = promise.region.repaired(promise.settings(children), filtered=False)[:, promise.columns]
-    return np.unique(failures, axis=0)[:, 1:]
 
 
-def _search_failures(
-    problem: Problem, sets: Sequence[FloatArray], points: Sequence[int], number: int
+def _carry_out(
+    problem: Problem, shares: FloatArray, runs: Runs, points: Sequence[int], enough: int | None = None
 ) -> list[FloatArray]:
-    """The failures of each set that runs of the search find, worst first."""
-    if not sets:
-        return []
-    shares, worn, search = np.array(sets), problem.promise.worn, problem.study.search
-    label = next(iter(search.labels))
-    originals = problem.evaluate(shares, np.tile(worn.original, (len(shares), 1)), "attack", points)
-    runs = {}
-    for owner in range(len(shares)):
-        task = SearchProblem(
-            characteristics=worn,
-            original=originals.take([owner]),
-            evaluations=search.evaluations,
-            population=search.population,
-        )
-        for seed in range(ATTACKS):
-            rng = np.random.default_rng((search.seed, number, owner, seed))
-            runs[owner, seed] = algorithm_of(label, problem.study).search(task, rng)
-    found = [np.zeros((0, 1 + len(worn))) for _ in sets]  # safety degree and vehicle
+    """The failures of each set that runs find, worst first; a set's runs end when they have found `enough`."""
+    found = [np.zeros((0, 1 + len(problem.promise.worn))) for _ in shares]  # safety degree and vehicle
     answers: dict[tuple[int, int], Evaluations | None] = dict.fromkeys(runs)
     while answers:
         wanted = dict[tuple[int, int], FloatArray]()
         for key, answer in answers.items():
-            if len(found[key[0]]) < MAX_NEW:
+            if enough is None or len(found[key[0]]) < enough:
                 with suppress(StopIteration):
                     wanted[key] = next(runs[key]) if answer is None else runs[key].send(answer)
         answers = dict(zip(wanted, _judge(problem, shares, wanted, found, points), strict=True))
@@ -131,7 +126,9 @@ def _judge(
     found: list[FloatArray],
     points: Sequence[int],
 ) -> list[Evaluations]:
-    """Evaluate the vehicles that searches want, and note their failures that a driving system could avoid."""
+    """Evaluate the vehicles that runs want, and note their failures that a driving system could avoid; a vehicle that
+    none could keep safe is no feasible attack.
+    """
     if not wanted:
         return []
     promise, owners = problem.promise, [owner for owner, _ in wanted]
@@ -141,7 +138,9 @@ def _judge(
     evaluations = problem.evaluate(shares[owner_of], vehicles, "attack", points)
     degrees = degrees_of(evaluations)
     failing = np.flatnonzero(degrees < problem.margin)
-    failing = failing[problem.repairable(vehicles[failing])]
+    is_able = problem.repairable(vehicles[failing])
+    evaluations.outcome[failing[~is_able]] = Outcome.INFEASIBLE.value
+    failing = failing[is_able]
     for owner in set(owners):
         own = failing[owner_of[failing] == owner]
         found[owner] = np.unique(np.concatenate([found[owner], np.column_stack([degrees[own], vehicles[own]])]), axis=0)
