@@ -1,6 +1,5 @@
-"""What users type: a study or results and their solutions, output files, changes of characteristics, with its
-completion in the shell; and gates (`--fail-if "KEY > X"`), which end a command with exit code 3 if this holds for a
-number of its JSON.
+"""What users type: a study or results and their solutions, output files, changes of characteristics; the completion of
+these in the shell; and the conditions on the answer (`--fail-if "KEY > X"`) that end a command with exit code 3.
 """
 
 from __future__ import annotations
@@ -295,14 +294,14 @@ def _load_subject(source: str, point: str | None = None, *, results_only: bool =
 
 GATE_EXIT_CODE = 3
 FAILURES_KEY = "safevar_sumo.failures"
-"""Key of the sentences in a command's context that end it with this exit code."""
+"""Key, in a command's context, of the reasons for this exit code."""
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
     ">=": operator.ge,
 }
-FORM = re.compile(r"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*([^\s<>=]+)\s*")
+CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
 
 
 class Condition(NamedTuple):
@@ -314,8 +313,8 @@ class Condition(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Condition:
-        match = FORM.fullmatch(text)
-        if match is None or not math.isfinite(limit := _number(match[3])):
+        match = CONDITION.fullmatch(text)
+        if match is None or not math.isfinite(limit := float(match[3])):
             expected = '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"'
             raise InputError("--fail-if", repr(text), expected)
         return cls(match[1], match[2], limit)
@@ -330,13 +329,6 @@ class Condition(NamedTuple):
                 raise InputError("--fail-if", f"{self.key} is no number", "the key of a number of the command's JSON")
             if value is not None and OPERATORS[self.operator](value, self.limit):
                 yield f"{self.key} = {value:g} {self.operator} {self.limit:g}"
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:

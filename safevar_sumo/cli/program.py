@@ -141,7 +141,8 @@ def commands() -> None:
 def main() -> None:
     """Run the program.
 
-    Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`) or 130 (interrupted).
+    Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a limit is not kept) or
+    130 (interrupted).
     """
     warnings.showwarning = lambda message, *_, **__: print_warning(message)  # without its file and line
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file

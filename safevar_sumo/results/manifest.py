@@ -145,7 +145,7 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     Parameters
     ----------
     identity
-        Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.evaluation.identity_of`.
+        Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.identity.identity_of`.
     """
     return {
         "format": FORMAT,

@@ -57,7 +57,7 @@ class ResultsDirectory:
     study
         The study as it is run.
     identity
-        Inputs of the study's results besides the study file; see `safevar_sumo.campaign.evaluation.identity_of`.
+        Inputs of the study's results besides the study file; see `safevar_sumo.campaign.identity.identity_of`.
     scoring
         Metrics and objectives.
 
@@ -78,7 +78,7 @@ class ResultsDirectory:
         self._refuse_another_study()
         self.inputs: JsonObject = {layer: self.manifest.get(layer, {}) for layer in LAYERS_OF_FILES}
         """Digests, by layer, of the files that all workers must share."""
-        self.inputs["sources"] = {**self.inputs["sources"], **_later_files(path, study)}
+        self.inputs["sources"] = self.inputs["sources"] | _later_files(path, study)
 
     @property
     def digest(self) -> str:
@@ -87,10 +87,8 @@ class ResultsDirectory:
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
-        path, head = (
-            journal_file(self.path, run),
-            journal_head(self.digest, run, [*self._study.vehicle.characteristics]),
-        )
+        path = journal_file(self.path, run)
+        head = journal_head(self.digest, run, self._study.vehicle.characteristics)
         try:
             return Journal(path, head)
         except JournalBusyError:
@@ -135,10 +133,8 @@ def input_differences(
     later_now = {name: digest for name in later if (digest := digest_of(file_by_name(name, study.origin.places)))}
     return list(
         differences(
-            *(
-                {**manifest, "sources": {**files, **manifest.get("sources", {})}}
-                for manifest, files in ((stored, later), (now, later_now))
-            )
+            {**stored, "sources": later | stored.get("sources", {})},
+            {**now, "sources": later_now | now.get("sources", {})},
         )
     )
 

@@ -1,4 +1,4 @@
-"""Simulation: many settings of a study in one SUMO process."""
+"""Simulation of many settings of a study at once, in recorded scenes or in SUMO."""
 
 from safevar_sumo.sumo.batch import is_recorded as is_recorded, reason_for_sumo as reason_for_sumo
 from safevar_sumo.sumo.engine import Engine as Engine

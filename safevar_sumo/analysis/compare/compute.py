@@ -158,7 +158,8 @@ def _criterion(
 ) -> Unsafe:
     """The stated criterion, or the default of all vehicles of both systems, with the limit of the first original."""
     if text is not None:
-        return next(iter([one.parse_criterion(text) for one in evaluators]))
+        unsafe, _ = (one.parse_criterion(text) for one in evaluators)  # both systems must be able to use it
+        return unsafe
     original = originals[0]
     if not all(is_rated(one.study) for one in evaluators):
         metrics = {name: values for name, values in original.metrics.items() if name != RATING_POINTS.name}
