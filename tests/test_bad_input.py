@@ -99,6 +99,7 @@ TYPED = [
     ("repair wear --promise all --margin -1", "0<=x<=100"),
     ("repair wear --promise all --curve tread", "did you mean 'treadDepth'?"),
     ("repair wear --promise all --out folder.png", "--out"),
+    ("repair base.toml --promise all --out base.toml", "--out: base.toml is an input of the command"),
     ("repair euro_ncap_rating --promise all", "is rated"),
     ("repair native --promise all --change headway", "no parameter 'headway'"),
     ("risk sun --confidence nan", "below 1"),

@@ -46,6 +46,13 @@ def check_output(path: Path | None, flag: str, endings: tuple[str, ...] = PICTUR
     check_writable(path, flag)
 
 
+def check_study_output(path: Path | None, flag: str, studies: Sequence[Study]) -> None:
+    """Refuse an output file that is no study file, cannot be written, or is a file of one of the studies."""
+    check_output(path, flag, (".toml",))
+    if path is not None and path.exists() and any(path.samefile(file) for one in studies for file in one.origin.files):
+        raise InputError(flag, f"{path} is an input of the command", "another file")
+
+
 NUMBER_PATTERN = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 SIGNED_NUMBER = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
 PERCENTAGE = re.compile(rf"({SIGNED_NUMBER.pattern})%")
@@ -332,22 +339,25 @@ class Condition(NamedTuple):
 
 
 def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:
-    """The values under names in the JSON; in a list, an element by its index, or all elements that have the name."""
+    """The values under names in the JSON; in a list, an element by its index, or all elements that have the name.
+    Nothing under an undefined value (None) is defined.
+    """
     values = [answer]
     for name in names:
-        lists = [value for value in values if isinstance(value, list)]
+        lists = [value for value in values if isinstance(value, list | tuple)]
         if name.isdecimal() and lists:
             if int(name) >= len(shortest := min(lists, key=len)):
                 problem = f"{key}: there is no element {name}"
                 raise InputError("--fail-if", problem, f"an index below {len(shortest)}")
-            values = [value[int(name)] for value in lists]
+            values = [*(value[int(name)] for value in lists), *(None for value in values if value is None)]
             continue
-        elements = [element for value in values for element in (value if isinstance(value, list) else [value])]
+        elements = [one for value in values for one in (value if isinstance(value, list | tuple) else [value])]
         tables = [element for element in elements if isinstance(element, dict)]
-        if elements and not any(name in table for table in tables):
+        undefined = [element for element in elements if element is None]
+        if elements and not undefined and not any(name in table for table in tables):
             known = sorted({known for table in tables for known in table})
             raise unknown_name("--fail-if", f"{key}: the command's JSON has no {name!r} there", name, known)
-        values = [table[name] for table in tables if name in table]
+        values = [*(table[name] for table in tables if name in table), *undefined]
     return values
 
 

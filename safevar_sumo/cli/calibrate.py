@@ -11,7 +11,7 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.cli.arguments import check_output, complete_study, file_option, jobs_option
+from safevar_sumo.cli.arguments import check_output, check_study_output, complete_study, file_option, jobs_option
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import find_owner, print_by_metric, read_rows
 from safevar_sumo.errors import InputError
@@ -80,9 +80,7 @@ def calibrate_command(
         raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")
     targets = _choose_targets(studies, out)
     for target in targets:
-        check_output(target, "--out", (".toml",))
-        if target.exists() and any(target.samefile(file) for item in studies for file in item.origin.files):
-            raise InputError("--out", f"{target} is an input of the command", "another file")
+        check_study_output(target, "--out", studies)
     subjects = [
         FitSubject(
             item, {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner == index}

@@ -29,6 +29,7 @@ from safevar_sumo.cli.arguments import (
     add_flags,
     as_it_is_now_option,
     check_output,
+    check_study_output,
     fail,
     file_option,
     gated,
@@ -46,7 +47,6 @@ from safevar_sumo.terminal import print_answer, print_parts
 from safevar_sumo.vehicles import CharacteristicSet
 
 SPREADSHEET_ENDINGS = (".xlsx",)
-STUDY_ENDINGS = (".toml",)
 
 
 def add_question(
@@ -229,7 +229,7 @@ def repair(
     from safevar_sumo.analysis.repair.compute import find_repairs
 
     options, subject = RepairOptions(**values), load_results_or_study(source, point)
-    check_output(out, "--out", STUDY_ENDINGS)
+    check_study_output(out, "--out", [study_in(subject)])
     check_output(plot, "--plot")
     if plot is not None and options.curve is None:
         raise InputError("--plot", "there is no curve to draw", "--plot with --curve")

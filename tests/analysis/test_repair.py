@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.analysis.repair import attack, compute, smallest
-from safevar_sumo.analysis.repair.answer import write_repair
+from safevar_sumo.analysis.repair.answer import NotRepairable, write_repair
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.shipped import STUDY_SCHEMA
@@ -227,11 +228,15 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_sea
     assert kept.worst_today == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     assert f"has a safety degree of {kept.worst_today:.2f} m, and 5 fresh worn cars, 0 unsafe" in kept.verdict
     assert "  not searched       no simulation reads colour" in list(replace(kept, unread=("colour",)).sentences())
+    some_lost = replace(kept, not_repairable=(NotRepairable({"decel": 5.0}, "", 0.5),))
+    assert "keeps this promise (decel >= 7 m/s^2, decel <= 9.5 m/s^2) wherever any driving" in some_lost.verdict
     name = kept.parameters[0].name
     changed: Any = SimpleNamespace(values={name: kept.parameters[0].today})
-    write_repair(tmp_path / "it.toml", replace(kept, repairs=(changed,)))
-    assert (tmp_path / "it.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# The driving system of today")
-    assert sv.load_study(tmp_path / "it.toml").ads.parameters[name] == kept.parameters[0].today
+    # A study that results alone hold has no file to extend.
+    for study in (kept.study, replace_in(kept.study, name="lost")):
+        write_repair(tmp_path / "it.toml", replace(kept, study=study, repairs=(changed,)))
+        assert (tmp_path / "it.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# The driving system of today")
+        assert sv.load_study(tmp_path / "it.toml").ads.parameters[name] == kept.parameters[0].today
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def simulate(*arguments: str) -> Result:
 ANSWER = [
     {"joint": {"factor": 0.25, "kept": True}, "limit": None},
     {"joint": {"factor": 0.75}},
-    {"interval": [0.1, 0.2], "pairs": []},
+    {"interval": (0.1, 0.2), "pairs": []},
 ]
 
 
@@ -126,6 +126,8 @@ ANSWER = [
         ("1.joint.factor >= 7.5e-1", ["1.joint.factor = 0.75 >= 0.75"]),
         ("interval.1 > 0.1", ["interval.1 = 0.2 > 0.1"]),
         ("limit > 0", []),
+        ("limit.margin > 0", []),
+        ("limit.alone.0 > 0", []),
         ("pairs.share > 0", []),
     ],
 )

@@ -22,7 +22,7 @@ from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import SCHEMA_LINE, Study, unit_text
+from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
 from safevar_sumo.study.schema import NAME_PATTERN
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.terminal import WholeTable, answer_as_html
@@ -200,9 +200,10 @@ class Repairs:
         if self.no_verdict:
             return self.no_verdict
         if self.proof_of_today is not None:
+            where = " wherever any driving system can" if self.not_repairable else ""
             return (
-                f"The driving system of today keeps this promise ({self.promise.in_words}): the worst vehicle tried "
-                f"has a safety degree of {self.worst_today:.2f} m, and {_proof_in_words(self.proof_of_today)}."
+                f"The driving system of today keeps this promise ({self.promise.in_words}){where}: the worst vehicle "
+                f"tried has a safety degree of {self.worst_today:.2f} m, and {_proof_in_words(self.proof_of_today)}."
             )
         if self.repairs:
             first = self.repairs[0]
@@ -260,7 +261,7 @@ class Repairs:
 
 
 def write_repair(path: Path, result: Repairs) -> None:
-    """Write a study file with the first repair, which extends the study.
+    """Write a study file with the first repair, which extends the study; the whole study, if results hold it alone.
 
     Raises
     ------
@@ -268,6 +269,9 @@ def write_repair(path: Path, result: Repairs) -> None:
         If the file cannot be written.
     """
     study, values = result.study, result.repairs[0].values
+    if not study.origin.called and study.name not in study_names():
+        write_study(path, result.repaired_study(), result.verdict)
+        return
     base = os.path.abspath(study.origin.called) if study.origin.called else study.name
     name = {"name": path.stem} if re.fullmatch(NAME_PATTERN, path.stem) else {"name": f"{study.name}-repaired"}
     tables = {"extends": base, **name, "ads": {"parameters": values}}

@@ -69,7 +69,8 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
         )
     degrees = problem.degrees(problem.today[np.newaxis], vehicles, "the driving system of today")[0][0]
     order = np.argsort(degrees, kind="stable")
-    vehicles, failing, worst_today = vehicles[order], degrees[order] < problem.margin, float(degrees.min())
+    vehicles, degrees = vehicles[order], degrees[order]
+    failing = degrees < problem.margin
     # 0. What no driving system survives needs another part, not a parameter; the rest is repaired.
     can = ~failing
     can[failing] = problem.repairable(vehicles[failing])
@@ -92,7 +93,7 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
         margin=problem.margin,
         parameters=tuple(problem.parameters),
         repairs=tuple(repairs),
-        worst_today=worst_today,
+        worst_today=float(degrees[0] if proof_of_today is None else degrees[can][0]),
         proof_of_today=proof_of_today,
         not_repairable=tuple(not_repairable),
         largest_promise=largest,
