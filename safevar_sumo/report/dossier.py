@@ -311,15 +311,20 @@ class _Dossier:
         yield self._say("status", text)
         for path, cause in self._causes():
             words = ", ".join(f"{name} {{changes.{name}:.4g}}" for name in cause["changes"])
-            yield self._say("explain", f"Enough by themselves: {words} ({{outcome}}).", at=f"{path}.")
+            yield self._say("explain", f"Enough by themselves: {words or 'no change'} ({{outcome}}).", at=f"{path}.")
         tolerance = self._answer("tolerance", {"alone": []})
-        for index, row in enumerate(tolerance["alone"]):
+        has_limits = isinstance(tolerance, list)
+        first, at = (tolerance[0], "0.") if has_limits else (tolerance, "")
+        for index, row in enumerate(first["alone"]):
             if row["safe"]:
                 text = "Alone: no unsafe value of {characteristic} found from {safe.0:.4g} to {safe.1:.4g}"
-                yield self._say("tolerance", f"{text}{unit_text(row['unit'])}.", at=f"alone.{index}.")
-        if tolerance.get("joint"):
+                yield self._say("tolerance", f"{text}{unit_text(row['unit'])}.", at=f"{at}alone.{index}.")
+        if first.get("joint"):
             bound = "at most {unsafe_at_most:.2%} unsafe with {confidence:.0%} confidence"
-            yield self._say("tolerance", f"All together: {{factor:.1%}} of the domain, {bound}.", at="joint.")
+            yield self._say("tolerance", f"All together: {{factor:.1%}} of the domain, {bound}.", at=f"{at}joint.")
+        if has_limits and tolerance[-1]["joint"]:
+            text = "With the limits of the study: {unsafe} of {samples} settings unsafe, at most {at_most:.2%} of all."
+            yield self._say("tolerance", text, at="-1.joint.")
         if "risk" in self.questions:
             yield self._say("risk", "The share of unsafe vehicles is {probability:.3g}.")
         for question in self.questions:
@@ -344,8 +349,8 @@ class _Dossier:
         if not self.study.variation:
             yield Statement("No [variation]: shares are of the domain, not of vehicles in the field.")
         answers = (self._answer(question, {}) for question in self.questions)
-        last = (answer[-1].get("summary", {}) if isinstance(answer, list) else answer for answer in answers)
-        if any(record.get("driven") is False for record in last):
+        records = (record for answer in answers for record in (answer if isinstance(answer, list) else [answer]))
+        if any({**record, **record.get("summary", {})}.get("driven") is False for record in records):
             yield Statement(
                 "No verdict: the original vehicle never reaches the encounter, or brakes with nobody in sight."
             )

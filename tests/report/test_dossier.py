@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.report.dossier import FIRST, MEASURES, value_at
+from safevar_sumo.report.dossier import FIRST, MEASURES, _Dossier, value_at
 from safevar_sumo.report.measurements import count_constants, measure_validation
 from safevar_sumo.report.pack import read_pack
 from safevar_sumo.study import load_study
@@ -86,6 +86,27 @@ def test_constants_are_counted_by_origin() -> None:
     assert counts["published"] == 3 * 12 + len(rain.published) + len(rain.repeatability)
     assert counts["fitted"] == len({*rain.calibration, *rain.spread}) > 5
     assert count_constants(load_study("native"))["fitted"] == 0
+
+
+def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
+    alone = {"characteristic": "decel", "unit": "m/s^2", "safe": [4.8, 9.5]}
+    record = {
+        "driven": False,
+        "alone": [alone],
+        "joint": {"factor": 0.293, "unsafe_at_most": 0.003, "confidence": 0.95},
+    }
+    limits = {"joint": {"samples": 1228, "unsafe": 0, "at_most": 0.003}}
+    stated = []
+    for answer in (record, [record, {"limit": {}}, limits]):
+        sources = {"status": ("", {"simulated": 9}), "tolerance": ("", answer)}
+        made = _Dossier(load_study("native"), sources, ["tolerance"], [])
+        statements = [one for one in made.results() if one.numbers and "simulated" not in one.numbers]
+        assert all(value_at(answer, path) == value for one in statements for path, value in one.numbers.items())
+        assert any("the original vehicle never reaches" in one.text for one in made.open_points())
+        stated.append([one.text for one in statements])
+    assert len(stated[0]) == 2
+    text = "With the limits of the study: 0 of 1228 settings unsafe, at most 0.30% of all."
+    assert stated[1] == [*stated[0], text]
 
 
 @pytest.fixture(scope="module")
