@@ -130,7 +130,8 @@ def study_or_case(
     Warns
     -----
     UserWarning
-        With `as_it_is_now`: names each input that has changed since the results were computed.
+        If a directory of results has the name of the study; with `as_it_is_now`, for each input that has changed
+        since the results were computed.
 
     Raises
     ------
@@ -147,6 +148,8 @@ def study_or_case(
             )
         if results_only or (is_directory and not is_study):
             source = load(source)
+        elif is_study and os.path.exists(os.path.join(source, MANIFEST)):
+            warn(f"{source} is the study; the results in the directory of this name are ./{source}")
         elif not (is_study or os.path.lexists(source)):
             names = study_names()
             raise InputError(

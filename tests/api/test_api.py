@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.analysis.subject import study_or_case
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
@@ -200,3 +201,12 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     assert worst != points[-1].point.name  # the last one that is driven
     alone = sv.simulate(study_at(study, worst, "the test")).trace
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
+
+
+def test_results_with_the_name_of_a_study_are_not_passed_over_in_silence(
+    results: sv.Results, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(results.directory.parent)
+    Path("native").symlink_to(results.directory)
+    with pytest.warns(UserWarning, match=r"native is the study; the results .* are \./native"):
+        assert study_or_case("native") == sv.load_study("native")
