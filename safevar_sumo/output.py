@@ -39,7 +39,7 @@ def whole_file(path: Path, source: str = "") -> Iterator[Path]:
         raise
 
 
-def check_writable(path: Path, source: str = "out") -> None:
+def check_writable(path: Path, source: str) -> None:
     """Refuse an output file that cannot be written, before the work begins; raises InputError."""
     try:
         with path.open("a") if path.exists() else tempfile.TemporaryFile(dir=path.resolve().parent):

@@ -218,7 +218,7 @@ def at_point(case: Case, point: str) -> Case:
     )
 
 
-def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:
+def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
     """Changes of the inputs since the results were computed; empty for imported results, which record no inputs.
 
     Raises

@@ -8,7 +8,7 @@ from shlex import quote
 
 from safevar_sumo.records import Outcome
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet
 
 OUTCOME_VERBS = {
     Outcome.STOPPED: "stops",
@@ -50,11 +50,6 @@ def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]
 def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
     """The values that differ from the original values in one line, as in `change_texts`."""
     return ", ".join(change_texts(characteristics, values)) or "no change at all"
-
-
-def direction_in_words(characteristic: Characteristic, value: float) -> str:
-    """A characteristic and the direction of its change, such as `mass up`."""
-    return f"{characteristic.name} {'up' if value > characteristic.original else 'down'}"
 
 
 def simulate_command(study: str, values: Mapping[str, float], point: str = "") -> str:

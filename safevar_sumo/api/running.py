@@ -173,7 +173,7 @@ def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
 
 
-def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None) -> AbstractContextManager[Pool]:
+def open_pool(study: Study, jobs: int | None, cluster: str | None) -> AbstractContextManager[Pool]:
     """Open the pool that computes a study's batches: worker processes, or the workers of a cluster."""
     limit = study.search.time_limit
     return cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit)

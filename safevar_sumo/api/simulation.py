@@ -242,7 +242,7 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
     return setting
 
 
-def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True) -> Simulation:
+def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool) -> Simulation:
     """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested

@@ -29,7 +29,7 @@ _verified_counts: dict[bytes, int] = {}
 """Number of settings with verified results, by packed study."""
 
 
-def choose_batch_size(study: Study, selection: Selection = EVERYTHING) -> tuple[int, bool]:
+def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
     """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
     SUMO.
     """

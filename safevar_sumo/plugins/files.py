@@ -59,7 +59,7 @@ class InputFiles:
     def __init__(self) -> None:
         self.paths: set[str] = set()
 
-    def files(self, packages: Sequence[str] = ()) -> set[str]:
+    def files(self, packages: Sequence[str]) -> set[str]:
         """Every input file: sources in place of Python's caches, and of installed packages only the files of
         `packages`.
         """
@@ -173,7 +173,7 @@ def digests(paths: Iterable[str], folders: Sequence[str]) -> Files:
     return {name: digest_of(path) for name, path in sorted(named.items())}
 
 
-def _name_of(path: str, folders: Sequence[str], extra_parts: int = 0) -> str:
+def _name_of(path: str, folders: Sequence[str], extra_parts: int) -> str:
     """A file's path relative to the first of `folders` that contains the file; if none does, the path's last 2 +
     `extra_parts` parts.
     """

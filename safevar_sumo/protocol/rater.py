@@ -162,11 +162,6 @@ def is_rated(study: Study) -> bool:
     return study.matrix is not None and bool(study.matrix.protocol)
 
 
-def with_protocol(study: Study, protocol: str) -> Study:
-    """The study with the matrix of a protocol; a study that is rated already stays unchanged."""
-    return study if is_rated(study) else replace(study, matrix=MatrixTable(protocol=protocol))  # type: ignore[arg-type]
-
-
 def rater_of(study: Study, source: str) -> Rater | None:
     """The rater of a study with a protocol's matrix; None for other studies.
 

@@ -19,7 +19,6 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.network import Network, built_network, run_program
 
-TARGETS = ("carla", "openscenario")
 ROAD, SCENARIO, SCRIPT, VEHICLE = "road.xodr", "scenario.xosc", "run_in_carla.py", "vehicle.json"
 BLUEPRINT = "vehicle.lincoln.mkz*2017"
 """The Lincoln MKZ of CARLA 0.9.10 (`mkz2017`) and of later versions (`mkz_2017`)."""
@@ -174,7 +173,7 @@ def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float
 
 
 def export(comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, Mapping[str, float]]) -> None:
-    """Write the last run of a comparison for one of `TARGETS` into a new directory; `physics` is for CARLA only."""
+    """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or "openscenario"."""
     road, scene = open_drive(comparison.network), carla_scene(comparison, physics, handle) if to == "carla" else {}
     if to == "carla":
         script = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")

@@ -258,11 +258,6 @@ def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 
 
-def relative_folders(directory: Path, study: Study) -> list[str]:
-    """The folders of a study's files, relative to the directory."""
-    return [os.path.relpath(folder, directory.resolve()) for folder in study.origin.places]
-
-
 def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
     """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
     if isinstance(first, dict) and isinstance(second, dict):

@@ -4,6 +4,7 @@ and solutions.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -32,7 +33,6 @@ from safevar_sumo.results.manifest import (
     make_directory,
     manifest_of,
     read_manifest,
-    relative_folders,
     search_extent_of,
     write_manifest,
     write_whole,
@@ -71,7 +71,8 @@ class ResultsDirectory:
         self, path: Path, study: Study, identity: Tables = MappingProxyType({}), scoring: Scoring = PUBLISHED_SCORING
     ) -> None:
         self.path, self._study, self.scoring = path, study, scoring
-        self.manifest = {**manifest_of(study, identity), "folders": relative_folders(path, study)}
+        folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
+        self.manifest = {**manifest_of(study, identity), "folders": folders}
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)

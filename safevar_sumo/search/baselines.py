@@ -8,7 +8,7 @@ import moocore
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, PUBLISHED_SCORING, Scoring
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Scoring
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
 
@@ -28,8 +28,6 @@ class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_
         return archive
 
 
-RESULT_SIZE = 50
-SAFETY_WEIGHT = 6.0
 MAX_REDRAWS = 100
 """Maximum number of draws to replace an infeasible setting."""
 PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -38,7 +36,7 @@ PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Changes a few characteristics of the original vehicle, in ranges that narrow towards less safe settings.
 
-    A setting's score compares it with its generation, and stays (`_scores`).
+    A setting gets its score (`_scores`) within its generation, and keeps it.
 
     Parameters
     ----------
@@ -56,11 +54,11 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
 
     generation: PositiveCount = 50
-    kept: PositiveCount = RESULT_SIZE
+    kept: PositiveCount = 50
     warm_up: Annotated[int, Meta(ge=0)] = 500
     generations_between_updates: PositiveCount = 5
     generations_without_improvement: PositiveCount = 5
-    safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = SAFETY_WEIGHT
+    safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = 6.0
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         ranges = _Ranges(problem)
@@ -146,15 +144,13 @@ class _Ranges:
         self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
 
-def _scores(
-    evaluations: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT
-) -> FloatArray:
+def _scores(evaluations: Evaluations, scoring: Scoring, safety_weight: float) -> FloatArray:
     """The scores (6 SD_norm + f_diff + num_norm) / 8 of a generation, of which the search prefers low values; NaN where
     invalid.
 
     SD_norm is the safety degree scaled to [0, 1] over the generation ("after each generation, the value of each
-    objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n characteristics. The first of other
-    objectives takes the place of the safety degree; further ones are scaled to [0, 1], too.
+    objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n characteristics. In a study with other
+    objectives, the first takes the place of the safety degree, and further ones are scaled to [0, 1], too.
     """
     values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
     score = safety_weight * _normalise(values[:, 0])

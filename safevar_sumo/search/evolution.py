@@ -91,7 +91,7 @@ class Reproduction:
             self._random_state = random.getstate()
             random.setstate(state_of_caller)
 
-    def draw_offspring(self, population: list[Individual], number: int, *, distinct: bool = False) -> list[Individual]:
+    def draw_offspring(self, population: list[Individual], number: int, *, distinct: bool) -> list[Individual]:
         """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation.
 
         With `distinct` all parents enter equally many tournaments, and copies of existing individuals are drawn again.

@@ -64,7 +64,7 @@ def json_schema(table: type) -> Parameters:
     return msgspec.json.schema(table)
 
 
-def schema_mistakes(source: object, raw: Any, table: type, prefix: str = "") -> Iterator[InputError]:
+def schema_mistakes(source: object, raw: Any, table: type, prefix: str) -> Iterator[InputError]:
     """All mistakes in `raw` by the JSON schema of `table`, in jsonschema's words; one for each unknown key."""
     import jsonschema  # here, as it takes longer to load than a study
 
@@ -139,7 +139,7 @@ def _path_text(path: Sequence[str | int]) -> str:
     return text
 
 
-def error_with_key(source: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
+def error_with_key(source: object, error: msgspec.ValidationError, prefix: str) -> InputError:
     """Turn msgspec's error into an error that names the key."""
     problem, _, location = str(error).partition(" - at `$")
     path = f"{prefix}{location.rstrip('`')}".removeprefix(".")

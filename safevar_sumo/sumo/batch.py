@@ -88,11 +88,7 @@ def is_recorded(system: System, engine: Engine = Engine.RECORDED) -> bool:
 
 
 def drive_all(
-    system: System,
-    settings: FloatArray,
-    engine: Engine = Engine.RECORDED,
-    watch: Watcher | None = None,
-    listen: Listener | None = None,
+    system: System, settings: FloatArray, engine: Engine, watch: Watcher | None = None, listen: Listener | None = None
 ) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 

@@ -62,8 +62,8 @@ class PointResult(NamedTuple):
     runs: SimulationRuns
 
 
-def point_record(result: PointResult, row: int = 0) -> JsonObject:
-    """Plain values of the setting in row `row` of a result; a value is None if it is undefined.
+def point_record(result: PointResult) -> JsonObject:
+    """Plain values of the first setting of a result; a value is None if it is undefined.
 
     Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted
     [km/h]; the time to collision at the first warning [s]; the side of the contact, and the position along that side
@@ -71,17 +71,17 @@ def point_record(result: PointResult, row: int = 0) -> JsonObject:
     """
     evaluations, relative_speed = result.evaluations, result.runs.relative_speed
     values = {
-        "impact_speed": evaluations.collision_speed[row],
-        "relative_impact_speed": relative_speed[row],
-        SAFETY_DEGREE: evaluations.f_safe[row],
-        "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[row] / KMH,
-        "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[row],
+        "impact_speed": evaluations.collision_speed[0],
+        "relative_impact_speed": relative_speed[0],
+        SAFETY_DEGREE: evaluations.f_safe[0],
+        "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[0] / KMH,
+        "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[0],
     }
-    side, place = (np.broadcast_to(column, relative_speed.shape)[row] for column in result.runs.contact)
+    side, place = (np.broadcast_to(column, relative_speed.shape)[0] for column in result.runs.contact)
     return {
         "point": result.point.name,
         **dict(result.point.parameters),
-        "outcome": str(evaluations.outcome[row]),
+        "outcome": str(evaluations.outcome[0]),
         **{name: finite_or_none(value) for name, value in values.items()},
         **({"contact": {"side": str(side), "place": float(place)}} if side else {}),
     }
@@ -122,9 +122,7 @@ def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Eva
     return score(system, settings, simulate(system, settings, engine))
 
 
-def rate_settings(
-    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
-) -> tuple[Evaluations, CellResults]:
+def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple[Evaluations, CellResults]:
     """Simulate settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their
     results in every cell.
 
@@ -147,9 +145,7 @@ def rate_settings(
     ), cells
 
 
-def evaluate_cells(
-    system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED
-) -> Evaluations:
+def evaluate_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine) -> Evaluations:
     """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part`
     is (k, m).
     """

@@ -104,7 +104,7 @@ class Characteristic:
                 f"{expected}{self.suffix}{otherwise}{hint}",
             )
 
-    def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
+    def is_legal(self, values: Any, *, beyond: bool) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
         A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0 if the domain is.

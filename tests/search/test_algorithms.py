@@ -13,6 +13,7 @@ from hypothesis import given, strategies as st
 
 from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
 from safevar_sumo.search.baselines import _Ranges, _scores
@@ -160,7 +161,7 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
 
 def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:
     """SD 1, 2, 3 by min-max 0, 0.5, 1; numbers 1, 2, 2 of 2 give 0, 1, 1; changes 0.2, 0.4, 1."""
-    scores = _scores(window([[60, 50], [70, 60], [100, 0]], [1.0, 2.0, 3.0]))
+    scores = _scores(window([[60, 50], [70, 60], [100, 0]], [1.0, 2.0, 3.0]), PUBLISHED_SCORING, 6.0)
     assert scores == pytest.approx([0.2 / 8, (3 + 0.4 + 1) / 8, (6 + 1 + 1) / 8])
 
 

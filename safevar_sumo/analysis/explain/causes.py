@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.words import direction_in_words
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.vehicles import CharacteristicSet
@@ -293,7 +292,9 @@ def necessity_frame(
 def cause_key(characteristics: CharacteristicSet, cause: Cause) -> tuple[str, ...]:
     """The directions of a cause's changes, without their sizes, such as ('mass up', 'tireFric down')."""
     return tuple(
-        direction_in_words(item, cause.changes[item.name]) for item in characteristics if item.name in cause.changes
+        f"{item.name} {'up' if cause.changes[item.name] > item.original else 'down'}"
+        for item in characteristics
+        if item.name in cause.changes
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 import pandas as pd
 from rich.table import Table
@@ -21,11 +22,11 @@ from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, Protocol
 from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
-from safevar_sumo.protocol.rater import darken, with_protocol
+from safevar_sumo.protocol.rater import darken, is_rated
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Study
+from safevar_sumo.study import MatrixTable, Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Answer, WholeTable
@@ -255,7 +256,9 @@ def rate(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     SimulationError
         If a vehicle cannot be simulated.
     """
-    study = with_protocol(evaluator.study, EURO_NCAP_2026)
+    study = evaluator.study
+    if not is_rated(study):
+        study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
     rater, rated = assemble(study, study.source).rater, evaluator.for_study(study)
     assert rater is not None
     names, settings = rated.characteristics.names, {"original": rated.characteristics.original, **settings}

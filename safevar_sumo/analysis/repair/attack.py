@@ -157,8 +157,10 @@ def prove(problem: Problem, one: FloatArray, attempt: int) -> tuple[Proof | None
     fresh = problem.promise.draw(number, np.random.default_rng((problem.study.search.seed, 7, attempt)))
     drawn = 0
     for part in np.array_split(fresh, PROOF_PARTS):
-        _, unsafe, lost = problem.failing(one, part, "proof on fresh wear")
-        if len(unsafe):
-            return None, unsafe
-        drawn += len(part) - lost
+        degrees, _ = problem.degrees(one[np.newaxis], part, "proof on fresh wear")
+        unsafe = part[degrees[0] < problem.margin]
+        is_able = problem.repairable(unsafe)
+        if is_able.any():
+            return None, unsafe[is_able]
+        drawn += len(part) - len(unsafe)  # what no driving system keeps safe proves nothing
     return Proof(drawn, 0, -math.expm1(math.log(error) / drawn) if drawn else 1.0), fresh[:0]

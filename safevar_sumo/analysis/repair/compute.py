@@ -185,7 +185,7 @@ class _Finder:
         self.search.add(np.concatenate(self._attack([self.problem.today], self.search.seen)))
         for _ in range(MAX_ROUNDS):
             # 2. The smallest changes that survive all counterexamples.
-            kept = self.search.pareto_set(self._mean_price)
+            kept = self.search.pareto_set(lambda one: self.prices.of(self.problem.changed_values(one)).mean or 0.0)
             if not kept:
                 return []
             # 3. Attacks on those that have survived none yet; new failures are counterexamples.
@@ -210,9 +210,6 @@ class _Finder:
                     return [self._repair(one, proof) for one, proof in zip(kept, proofs, strict=True)]
             self.search.add(np.concatenate(failures))
         return []
-
-    def _mean_price(self, one: FloatArray) -> float:
-        return self.prices.of(self.problem.changed_values(one)).mean or 0.0
 
     def _look_at_left_out(self, sets: Sequence[FloatArray]) -> None:
         """Note at how many of the points left out all repairs are safe, and let the search see all points from now

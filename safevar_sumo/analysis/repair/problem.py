@@ -282,18 +282,6 @@ class Problem:
         numbers = np.zeros(shape, dtype=np.intp) if worst is None else worst.reshape(shape)
         return degrees_of(evaluations).reshape(shape), numbers
 
-    def failing(
-        self, one: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()
-    ) -> tuple[FloatArray, FloatArray, int]:
-        """The safety degrees and the vehicles that a set, shape (P,), does not keep safe and another driver could; and
-        the number of vehicles that no driver keeps safe.
-        """
-        degrees = self.degrees(one[np.newaxis], vehicles, stage, points)[0][0]
-        is_unsafe = degrees < self.margin
-        degrees, vehicles = degrees[is_unsafe], vehicles[is_unsafe]
-        can = self.repairable(vehicles)
-        return degrees[can], vehicles[can], int(np.count_nonzero(~can))
-
     @cached_property
     def best_driver(self) -> Evaluator:
         """Full braking at the first possible moment."""

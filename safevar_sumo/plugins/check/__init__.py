@@ -98,7 +98,7 @@ def subjects_of(study: Study) -> list[Subject]:
     return [Subject(name, kind, study) for kind, each in KINDS.items() for name in dict.fromkeys(each.names_in(study))]
 
 
-def find_subject(name: str, study: str | None = None) -> Subject:
+def find_subject(name: str, study: str | None) -> Subject:
     """Find a subject by its name.
 
     Parameters
