@@ -269,7 +269,7 @@ def answer_question(
 def answer_call(
     compute: Callable[..., Answer], options: type[Options], arguments: JsonObject, *, results_only: bool = False
 ) -> Answer:
-    """Answer a call of a question's function, whose `arguments` are given by name; the first is the subject."""
+    """Answer a call of a question's function with these `arguments`, its local names; the first is the subject."""
     from safevar_sumo.metrics import Unsafe
 
     source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]

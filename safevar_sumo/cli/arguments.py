@@ -136,7 +136,7 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
     """Complete `NAME=` for each characteristic of the study named earlier in the command line, with its domain as
     help.
     """
-    # While --set is incomplete, click has not parsed the rest.
+    # While --set is incomplete, click may not have parsed the study: then it is the first word that is left.
     study = str(ctx.params.get("study") or next(iter(ctx.args), ""))
     if not study or Path(study).is_dir():
         return []

@@ -78,7 +78,7 @@ class Subject(NamedTuple):
         return self.case.study
 
     def in_folder(self, *folders: str) -> list[str]:
-        """The names, without folder and ending, of the files in these folders."""
+        """The names, without folder and ending, of the files in these folders; equal names in several count once."""
         names = (PurePosixPath(name) for name in self.files)
         return sorted({name.stem for name in names if str(name.parent) in folders})
 
@@ -191,7 +191,10 @@ def command_of(question: str, options: JsonObject, study_name: str) -> str:
 
 
 def _named_settings(answer: Any, characteristics: CharacteristicSet, path: str) -> Iterator[tuple[str, FloatArray]]:
-    """The settings that an answer's JSON names as a whole or by their changes from the original, and their paths."""
+    """The settings that an answer's JSON names as a whole or by their changes from the original, and their paths.
+
+    Beside a setting stands its `outcome`; changes with an undefined value are none.
+    """
     names = characteristics.names
     if isinstance(answer, list):
         for index, item in enumerate(answer):
@@ -243,7 +246,7 @@ def make_pack(
     studies, files = list[PackedStudy](), dict[str, bytes]()
     for number, (directory, case) in enumerate(cases, 1):
         code = {} if digests_only else _files_of_user(case.study, directory)
-        subject = _begin(f"{number}-{case.study.name}", directory, case, questions, code)
+        subject = _subject_of_results(f"{number}-{case.study.name}", directory, case, questions, code)
         subject.files.update({f"{REFERENCES}/{path.name}": path.read_bytes() for path in references})
         with local_pool(jobs or available_cores(), case.study.search.time_limit) as pool:
             for name in subject.made:
@@ -259,8 +262,10 @@ def make_pack(
     return describe(studies, digests_only), files
 
 
-def _begin(folder: str, directory: Path, case: Case, questions: Collection[str], code: Mapping[str, bytes]) -> Subject:
-    """A subject with the files that are not made of others."""
+def _subject_of_results(
+    folder: str, directory: Path, case: Case, questions: Collection[str], code: Mapping[str, bytes]
+) -> Subject:
+    """The subject that a directory of results becomes, with the files from which `make` makes all others."""
     name, manifest, answers = case.study.name, read_manifest(directory), list[PackedAnswer]()
     manifest.pop("folders", None)  # of this machine
     for question, (options, _) in QUESTIONS.items():

@@ -221,9 +221,9 @@ class SpeedProfile(NamedTuple):
 
     def speed_at(self, time: float) -> float:
         """Speed [m/s] at a time [s]."""
-        if time < self.begin:
+        elapsed = time - self.begin
+        if elapsed < 0:
             return 0.0
-        elapsed = max(time - self.begin, 0.0)
         if not self.run_up or elapsed >= 2 * self.run_up / self.speed:
             return self.speed
         return self.speed * self.speed / (2 * self.run_up) * elapsed

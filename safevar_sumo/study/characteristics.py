@@ -176,20 +176,20 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ]
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))
 
-    def unit_of(self, table: Mapping[str, CharacteristicTable]) -> str:
-        """The unit of the quantity; `table` holds the vehicle's characteristics."""
-        units = {table[name].unit for name in self.sum if name in table}
+    def unit_of(self, rows: Mapping[str, CharacteristicTable]) -> str:
+        """The unit of the quantity; `rows` are the characteristics of the vehicle."""
+        units = {rows[name].unit for name in self.sum if name in rows}
         return self.unit if self.unit is not None else next(iter(units), "-")
 
-    def bounds_in_words(self, table: Mapping[str, CharacteristicTable]) -> str:
+    def bounds_in_words(self, rows: Mapping[str, CharacteristicTable]) -> str:
         """The bounds in words."""
-        unit = unit_text(self.unit_of(table))
+        unit = unit_text(self.unit_of(rows))
         bounds = {"at least": self.at_least, "at most": self.at_most}
         return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
 
 
 def constraint_mistakes(
-    source: object, table: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]
+    source: object, rows: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]
 ) -> Iterator[InputError]:
     """Errors for constraints that name unknown characteristics, add quantities of different units, or have no
     bounds.
@@ -203,8 +203,8 @@ def constraint_mistakes(
                 "one of them",
             )
         for name, weight in constraint.sum.items():
-            if name not in table:
-                yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, table)
+            if name not in rows:
+                yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, rows)
             if weight == 0:
                 yield InputError(source, f"{key}.sum.{name} = 0", "a number other than 0")
         at_least, at_most = constraint.at_least, constraint.at_most
@@ -212,15 +212,15 @@ def constraint_mistakes(
             yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
         elif at_least is not None and at_most is not None and at_least > at_most:
             yield InputError(source, f"{key}: at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most")
-        yield from _unit_mistakes(source, key, constraint, table)
+        yield from _unit_mistakes(source, key, constraint, rows)
 
 
 def _unit_mistakes(
-    source: object, key: str, constraint: Constraint, table: Mapping[str, CharacteristicTable]
+    source: object, key: str, constraint: Constraint, rows: Mapping[str, CharacteristicTable]
 ) -> Iterator[InputError]:
-    units = {table[name].unit for name in constraint.sum if name in table}
-    legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in table.values()))}
+    units = {rows[name].unit for name in constraint.sum if name in rows}
+    legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
     if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
-        terms = ", ".join(f"{name} [{table[name].unit}]" for name in constraint.sum if name in table)
+        terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum if name in rows)
         problem = f"{key}: unit = {constraint.unit!r}" + (f" for the sum of {terms}" if terms else "")
         yield InputError(source, problem, f"{one_of(legal_units)}; weights may convert units")

@@ -152,7 +152,7 @@ def build_plant(
         drive_shares=per_axle(front_drive_share, 1 - front_drive_share),
         **constants,
     )
-    # Heights in the state count from unloaded tyres, so add the static deflection, which is the same at any speed.
+    # Heave counts from unloaded tyres: with this sum, the height that is left in balance, at any speed, is h_s.
     return plant._replace(height=plant.height + balanced_state(plant, np.zeros_like(mass)).heights[0])
 
 
@@ -175,7 +175,7 @@ def balanced_state(plant: Plant, speed: FloatArray) -> MultiBodyState:
     """The body in static balance on its springs, with rolling wheels."""
     axle_loads = (plant.sprung_mass * plant.static_shares + plant.unsprung_mass) * plant.down
     axle_heights = axle_loads / (2 * plant.tyre_spring)
-    # Springs count from their static load: in balance the body above each axle is as high as the axle.
+    # The length of a spring counts from that under its static load: in balance, the body is as high as each axle below.
     heave = (axle_heights * plant.static_shares).sum(axis=0)
     pitch = (axle_heights[1] - axle_heights[0]) / (plant.arms[0] - plant.arms[1])
     heights = np.stack([heave, pitch, *axle_heights])
@@ -216,12 +216,12 @@ def derivatives(
         coordinates[2:] - coordinates[0] + plant.arms * coordinates[1] for coordinates in (body.heights, body.rates)
     )
     static_loads = plant.sprung_mass * plant.down * plant.static_shares / 2
-    springs = static_loads - deflection * plant.springs - deflection_rate * plant.dampers
-    moments = plant.arms * springs
-    heave_acceleration = plant.down - 2 * (springs[0] + springs[1]) / plant.sprung_mass
+    spring_forces = static_loads - deflection * plant.springs - deflection_rate * plant.dampers
+    moments = plant.arms * spring_forces
+    heave_acceleration = plant.down - 2 * (spring_forces[0] + spring_forces[1]) / plant.sprung_mass
     pitch_moment = 2 * (moments[0] + moments[1]) + traction * (plant.height - body.heights[0])
     pitch_acceleration = pitch_moment / plant.pitch_inertia
-    axle_accelerations = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - springs) / plant.unsprung_mass
+    axle_accelerations = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - spring_forces) / plant.unsprung_mass
     return (
         traction / plant.mass - plant.back,
         np.stack([heave_acceleration, pitch_acceleration, *axle_accelerations]),
@@ -242,14 +242,14 @@ def advance(
     pressure_shares = np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
     drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * peak)
     brakes = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
-    acceleration, rate_gains, wheel_gains = derivatives(plant, body, drive - brakes, force)
+    acceleration, body_accelerations, wheel_accelerations = derivatives(plant, body, drive - brakes, force)
     gradients = np.maximum(gradient, 0.0)
     damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
-    wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_gains / damping, 0.0)
+    wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_accelerations / damping, 0.0)
     added_force = gradients * (wheel_speeds - body.wheel_speeds)
     speed = np.maximum(body.speed + step * (acceleration + 2 * (added_force[0] + added_force[1]) / plant.mass), 0.0)
     # Pacejka's tyres push slightly even without slip, so a vehicle without drive is held.
     is_standing = (body.speed <= 0) & (drive_torque <= 0) & (plant.back >= 0)
     speed = np.where(is_standing, 0.0, speed)
-    rates = body.rates + step * rate_gains
+    rates = body.rates + step * body_accelerations
     return MultiBodyState(speed, body.heights + step * rates, rates, wheel_speeds, pressure_shares)

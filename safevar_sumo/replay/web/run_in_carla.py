@@ -26,7 +26,7 @@ SETTLING = 20
 
 
 def apply_values(physics: Any, scene: Scene) -> Any:
-    """Set the vehicle's twelve values; all others stay CARLA's."""
+    """Set the values that the study varies, of the vehicle and of its wheels; all others stay CARLA's."""
     for name, value in scene["physics"].items():
         setattr(physics, name, value)
     wheels = list(physics.wheels)
@@ -40,6 +40,12 @@ def apply_values(physics: Any, scene: Scene) -> Any:
 def place(x: float, y: float, heading: float, z: float = RIDE_HEIGHT) -> Any:
     """A place of the file in CARLA's left-handed frame."""
     return carla.Transform(carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(heading)))
+
+
+def place_at(actor: Scene, step: int) -> Any:
+    """The recorded place of an actor at a step; the last one after the record's end."""
+    _, x, y, heading = actor["places"][min(step, len(actor["places"]) - 1)]
+    return place(x, y, heading, 1.0 if actor["kind"] == "pedestrian" else RIDE_HEIGHT)
 
 
 def pedals(scene: Scene, step: int) -> Any:
@@ -65,9 +71,7 @@ def spawn(world: Any, scene: Scene) -> tuple[Any, list[tuple[Scene, Any]]]:
     patterns = {"pedestrian": "walker.pedestrian.*", "bicycle": "vehicle.*.crossbike", "car": scene["blueprint"]}
     others = []
     for actor in scene["actors"]:
-        _, x, y, heading = actor["places"][0]
-        start = place(x, y, heading, 1.0 if actor["kind"] == "pedestrian" else RIDE_HEIGHT)
-        body = world.spawn_actor(library.filter(patterns[actor["kind"]])[0], start)
+        body = world.spawn_actor(library.filter(patterns[actor["kind"]])[0], place_at(actor, 0))
         body.set_simulate_physics(False)
         others.append((actor, body))
     return vehicle, others
@@ -94,8 +98,7 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
             for actor, body in others:
                 if actor["kind"] == "pedestrian":  # it moves its legs; the record places it
                     body.apply_control(walk(actor["places"], step, scene["step"], body.get_location()))
-                _, x, y, heading = actor["places"][min(step, len(actor["places"]) - 1)]
-                body.set_transform(place(x, y, heading, 1.0 if actor["kind"] == "pedestrian" else RIDE_HEIGHT))
+                body.set_transform(place_at(actor, step))
             before, speed = speed, math.hypot(vehicle.get_velocity().x, vehicle.get_velocity().y)
             world.tick()
             if touched:
