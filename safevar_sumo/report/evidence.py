@@ -36,6 +36,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import file_by_name
 from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.report.dossier import dossier_page, make_dossier
 from safevar_sumo.report.measurements import check_study, settings_of, validate_with
 from safevar_sumo.report.pack import Description, PackedAnswer, PackedStudy, describe
@@ -242,6 +243,8 @@ def make_pack(
         assert isinstance(case, Case)
         if not case.has_runs:
             raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
+        for path in references:
+            read_reference(path, case.characteristics)  # raises errors with the user's path
         cases.append((directory, case))
     studies, files = list[PackedStudy](), dict[str, bytes]()
     for number, (directory, case) in enumerate(cases, 1):

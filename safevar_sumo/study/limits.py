@@ -36,7 +36,7 @@ def limits_of(
     texts: Iterable[str],
     rows: Mapping[str, CharacteristicTable],
     stated: Mapping[str, Limit] | None = None,
-    source: str = "--limits",
+    source: str = "limits",
 ) -> dict[str, Limit]:
     """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >= 3`, and where a text
     does not replace them, those `stated` in a study.

@@ -84,12 +84,15 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str) -> Itera
         elif error.validator == "enum":
             yield unknown_name(source, f"{_path_text(path)} = {value!r}", value, filter(None, schema["enum"]))
         elif error.validator == "anyOf":
-            choices = schema.get("discriminator", {}).get("mapping") or filter(
-                None, (choice.get("type", "object") for choice in schema["anyOf"])
-            )
+            choices = schema.get("discriminator", {}).get("mapping") or [
+                choice.get("type", "object") for choice in schema["anyOf"] if choice.get("type") != "null"
+            ]
             yield InputError(source, f"{_path_text(path)} = {short_text(value)}", one_of(choices))
         elif error.validator == "pattern":
             yield InputError(source, f"{_path_text(path)} = {short_text(value)}", schema["description"])
+        elif error.validator == "type" and schema["type"] == "object":
+            legal = " of ".join(filter(None, ("a table", ", ".join(schema.get("properties", ())))))
+            yield InputError(source, f"{_path_text(path)} = {short_text(value)}", legal)
         else:
             message = error.message.removeprefix(repr(value)).strip()
             quoted = f" = {short_text(value)}" if message != error.message else ":"
@@ -103,10 +106,11 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str) -> Itera
 def _leaves(error: ValidationError) -> list[ValidationError]:
     """The errors of the alternative that a value of several alternatives belongs to, or the error itself."""
     tag = error.schema.get("discriminator", {}).get("propertyName")
+    unlike = ("type", "enum") if isinstance(error.instance, dict) else ("type",)
     others = {
         inner.schema_path[0]
         for inner in error.context
-        if (not inner.path and inner.validator == "type") or list(inner.path) == [tag]
+        if (not inner.path and inner.validator in unlike) or list(inner.path) == [tag]
     }
     fitting = [inner for inner in error.context if inner.schema_path[0] not in others]
     return [leaf for inner in fitting for leaf in _leaves(inner)] or [error]

@@ -130,7 +130,7 @@ def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Pat
 def test_systems_that_cannot_be_compared_are_refused(in_tmp: Path) -> None:
     refused("compare", "wear", "rain", message=("study 'rain': cannot be compared", "treadDepth [mm]", "same units"))
     refused("compare", "smoke", "smok", message=("smok", "did you mean 'smoke'"))
-    refused("compare", "smoke", "smoke", "--unsafe", "points=3", message=("--unsafe", "is not rated"))
+    refused("compare", "euro_ncap_rating", "wear", "--unsafe", "points=3", message=("--unsafe", "'wear' is not rated"))
     Path("far.toml").write_text(
         'extends = "smoke"\nname = "far"\n[vehicle.characteristics]\n'
         "mass = { original = 9e3, lower = 8e3, upper = 1e4 }\n"

@@ -243,6 +243,8 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_sea
     ("old", "new", "change", "message"),
     [
         ("lower = 4.0", "lower = 14.0", "gap", "bounds that hold the value of today"),
+        ("lower = 4.0", "log = true, lower = 0.0", "gap", "expected: 0 < lower < upper"),
+        ("always = {", "alway = {", "alway", "there is no ads.parameters.alway; did you mean 'always'?"),
         pytest.param("", "", "colour", "colour: no simulation reads it", marks=pytest.mark.slow),
         ("", "", "gape", "did you mean 'gap'?"),
         ("at_least = 5", "at_least = 3", "gap", "outside its domain"),

@@ -364,6 +364,6 @@ def test_bad_input_is_refused(slippery: Path, tmp_path: Path) -> None:
     refused("evidence", str(tmp_path), "--out", str(tmp_path / "it.zip"), message=("is not a results directory",))
     (tmp_path / "rows.csv").write_text("a,b\n1,2\n")
     common = ("evidence", str(slippery), "--out", str(tmp_path / "it.zip"), "--reference")
-    refused(*common, str(tmp_path / "rows.csv"), message=("rows.csv", "lacks the columns"))
+    refused(*common, str(tmp_path / "rows.csv"), message=(str(tmp_path / "rows.csv"), "lacks the columns"))
     refused(*common, str(tmp_path / "none.csv"), message=("--reference", "none.csv", "does not exist"))
     assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]

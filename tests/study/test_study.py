@@ -101,7 +101,8 @@ ADDITIONS = [
     ),
     ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
     ("[origin]\nplaces = []", "origin"),
-    ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3 is not of type 'object'"),
+    ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
+    ("[repair.promise]\nmass = 3", "repair.promise.mass = 3\nexpected: a table of at_least, at_most, source"),
     ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci"),
     (
         '[variation.mass]\ndistribution = "norml"',
@@ -307,7 +308,7 @@ def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:
     [
         ("decl = { at_least = 6 }", "limits.decl: there is no such characteristic; did you mean 'decel'?"),
         ("decel = { source = 'x' }", "limits.decel: neither at_least nor at_most"),
-        ("decel = 6", "limits.decel = 6 is not of type 'object'"),
+        ("decel = 6", "limits.decel = 6\nexpected: a table of at_least, at_most, source"),
         ("decel = { atleast = 6 }", "limits.decel.atleast: there is no such key; did you mean 'at_least'?"),
         ("decel = { at_least = 3 }", "limits.decel.at_least = 3 is outside its domain"),
         ("decel = { at_least = 9.4 }", "limits.decel.at_least = 9.4: the original, 9 m/s^2, does not keep it"),

@@ -42,6 +42,7 @@ def compare_systems(
     """
     subjects, evaluators = (subject, other), (evaluator, evaluator.for_study(study_in(other)))
     _require_same_characteristics(*(one.study for one in evaluators))
+    stated = [one.parse_criterion(options.unsafe) for one in evaluators if options.unsafe is not None]
     names = list(evaluator.characteristics.names)
     orders = [[names.index(name) for name in one.characteristics.names] for one in evaluators]
     lower, upper = _common_domain(evaluators, orders)
@@ -58,7 +59,7 @@ def compare_systems(
         for one, order, side in zip(evaluators, orders, "AB", strict=True)
     ]
     originals = [one.evaluate_original() for one in evaluators]
-    unsafe = _criterion(options.unsafe, evaluators, evaluations, originals)
+    unsafe = stated[0] if stated else _default_criterion(evaluators, evaluations, originals)
     both_rated = all(is_rated(one.study) for one in evaluators)
     is_valid = np.logical_and.reduce([one.valid for one in evaluations])
     for side, one in zip("ab", evaluations, strict=True):
@@ -150,16 +151,10 @@ def _common_sample(
         factor *= 2
 
 
-def _criterion(
-    text: str | None,
-    evaluators: tuple[Evaluator, Evaluator],
-    evaluations: list[Evaluations],
-    originals: list[Evaluations],
+def _default_criterion(
+    evaluators: tuple[Evaluator, Evaluator], evaluations: list[Evaluations], originals: list[Evaluations]
 ) -> Unsafe:
-    """The stated criterion, or the default of all vehicles of both systems, with the limit of the first original."""
-    if text is not None:
-        unsafe, _ = (one.parse_criterion(text) for one in evaluators)  # both systems must be able to use it
-        return unsafe
+    """The default of all vehicles of both systems, with the limit of the first original."""
     original = originals[0]
     if not all(is_rated(one.study) for one in evaluators):
         metrics = {name: values for name, values in original.metrics.items() if name != RATING_POINTS.name}

@@ -177,6 +177,9 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     parameters = []
     for name in chosen:
         row, today = table[name], study.ads.parameters.get(name, getattr(getattr(ads, "_ads", ads), name, None))
+        if today is None:
+            known = {*study.ads.parameters, *CHANGEABLE.get(study.ads.model, ())}
+            raise unknown_name(source, f"repair.{name}: there is no ads.parameters.{name}", name, known)
         if isinstance(today, bool) or not isinstance(today, int | float):
             raise InputError(
                 source, f"repair.{name}: ads.parameters.{name} = {today!r}", "a number, the value of today"
@@ -185,7 +188,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
             row = replace_in(row, lower=min(row.lower, today), upper=max(row.upper, today))
         if not row.lower < row.upper or not row.lower <= today <= row.upper or (row.log and row.lower <= 0):
             problem = f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g}, and today it is {today:g}"
-            raise InputError(source, problem, "lower < upper, and bounds that hold the value of today")
+            legal = f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today"
+            raise InputError(source, problem, legal)
         facts = {key: value for key, value in asdict(row).items() if key != "own"}
         parameters.append(Parameter(name=name, today=float(today), **facts))
     return parameters

@@ -97,7 +97,7 @@ def _limits_of(study: Study, options: ToleranceOptions, columns: Sequence[int]) 
     varied, typed = [list(rows)[column] for column in columns], limits_of(options.limits, rows)
     for name in typed:
         if name not in varied:
-            raise unknown_name("--limits", f"{name} does not vary with these --characteristics", name, varied)
+            raise unknown_name("limits", f"{name} does not vary with these --characteristics", name, varied)
     return {name: limit for name, limit in limits_of(options.limits, rows, study.limits).items() if name in varied}
 
 
