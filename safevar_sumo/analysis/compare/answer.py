@@ -188,11 +188,11 @@ class SystemComparison:
             yield f"Rating of the original vehicles: {self.a.points:.2f} points in A, {self.b.points:.2f} in B."
         if self.weather is not None:
             names = self.weather[["setting", "other"]].iloc[0].to_list()
-            heads = [f"{quantity} {name}" for quantity in ("%", "rank", "increase", "decrease") for name in names]
+            heads = [f"{quantity} {name}" for quantity in ("%", "rank", "+", "-") for name in names]
             frame = self.weather.drop(columns=["setting", "other", "difference"]).set_axis(
                 ["characteristic", *heads], axis=1
             )
-            yield _as_table(frame, "What critical solutions change, as in tables")
+            yield _as_table(frame, "What critical solutions change (rank), and mean increase (+) and decrease (-)")
         yield meanings(one.characteristic for one in self.a.limits)
         yield from (f"note: {remark}." for remark in self.remarks)
 
