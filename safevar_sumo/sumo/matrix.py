@@ -16,7 +16,6 @@ from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
 from safevar_sumo.records import (
-    BoolArray,
     CellResults,
     Evaluations,
     FloatArray,
@@ -45,13 +44,6 @@ MAX_LANES = 100_000
 """Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and gigabytes."""
 N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
-
-
-class PointEvaluations(NamedTuple):
-    """Evaluations of N settings at one point of a study."""
-
-    point: Point
-    evaluations: Evaluations
 
 
 class PointResult(NamedTuple):
@@ -118,7 +110,8 @@ def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Eva
     if system.rater is not None:
         return rate_settings(system, settings, engine)[0]
     if system.matrix:
-        return evaluations_at_worst_points(simulate_all_points(system, settings, engine))
+        results = simulate_all_points(system, settings, engine)
+        return evaluations_at_worst_points(system, [result.evaluations for result in results])
     return score(system, settings, simulate(system, settings, engine))
 
 
@@ -128,16 +121,10 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple
 
     Traces are dropped, as they would take gigabytes.
     """
-    scored, quantities = dict[str, PointEvaluations](), dict[str, tuple[FloatArray, FloatArray, BoolArray]]()
-    for group in _simulate_groups(system, settings, engine):
-        for result in group:
-            name = result.point.name
-            scored[name], quantities[name] = (
-                PointEvaluations(result.point, result.evaluations),
-                rated_quantities(result.runs),
-            )
-    cells = join_cells([quantities[point.name] for point in system.points])
-    evaluations = evaluations_at_worst_points([scored[point.name] for point in system.points])
+    groups = _simulate_groups(system, settings, engine)
+    results = {one.point.name: (one.evaluations, rated_quantities(one.runs)) for group in groups for one in group}
+    scored, quantities = zip(*(results[point.name] for point in system.points), strict=True)
+    cells, evaluations = join_cells(quantities), evaluations_at_worst_points(system, scored)
     if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
     return replace(
@@ -175,12 +162,10 @@ def _batch_size(system: System, engine: Engine) -> int:
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 
-def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> Evaluations:
-    """The evaluations of N settings, each at its worst point."""
-    settings = at_points[0].evaluations.settings
-    point_numbers, setting_numbers = worst_points(at_points), np.arange(len(settings))
-    evaluations = Evaluations.concatenate([result.evaluations for result in at_points])
-    return replace(evaluations.take(point_numbers * len(settings) + setting_numbers), worst_points=point_numbers)
+def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]) -> Evaluations:
+    """The evaluations of N settings, each at its worst point, of those at each of the system's points."""
+    numbers, n = worst_points(system, at_points), len(at_points[0])
+    return replace(Evaluations.concatenate(at_points).take(numbers * n + np.arange(n)), worst_points=numbers)
 
 
 def simulate(
@@ -220,7 +205,8 @@ def system_at_worst_point(system: System, settings: FloatArray) -> System:
     """The system at the worst point of the last setting."""
     if not system.matrix:
         return system
-    return system.at(system.points[worst_points(simulate_all_points(system, settings[-1:]))[0]])
+    at_points = [result.evaluations for result in simulate_all_points(system, settings[-1:])]
+    return system.at(system.points[worst_points(system, at_points)[0]])
 
 
 def system_at_point(system: System, name: str, source: object) -> System:
@@ -282,14 +268,15 @@ def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) ->
             yield tuple(group[start : start + max(size, 1)])
 
 
-def worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> npt.NDArray[np.intp]:
+def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:
     """For every setting, the number of the point with the least safety degree; of equal points, the first by name.
+    `at_points` are the evaluations of the settings at each of the system's points.
 
     A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst,
     because such a test leaves open whether the setting is safe.
     """
-    order = np.argsort([result.point.name for result in at_points])
-    in_order = [at_points[k].evaluations for k in order]
+    order = np.argsort([point.name for point in system.points])
+    in_order = [at_points[k] for k in order]
     safety_degrees = np.stack([evaluations.f_safe for evaluations in in_order])
     safety_degrees[np.isnan(safety_degrees)] = np.inf
     is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])

@@ -197,7 +197,7 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     study = load_study("euro_ncap_pedestrian")
     system = assemble(study)
     points = simulate_all_points(system, system.characteristics.original[np.newaxis])
-    worst = points[worst_points(points)[0]].point.name
+    worst = points[worst_points(system, [point.evaluations for point in points])[0]].point.name
     assert worst != points[-1].point.name  # the last one that is driven
     alone = sv.simulate(study_at(study, worst, "the test")).trace
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)

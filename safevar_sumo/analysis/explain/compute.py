@@ -252,9 +252,10 @@ def compare_at_points(
 ) -> list[PointComparison]:
     """Compare settings, shape (M, n), with the original, shape (1, n)."""
     results = simulate_all_points(system, np.concatenate([original, settings]))
-    is_unsafe = np.stack([unsafe.of(result.evaluations) for result in results])
+    at_points = [result.evaluations for result in results]
+    is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)
     comparisons = []
-    for row, index in enumerate(worst_points(results)[1:].tolist(), 1):
+    for row, index in enumerate(worst[1:].tolist(), 1):
         point, evaluations, runs = results[index]
         failing = tuple(point.name for point, fails in zip(system.matrix, is_unsafe[:, row], strict=False) if fails)
         comparisons.append((compare_braking(runs, row, evaluations.f_safe, point.name), failing))
