@@ -81,8 +81,7 @@ def validate(
         vehicle = "any row" if evaluations.valid[0] else "the original vehicle"
         raise SimulationError(f"study {study!r} cannot be simulated with {vehicle}")
     if not valid.all():
-        number = np.count_nonzero(~valid)
-        print_warning(f"{reference}: {number} rows could not be simulated and are left out")
+        print_warning(f"{reference}: {np.count_nonzero(~valid)} rows could not be simulated and are left out")
     data, simulated = data.take(valid), evaluations.take(1 + np.flatnonzero(valid))
     result = measure_agreement(data, simulated, loaded_study, evaluations.take([0]))
     if plot is not None:

@@ -205,8 +205,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
     def draw(
         x: float, y: float, length: float, width: float, zorder: float = 3, linewidth: float = 0.0, **style: Any
     ) -> Patch:
-        rectangle = Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style)
-        return axis.add_patch(rectangle)
+        return axis.add_patch(Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style))
 
     patches = [
         draw(-length, -width / 2, length, width, color=colour, alpha=0.6 if is_beneath else 0.9),

@@ -97,8 +97,7 @@ def poses_of(comparison: Comparison) -> list[Poses]:
         kind = "pedestrian" if track.is_person else "bicycle" if track.width < BICYCLE_WIDTH else "car"
         to_middle = 0.0 if track.is_person else track.length / 2
         x, y = x - to_middle * np.cos(heading), y - to_middle * np.sin(heading)
-        samples = (values[here] for values in (time, x, y, heading))
-        actors.append(Poses(name, kind, track.length, track.width, *samples))
+        actors.append(Poses(name, kind, track.length, track.width, *(values[here] for values in (time, x, y, heading))))
     return actors
 
 

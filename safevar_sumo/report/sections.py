@@ -75,8 +75,7 @@ def make_verdict(data: ReportInput, explained: Explained | None) -> JsonObject:
     if explained.choices and explained.choices[0].handle:
         simulate = question_command("simulate", str(data.directory), data.point)
         commands.append(f"{simulate} --solution {explained.choices[0].name} --plot it.png")
-    is_bad = explained.failures > 0
-    return {"sentences": [*sentences, explained.counts], "is_bad": is_bad, "commands": commands}
+    return {"sentences": [*sentences, explained.counts], "is_bad": explained.failures > 0, "commands": commands}
 
 
 def describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:

@@ -43,8 +43,7 @@ class StopsShort(Crossing, frozen=True, kw_only=True):
     @property
     def stop(self) -> float:
         """Position at which the pedestrian stops, past the middle of the lane [m]."""
-        body = BODIES[self.parameter("target")]
-        return -(self.vut_width + body.length) / 2 - self.short
+        return -(self.vut_width + BODIES[self.parameter("target")].length) / 2 - self.short
 
 
 class LeavesInTime(Crossing, frozen=True, kw_only=True):

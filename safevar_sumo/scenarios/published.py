@@ -90,8 +90,7 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
             memory = memory._replace(has_turned=True)
         front = memory.frame.along(vehicle_positions)
         has_left_lane = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
-        has_passed = front > memory.clear_point
-        gap, over = memory.conflict_point - front, has_left_lane | has_passed
+        gap, over = memory.conflict_point - front, has_left_lane | (front > memory.clear_point)
         return Scene(gap, lateral, lateral_speed, over), memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
@@ -140,8 +139,7 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
 
     def begin(self, world: World) -> tuple[Frame, FloatArray]:
         frame = Frame.through_origin(world.lane_of(VUT))
-        rear = frame.along(world.vehicle_positions(PARKED_VEHICLE)) - world.vehicle_length(PARKED_VEHICLE)
-        return frame, rear
+        return frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - world.vehicle_length(PARKED_VEHICLE)
 
     def observe(
         self, world: World, step: float, memory: tuple[Frame, FloatArray]

@@ -94,8 +94,7 @@ class _Ranges:
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to `max_changes`."""
-        settings = np.stack([self._draw_feasible_setting(rng) for _ in range(number)])
-        return self._characteristics.filter(settings)
+        return self._characteristics.filter(np.stack([self._draw_feasible_setting(rng) for _ in range(number)]))
 
     def _draw_feasible_setting(self, rng: np.random.Generator) -> FloatArray:
         """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the original until it is

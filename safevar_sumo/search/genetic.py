@@ -210,8 +210,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         used = yield from request_evaluations(cells, problem)
         archive = update_archive([], cells, size)
         while used < problem.evaluations and archive:
-            valid = [cell for cell in cells if not cell.has_failed]
-            set_standings(valid)
+            set_standings([cell for cell in cells if not cell.has_failed])
             neighbourhoods = [[cells[i] for i in indices if not cells[i].has_failed] for indices in neighbours]
             with reproduction.randomness():
                 offspring = [

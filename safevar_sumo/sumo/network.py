@@ -157,8 +157,7 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
         write_roads(parse_xml(built_network(network)), size, into / NETWORK_FILE, source)
 
     def copy_traffic(into: Path) -> None:
-        root = _changed(traffic_file, network.traffic_changes)
-        write_demand(root, n, into / TRAFFIC_FILE, traffic_file)
+        write_demand(_changed(traffic_file, network.traffic_changes), n, into / TRAFFIC_FILE, traffic_file)
 
     roads = cache_folder_name(network, size, _road_digests(network))
     traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)])

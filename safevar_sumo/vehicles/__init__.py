@@ -93,8 +93,7 @@ def _accelerations(speeds: list[float]) -> FloatArray:
 
     Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has acceleration 0.
     """
-    rising_speeds = np.maximum.accumulate(np.array(speeds))
-    distinct_speeds, samples = np.unique(rising_speeds, return_index=True)
+    distinct_speeds, samples = np.unique(np.maximum.accumulate(np.array(speeds)), return_index=True)
     grid = SPEEDS[(distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)]
     if len(grid) < 2:
         return np.zeros(len(SPEEDS))

@@ -63,8 +63,7 @@ def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, se
     """
     n = len(characteristics)
     offsets = np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, n)) * characteristics.threshold
-    neighbours = settings[:, np.newaxis] + offsets
-    return np.clip(neighbours, characteristics.lower, characteristics.upper).reshape(-1, n)
+    return np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, n)
 
 
 def estimate_robustness(

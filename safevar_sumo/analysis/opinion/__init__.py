@@ -57,5 +57,4 @@ def opinion(
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    arguments = locals()  # by name, the subject first
-    return answer_call(ask_for_opinions, OpinionOptions, arguments, results_only=True)
+    return answer_call(ask_for_opinions, OpinionOptions, locals(), results_only=True)  # by name, the subject first

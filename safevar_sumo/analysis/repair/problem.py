@@ -233,8 +233,7 @@ class Problem:
     def changed_values(self, one: FloatArray) -> dict[str, float]:
         """The values of the parameters that a set, shape (P,), changes, by name."""
         names, values = [parameter.name for parameter in self.parameters], self.values(one[np.newaxis])[0].tolist()
-        changed = one != self.today
-        return {name: value for name, value, flag in zip(names, values, changed, strict=True) if flag}
+        return {name: value for name, value, flag in zip(names, values, one != self.today, strict=True) if flag}
 
     def evaluate(self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()) -> Evaluations:
         """Row i: parameters i in vehicle i, at the worst of some points; without any, at the worst of all. The settings

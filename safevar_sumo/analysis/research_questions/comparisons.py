@@ -105,8 +105,7 @@ def compare_over_runs(case: Case) -> pd.DataFrame:
     if NSGA2 in case.algorithms and len(case.algorithms) > 1:
         rows["RQ2"] = _test_pairs(case, nsga2_pairs(case), over_runs=True)
     tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
-    enough = tests["runs"] >= tests.index.map(fewest_runs)
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=enough)
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=tests["runs"] >= tests.index.map(fewest_runs))
 
 
 def compare_pairs(case: Case) -> pd.DataFrame:

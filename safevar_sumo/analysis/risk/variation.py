@@ -152,8 +152,7 @@ def compute_effects(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe,
 
         indices, stage, problem = SOBOL, "sensitivity analysis", {"num_vars": len(names), "names": list(names)}
         problem["bounds"] = [[0.0, 1.0]] * len(names)
-        points = sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed % 2**32)
-        settings = model.settings(points)
+        settings = model.settings(sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed % 2**32))
         effects_on = partial(_sobol_indices, problem, confidence, seed % 2**32)
     evaluations = evaluator.evaluate(settings, stage)
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)

@@ -274,5 +274,4 @@ def find_joint_limits(
         for one, low, high in zip(evaluator.characteristics, *(end.tolist() for end in ends), strict=True)
     }
     inside = int(search.hold(sides[np.newaxis], known).sum())
-    beyond = search.beyond(sides)
-    return JointLimits(limits, box, samples, len(found), failed, at_most, inside, kept, beyond)
+    return JointLimits(limits, box, samples, len(found), failed, at_most, inside, kept, search.beyond(sides))
