@@ -179,11 +179,6 @@ def format_number(value: float) -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
-def superscript_powers(text: str) -> str:
-    """Raise the powers of a text's units: m/s² for m/s^2."""
-    return text.replace("^2", "²").replace("^3", "³")
-
-
 def compare_with_original(
     study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
 ) -> Comparison:

@@ -37,7 +37,6 @@ from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
-from safevar_sumo.replay.comparison import superscript_powers
 from safevar_sumo.report.input import ReportInput, page_options, read_inputs
 from safevar_sumo.report.sections import (
     GENERAL_LIMITS,
@@ -388,8 +387,8 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
 
 
 def _render(template: str, **values: Any) -> str:
-    page = template_environment(TEMPLATE_FOLDER).get_template(template)
-    return superscript_powers(page.render(css=_web_file("report.css"), **values)) + "\n"
+    page = template_environment(TEMPLATE_FOLDER).get_template(template).render(css=_web_file("report.css"), **values)
+    return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
 
 
 def _web_file(name: str) -> Markup:

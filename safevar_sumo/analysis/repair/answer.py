@@ -224,7 +224,9 @@ class Repairs:
             yield self.verdict
         if self.repairs:
             first = self.repairs[0]
-            yield f"  today              the worst vehicle of the promise: {_degree(self.worst_today)}"
+            degree = self.worst_today
+            worst = f"safety degree {degree:.2f} m" if degree >= 0 else f"a collision at {-degree:.2f} m/s"
+            yield f"  today              the worst vehicle of the promise: {worst}"
             yield f"  price on a new car {_price_in_words(first.price)}"
             for one in self.repairs[1:]:
                 yield f"  or                 {self._changes_in_words(one)}: {_price_in_words(one.price)}"
@@ -278,10 +280,6 @@ def write_repair(path: Path, result: Repairs) -> None:
     text = f"{SCHEMA_LINE}# {result.verdict}\n\n{tomli_w.dumps(tables)}"
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
-
-
-def _degree(value: float) -> str:
-    return f"safety degree {value:.2f} m" if value >= 0 else f"a collision at {-value:.2f} m/s"
 
 
 def _price_in_words(price: Price) -> str:
