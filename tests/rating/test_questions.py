@@ -78,6 +78,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     assert record["any_lost"] == first
     assert record["points"][-1] == [1.0, points[1.0]]
     assert any(str(part).startswith("brakeTorque: points are lost from") for part in result.sentences())
+    assert set(result.sheet.to_frame()["limit with all others at theirs"]) == {"-"}, "no box of a rating is sought"
     assert result.figure().get_axes()
 
 

@@ -191,7 +191,8 @@ class LimitsSheet:
                     "part": row.characteristic.counterpart or NONE,
                     "new": f"{row.characteristic.original:g}{row.characteristic.suffix}",
                     "limit alone": row.in_words(row.scan.safe),
-                    "limit with all others at theirs": row.in_words(row.together),
+                    # No box of a rated study is sought.
+                    "limit with all others at theirs": NONE if row.scan.points else row.in_words(row.together),
                     "specified": row.specified_in_words,
                     "kept": row.verdict,
                     "fails first": row.first_failure["description"] if row.first_failure else NONE,
