@@ -31,8 +31,8 @@ hypothesis.settings.load_profile("default")
 # Programs that tests start need not compile the package each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 WORKER_PROCESSES = local.LocalPool
-FITS = 4
-"""Number of fitted vehicle models with which `explained` repeats its conclusions."""
+FITS = 2
+"""Number of fitted vehicle models of the study `slippery`, with which conclusions are repeated."""
 SLIPPERY = """
 extends = "smoke"
 name = "slippery"
@@ -44,8 +44,8 @@ visibility = 1.0
 recognition_delay = 0.15
 [search]
 algorithms = ["nsga2", "rs"]
-population = 10
-evaluations = 60
+population = 8
+evaluations = 56
 runs = 1
 """
 
@@ -91,14 +91,16 @@ def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of a small study on wet leaves: collisions and near misses among 30 solutions."""
+    """Results of a small study on wet leaves: collisions and near misses among 20 solutions."""
     folder = tmp_path_factory.mktemp("slippery")
     (folder / "slippery.toml").write_text(SLIPPERY)
-    return searched(load_study(str(folder / "slippery.toml")), folder / "results")
+    study = load_study(str(folder / "slippery.toml"))
+    sets = {name: values[:FITS] for name, values in study.spread.items()}
+    return searched(load_study(study, spread=sets), folder / "results")
 
 
 @pytest.fixture(scope="session")
 def explained(slippery: Path) -> Explained:
     """Explanations of the failures in the results `slippery`."""
     (case,) = load_cases([slippery])
-    return explain_failures(case, ExplainOptions(top=3, fits=FITS), Evaluator(case.study, InlinePool()))
+    return explain_failures(case, ExplainOptions(top=3), Evaluator(case.study, InlinePool()))

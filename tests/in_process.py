@@ -43,6 +43,12 @@ class InlinePool:
     def close(self) -> None: ...
 
 
+class TwoWorkers(InlinePool):
+    """A pool in this process whose work is split for two workers."""
+
+    workers = 2
+
+
 class SilentObserver:
     """An observer that ignores all reports."""
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
+import openpyxl
 import pytest
 
 from tests.in_process import refused
@@ -18,6 +18,7 @@ FILES = {
     "heavy.toml": 'extends = "smoke"\n[[constraints]]\nsum = { mass = 1 }\nat_least = 2500\n',
     "base.toml": 'extends = "sun"\n',
     "child.toml": 'extends = "base.toml"\nname = "child"\n',
+    "text.xlsx": "no spreadsheet",
     "mine.csv": "mass,radius\n1,2\n",
     "broken.py": "1 / 0\n",
     "mine.py": "class Mine: ...\n",
@@ -45,6 +46,11 @@ TYPED = [
     ("study smoke --shard 3/2", "K in 1..N"),
     ("study smoke --only nonsense", "ALGORITHM:RUN"),
     ("study smoke --only nsga2:2", "'nsga2:2'"),
+    ("study smoke --only nsga2:-1", "ALGORITHM:RUN"),
+    ("study smoke --only nsga2:\N{ARABIC-INDIC DIGIT ZERO}", "ALGORITHM:RUN"),
+    ("study smoke --shard 1/0", "K in 1..N"),
+    ("study smoke --evaluations 99999999999999999999", "--evaluations"),
+    ("study smoke --algorithms os:system", "os:system"),
     ("study smoke --cluster nowhere", "tcp://host:8786"),
     ("study smoke --cluster tcp://127.0.0.1:9", "no scheduler answers at 'tcp://127.0.0.1:9'"),
     ("study heavy.toml", "heavy.toml: the original vehicle: violates a constraint: mass = 2404 kg"),
@@ -62,6 +68,14 @@ TYPED = [
     ("simulate sun --set mass=+8", "or mass=+8% of the original, or any with --beyond"),
     ("simulate sun --set mass=2_404", "mass=2_404"),
     ("simulate sun --set weight=1", "weight"),
+    ("simulate sun --set mass", "NAME=VALUE"),
+    ("simulate sun --set mass=10%", "NAME=VALUE"),
+    ("simulate sun --set mass=1..", "NAME=VALUE"),
+    ("simulate sun --set mass=nan", "NAME=VALUE"),
+    ("simulate sun --set mass=2300 --set mass=2400", "mass is set twice"),
+    ("simulate sun --set mass=+50%", "mass = 3606"),
+    ("simulate sun --set mass=2100..9000", "mass = 2790"),
+    ("simulate sun --set mass=2100..2200:999 --set tireFric=1..2:999", "more than 10000 settings"),
     ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"),
     ("simulate sun --set tireFric=1..2:1", "at least 2"),
     ("simulate sun --set mass=2100..2200 --trace x.csv", "is a sweep"),
@@ -108,6 +122,21 @@ TYPED = [
     ("rating euro_ncap_rating --set treadDepth=300", "[1.6, 8] mm"),
     ("rating euro_ncap_rating --set treadDepth", "NAME=+10% of the original"),
     ("rating euro_ncap_rating --force", "--xlsx"),
+    ("rating euro_ncap_rating --xlsx new.xlsx", "--xlsx with --template"),
+    ("rating euro_ncap_rating --template there.xlsx", "--xlsx with --template"),
+    ("rating euro_ncap_rating --template there.xlsx --xlsx there.xlsx", "--force"),
+    ("rating euro_ncap_rating --preprocessed there.xlsx", "--force"),
+    ("rating euro_ncap_rating --template there.xlsx --preprocessed there.xlsx --xlsx new.xlsx", "but not both"),
+    (
+        "rating euro_ncap_rating --template nothing.xlsx --xlsx new.xlsx",
+        "nothing.xlsx: cannot be read as a spreadsheet",
+    ),
+    ("rating euro_ncap_rating --template . --xlsx new.xlsx", "cannot be read as a spreadsheet"),
+    ("rating euro_ncap_rating --template text.xlsx --xlsx new.xlsx", "text.xlsx"),
+    ("rating euro_ncap_rating --template there.xlsx --xlsx new.xlsx", "has no sheet 'Version'"),
+    ("rating euro_ncap_rating --set treadDepth=1.6..8:3", "one value"),
+    ("rating euro_ncap_rating --solution nsga2:0:0", "has no solutions"),
+    ("rating euro_ncap_rating --plot there.xlsx", ".png"),
     ("report results/smoke --only verdct", "did you mean 'verdict'?"),
     ("check mine:Nothing", "has no 'Nothing'"),
     ("check nothing:Mine", "No module named 'nothing'"),
@@ -160,18 +189,18 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("folder", "folder.csv", "folder.png"):
         (folder / name).mkdir()
     (folder / "link").symlink_to("nowhere")
+    openpyxl.Workbook().save(folder / "there.xlsx")
+    (folder / "__pycache__").mkdir()
     return folder
 
 
 @pytest.mark.parametrize(("typed", "told"), TYPED, ids=[typed for typed, _ in TYPED])
 def test_bad_input_ends_with_code_2_and_changes_no_file(
-    typed: str, told: str, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    typed: str, told: str, place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shutil.copytree(place, tmp_path / "here", symlinks=True)
-    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.chdir(place)
     monkeypatch.setattr("safevar_sumo.campaign.cluster.CONNECT_TIMEOUT", 0.5)
+    before = sorted(place.glob("[!_]*/*")), sorted(place.iterdir())
     refused(*typed.split(), message=(told,))
-    after = {str(path.relative_to(tmp_path / "here")) for path in (tmp_path / "here").rglob("*")}
-    before = {str(path.relative_to(place)) for path in place.rglob("*")}
-    assert {name for name in after - before if "__pycache__" not in name} == set()
+    assert (sorted(place.glob("[!_]*/*")), sorted(place.iterdir())) == before
     assert Path("solutions.csv").read_text() == "stored"

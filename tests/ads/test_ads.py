@@ -7,12 +7,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 
 from safevar_sumo.ads import ADS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.ads.published import WorldOnRails
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Along, CarToCar
@@ -75,34 +74,6 @@ def test_an_open_road_makes_it_drive(name: str) -> None:
     pedals = approach(system.ads, system.nominal, np.array([0.0]), np.array([1e3]))
     assert pedals[-1, 0, 0] > 0.1 or name in TAKE_OVER
     assert pedals[:, 1].max() == (1 if name == "full_braking" else 0)
-
-
-@given(lateral=st.floats(-3, 3), speed=st.floats(0, 8), gap=st.floats(0, 12))
-def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(
-    lateral: float, speed: float, gap: float
-) -> None:
-    ads = WorldOnRails(
-        first_command=0.0,
-        latency=0.0,
-        corridor=2.5,
-        brake_gap=9.0,
-        brake_gap_per_speed=-0.5,
-        brake_place=-0.4,
-        brake_gap_before=10.0,
-        brake_gap_past=2.0,
-        throttle=(0.8, 0.8, 0.5),
-    )
-    short, past = max(-0.4 - lateral, 0.0), max(lateral + 0.4, 0.0)
-    limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
-    assume(abs(gap - limit) > 1e-9)
-    seen = observation(1.0, np.full(1, speed), np.full(1, gap), np.full(1, lateral))._replace(visibility=0.9)
-    command, memory = ads.drive(seen, ads.start(1, KNOWN, STEP))
-    assert bool(command.brake[0]) == (gap < limit and abs(lateral) <= 2.5)
-    # Once it brakes, it goes on until the obstacle has left its corridor.
-    farther_command, _ = ads.drive(seen._replace(gap=np.full(1, 50.0)), memory)
-    assert farther_command.brake[0] == command.brake[0]
-    free_command, _ = ads.drive(seen._replace(lateral=np.full(1, 2.6)), memory)
-    assert free_command.brake[0] == 0
 
 
 class Timid(ScalarAds):

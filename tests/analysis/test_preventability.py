@@ -4,8 +4,6 @@ what makes a changed vehicle brake worse than the original, in parts of the lost
 
 from __future__ import annotations
 
-import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,9 +12,7 @@ import numpy as np
 import pytest
 import scipy
 
-from safevar_sumo.ads.reference_drivers import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, measure_braking
 from safevar_sumo.analysis.explain.causes import (
     STEP_FACTORS,
@@ -24,29 +20,20 @@ from safevar_sumo.analysis.explain.causes import (
     estimate_robustness,
     find_smallest_robust_failure,
 )
-from safevar_sumo.analysis.explain.compute import (
-    PointComparison,
-    compare_at_points,
-    explain_failures,
-    summarise_failures,
-)
+from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, summarise_failures
 from safevar_sumo.analysis.preventability import (
     Preventability,
     PreventableBy,
-    approach_parameters,
     assess_preventability,
     classify_collisions,
 )
 from safevar_sumo.analysis.research_questions.case import build_case
-from safevar_sumo.analysis.tolerance.answer import Tolerance
-from safevar_sumo.analysis.tolerance.boxes import SafeBox
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import ModelTable, load_study
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.vehicles import calibration_drive
 from tests.analysis.known_regions import box, made_up_evaluator
 from tests.in_process import InlinePool
 from tests.made_up import made_up_runs
@@ -186,38 +173,6 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     assert expected[0] < 1 / 3 < expected[1]
 
 
-@pytest.mark.slow
-def test_the_shares_do_not_change_with_the_gear_of_the_calibration_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In first gear the engine brakes with 2.8 m/s^2 at 20 km/h, in the gear of the shipped tables with 0.8 m/s^2."""
-    rain = load_study("rain")
-    first_gear = load_study(rain, vehicle={"parameters": {"shift_up": 0.65, "shift_down": 0.5, "shift_latency": 2.0}})
-    tables = assemble(first_gear).nominal.tables()
-    here, names = Evaluator(rain, InlinePool()), assemble(rain).characteristics.names
-    settings = np.tile(here.characteristics.original, (27, 1))
-    changed = ("mass", "gearSwitchTime", "tireFric", "dampRateZeroT_CE", "maxBrakeTorque")
-    settings[:, [names.index(name) for name in changed]] = list(
-        itertools.product((2690,), (0.41,), (1.0, 1.15, 1.3), (1.0, 1.2, 1.5), (1200, 1300, 1400))
-    )
-    evaluations = here.evaluate(settings, "worse tyres, less engine drag, weaker brakes")
-    colliding = evaluations.take(evaluations.collided)
-    shipped = classify_collisions(here, colliding)
-    assert len(set(shipped)) > 1, "all or none would be no test"
-    monkeypatch.setattr(sys.modules[calibration_drive.__module__], "_simulated_tables", lambda *_: tables)
-    assert classify_collisions(here, colliding) == shipped
-
-
-@pytest.mark.slow
-def test_a_vehicle_with_half_the_engine_drag_slows_down_while_its_driver_reacts() -> None:
-    rain = assemble(load_study("rain"))
-    shares = [0.5 if name.startswith("dampRate") else 1.0 for name in rain.characteristics.names]
-    driver = msgspec.convert({**approach_parameters(rain), "reaction_time": 1.15}, CompetentDriver)
-    trace = simulate(replace(rain, ads=driver), rain.characteristics.original[np.newaxis] * shares).trace
-    released = int(np.argmax((trace.time > 1) & (trace.throttle[:, 0] == 0)))
-    braking = int(np.argmax(trace.brake[:, 0] > 0))
-    assert (braking - released) * trace.step >= 1.0
-    assert np.diff(trace.speed[released:braking, 0])[6:].max() < 0  # 0.3 s later, when the wheels no longer push
-
-
 TESTS = [
     {"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
     {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}},
@@ -278,17 +233,6 @@ def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
         f"At {failure[0].point}, the original vehicle stops {degree:.2f} m short of the pedestrian. "
     )
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure[0].point}'")
-    whole = explain_failures(case, ExplainOptions(), Evaluator(case.study, InlinePool()), statistics=False)
-    tolerated = Tolerance(
-        study=study,
-        unsafe=Unsafe(),
-        original=original,
-        alone=[],
-        pairs=None,
-        joint=SafeBox(1.0, 0.95, 1, 0, 1, 0.003, ("mass",)),
-    )
-    assert whole.sentences()[0].startswith(first)
-    assert str(next(iter(tolerated.sentences()))).endswith(first)
 
 
 STEP, OBSTACLE = 0.002, 20.0

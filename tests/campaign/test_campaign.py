@@ -14,15 +14,13 @@ import pytest
 
 from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign
 from safevar_sumo.campaign.campaign import deal
-from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError
+from safevar_sumo.campaign.pool import WorkerLostError
 from safevar_sumo.campaign.run import Run
-from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory, load_runs
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import Study, load_study, tables_of
-from tests.campaign.formulas import SUN, Death, EventLog, FormulaPool, carried_out, solutions, with_search
+from safevar_sumo.study import Study, load_study
+from tests.campaign.formulas import Death, EventLog, FormulaPool, carried_out, solutions, with_search
 
 
 @pytest.fixture
@@ -74,31 +72,8 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
         assert len(share) < 3 or max(numbers.values()) - min(numbers.values()) <= 1
 
 
-@pytest.mark.slow
-def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Study, tmp_path: Path) -> None:
-    whole = FormulaPool()
-    carried_out(study, tmp_path / "whole", whole)
-    for limit in (1, 2, 3, 7, 20, 41):
-        out, first, second = tmp_path / str(limit), FormulaPool(limit=limit), FormulaPool()
-        with pytest.raises(PoolLostError, match="broken down"):
-            carried_out(study, out, first, batch=study.search.population)
-        carried_out(study, out, second)
-        assert solutions(out) == solutions(tmp_path / "whole")
-        assert set(first.simulated + second.simulated) == set(whole.simulated)
-        under_way = len(all_runs(study)) * study.search.population
-        assert len(first.simulated) + len(second.simulated) <= len(whole.simulated) + under_way
-
-
-def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> None:
-    pools = [FormulaPool() for _ in range(3)]
-    carried_out(with_search(study, runs=3), tmp_path / "whole", pools[0])
-    carried_out(with_search(study, runs=1), tmp_path / "grown", pools[1])
-    carried_out(with_search(study, runs=3), tmp_path / "grown", pools[2])
-    assert solutions(tmp_path / "grown") == solutions(tmp_path / "whole")
-    assert len(pools[1].simulated) + len(pools[2].simulated) == len(pools[0].simulated), "each setting once"
-
-
 def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> None:
+    study = with_search(study, algorithms=["nsga2", "rs"])
     carried_out(study, tmp_path / "whole")
     results = ResultsDirectory(tmp_path / "out", study)
     theirs = [results.journal("rs-01"), results.journal("original")]
@@ -131,20 +106,6 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(first, tmp_path / "out", FormulaPool(limit=0))
 
 
-def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:
-    carried_out(study, tmp_path, FormulaPool(workers=4), batch=3)
-    results = load_runs(tmp_path)
-    frame = results.evaluations
-    assert list(frame.columns[:3]) == ["algorithm", "run", "evaluation"]
-    for key in all_runs(study):
-        of_run = frame[(frame["algorithm"] == key.algorithm) & (frame["run"] == key.run)]
-        assert of_run["evaluation"].is_monotonic_increasing
-        assert of_run["evaluation"].iloc[0] == 0
-        assert of_run["evaluation"].iloc[-1] < study.search.evaluations
-    assert results.solutions.to_csv(index=False, lineterminator="\n").encode() == solutions(tmp_path)
-    assert results.manifest["study"] == tables_of(study)
-
-
 @pytest.mark.parametrize("workers", [1, 4])
 def test_a_forecast_counts_and_measures_the_search_itself(
     workers: int, study: Study, monkeypatch: pytest.MonkeyPatch
@@ -161,50 +122,6 @@ def test_a_forecast_counts_and_measures_the_search_itself(
     )
 
 
-class Deadly(FormulaPool):
-    """A worker dies of low tyre friction, at every attempt or only at each setting's first."""
-
-    def __init__(self, workers: int = 1, *, always: bool = True) -> None:
-        super().__init__(workers)
-        self._always = always
-        self._killed = set[bytes]()
-
-    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
-        deadly = {setting.tobytes() for setting in settings if setting[8] < 1.3}
-        if deadly if self._always else not deadly <= self._killed:
-            self._killed |= deadly
-            raise Death("died")
-        return super().evaluate(work, settings)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_settings_that_a_worker_dies_of_are_counted_kept_out_and_not_met_again(
-    workers: int, study: Study, tmp_path: Path
-) -> None:
-    pool = Deadly(workers)
-    campaign, _ = carried_out(study, tmp_path, pool)
-    frame = load_runs(tmp_path).evaluations
-    failed = frame["outcome"] == "simulator-error"
-    assert failed.sum() == len(campaign.failures) > 0
-    assert np.array_equal(failed, frame["tireFric"] < 1.3)
-    assert not (load_runs(tmp_path).solutions["tireFric"] < 1.3).any()
-    repeated = Counter(pool.simulated)
-    del repeated[SUN.original.tobytes()]
-    assert max(repeated.values()) <= 3, "an intact row is journalled at once: what kills a worker costs no other result"
-    before = solutions(tmp_path)
-    again, _ = carried_out(study, tmp_path, FormulaPool(limit=0))
-    assert again.failures == campaign.failures
-    assert solutions(tmp_path) == before
-
-
-def test_a_worker_that_dies_once_leaves_the_same_bytes(study: Study, tmp_path: Path) -> None:
-    carried_out(study, tmp_path / "whole")
-    campaign, _ = carried_out(study, tmp_path / "out", Deadly(always=False))
-    assert campaign.failures == []
-    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
-
-
 def test_a_worker_that_always_dies_outside_of_batches_ends_the_study(
     study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -214,27 +131,3 @@ def test_a_worker_that_always_dies_outside_of_batches_ends_the_study(
     monkeypatch.setattr(Run, "advance", die)
     with pytest.raises(WorkerLostError, match="died in the search"):
         carried_out(study, tmp_path)
-
-
-class Outage(FormulaPool):
-    """Cannot simulate low tyre friction today."""
-
-    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
-        if np.any(settings[:, 8] < 1.3):
-            raise SimulationError("SUMO failed: it has its day off")
-        return super().evaluate(work, settings)
-
-
-@pytest.mark.slow
-def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tmp_path: Path) -> None:
-    failed, _ = carried_out(study, tmp_path / "out", Outage())
-    results = load_runs(tmp_path / "out")
-    assert list(results.failures) == failed.failures != []
-    assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
-    with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
-        carried_out(study, tmp_path / "out", FormulaPool(limit=7), retry_failed=True)
-    campaign, _ = carried_out(study, tmp_path / "out", retry_failed=True)
-    carried_out(study, tmp_path / "whole")
-    assert campaign.failures == []
-    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
-    pd.testing.assert_frame_equal(load_runs(tmp_path / "out").evaluations, load_runs(tmp_path / "whole").evaluations)

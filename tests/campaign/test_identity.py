@@ -153,19 +153,6 @@ def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever
     assert read(place.parent / "copy") == result, "no name holds where the study lies"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["my_ads.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "tiles/1.txt", "table.bin"]
-)
-def test_an_edit_of_whatever_was_read_is_seen(name: str, place: Path) -> None:
-    before = read(place)
-    (place / name).write_text((place / name).read_text().replace("9.0", "8.0").replace("0.5", "0.4") + "\n")
-    if name.startswith("my_"):
-        (place / name).write_text((place / name).read_text() + "\nY = 2\n")
-    after = read(place)
-    assert [one for one in after if after[one] != before.get(one)] == [name]
-
-
 KINDS = (errno.EIO, errno.ENOSPC, errno.EINTR, 0)
 """Errors that a step fails with; 0 is a write of half of what was to be written, and no error elsewhere."""
 MOST_STEPS = 500

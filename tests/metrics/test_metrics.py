@@ -20,7 +20,6 @@ from safevar_sumo.metrics import (
     Unsafe,
     time_to_collision,
 )
-from safevar_sumo.metrics.measures import weight_acceleration
 from safevar_sumo.records import Encounter, Evaluations, SimulationRuns
 from safevar_sumo.study import MetricsTable, load_study
 from safevar_sumo.sumo.system import assemble
@@ -212,18 +211,6 @@ def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_sec
     speed = sampled(lambda t: 20 - t**2, 3.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(2.0)
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("frequency", [0.2, 0.5, 1.0, 2.0, 5.0])
-def test_weighting_agrees_with_iso_2631_1(frequency: float) -> None:
-    """The magnitude of H(s) by the standard's formula, on a settled sine sampled with a short step."""
-    step, f = 0.001, frequency
-    time = np.arange(0, 40, step)
-    low = np.abs(1j * f) ** 2 / np.abs((1j * f) ** 2 + np.sqrt(2) * 0.4 * 1j * f + 0.4**2)
-    shape = np.abs((1 + 1j * f / 2) / (1 + 1j * f / (0.63 * 2) - (f / 2) ** 2))
-    settled = weight_acceleration(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2 :]
-    assert np.sqrt(2 * np.mean(settled**2)) == pytest.approx(low * shape, rel=2e-3)
 
 
 def test_rms_agrees_with_scipys_filters() -> None:

@@ -95,31 +95,6 @@ def test_vehicles_with_any_colours_score_alike(
     agrees(rated, calculator, template, tmp_path)
 
 
-def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(
-    calculator: Calculator, template: Path, tmp_path: Path
-) -> None:
-    study = load_study("euro_ncap_rating")
-    characteristics = CharacteristicSet.of(study)
-    worst = characteristics.setting(
-        {
-            "treadDepth": 1.6,
-            "brakeTorque": 0.5,
-            "brakeResponse": 0.4,
-            "payload": 525,
-            "payloadCentre": 3.2,
-            "sensorRange": 15,
-            "sensorLatency": 0.4,
-        },
-        "worst",
-    )
-    result = rating_of(study, {"half": characteristics.setting({"brakeTorque": 0.5}, "half"), "worst": worst})
-    idle = rating_of(load_study(study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
-    for number, vehicle in enumerate([*result.vehicles, idle.original]):
-        agrees(vehicle, calculator, template, tmp_path / str(number))
-    assert result.original.points > result.vehicles[1].points > result.vehicles[2].points
-    assert idle.original.points == 0
-
-
 def test_the_pages_commands_run_as_typed(
     calculator: Calculator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

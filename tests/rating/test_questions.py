@@ -24,16 +24,11 @@ from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, run, searched
+from tests.in_process import TwoWorkers, run, searched
+from tests.sumo.test_recording import still as still
 
 STUDY = load_study("euro_ncap_rating")
 WHOLE = protocol_of(EURO_NCAP_2026)
-
-
-class TwoWorkers(InlinePool):
-    """A pool in this process that splits a rating's cells for two workers."""
-
-    workers = 2
 
 
 @pytest.fixture(autouse=True)
@@ -128,3 +123,9 @@ def test_a_rating_has_a_page_and_is_packed_and_made_again(in_tmp: Path) -> None:
     result = json.loads(run("verify", "it.zip", "--json").stdout)
     assert result["same"] == result["claims"]
     assert "answer rating" in {claim["claim"] for claim in result["table"]}
+
+
+@pytest.mark.slow
+def test_a_rating_begins_with_the_reason_and_a_robot_drives_who_does_nothing(still: str) -> None:
+    rated = json.loads(run("rating", still, "--json").stdout)
+    assert rated.get("driven", True) is (rated["variants"][0]["points"] == 0)  # 0 points: everything collides

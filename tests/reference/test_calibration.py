@@ -17,7 +17,7 @@ from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan_with_sets
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.calibration import Calibration, FitSubject, Profiles, calibrate
+from safevar_sumo.reference.calibration import FitSubject, Profiles, calibrate
 from safevar_sumo.reference.effects import error_beyond_spread, linear_effects
 from safevar_sumo.reference.fit_space import FitSpace, FittedParameter, reference_misfit
 from safevar_sumo.reference.rows import ReferenceData
@@ -53,11 +53,6 @@ def late(study: Study, hesitation: float) -> Study:
     own = FreeParameter(lower=0.0, upper=0.3, unit="s", meaning="pause", own=True)
     ads = msgspec.structs.replace(study.ads, parameters={**study.ads.parameters, "hesitation": hesitation})
     return msgspec.structs.replace(study, name="late", ads=ads, calibration={HESITATION: own})
-
-
-def fit_alone(study: Study, data: ReferenceData | None = None, *, from_scratch: bool = False) -> Calibration:
-    references = {} if data is None else {"mine": data}
-    return calibrate([FitSubject(study, references)], InlinePool(), from_scratch=from_scratch)[0]
 
 
 @pytest.mark.slow
@@ -157,23 +152,6 @@ class Bowl:
 def race_in(bowl: Bowl, population: int, trials: int) -> tuple[SearchRace, list[float]]:
     losses = list[float]()
     return SearchRace(bowl.misfits_at, population, trials, lambda loss, best: losses.append(loss)), losses
-
-
-def test_the_worse_half_gives_up_after_every_round() -> None:
-    class Runner:
-        """Has found what it has found, and counts its trials."""
-
-        def __init__(self, lowest: float) -> None:
-            self.lowest_loss, self.population, self.rounds = lowest, 1, list[int]()
-
-        def advance(self, trials: int) -> None:
-            self.rounds.append(trials)
-
-    runners = [Runner(lowest) for lowest in (5.0, 1.0, 4.0, 2.0, 3.0)]
-    race_in(Bowl(), 1, 300)[0].run(runners)  # type: ignore[arg-type]
-    # Rounds of 5, 3, 2 and 1 searches with 75 trials each; the winner gets what remains, which these runners never
-    # take.
-    assert [runner.rounds for runner in runners] == [[15], [15, 25, 37, 75, 300], [15], [15, 25, 37], [15, 25]]
 
 
 def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:

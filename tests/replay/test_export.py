@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -32,7 +33,6 @@ SCENES = {
     "lead_vehicle_stopped": ("lgsvl", ""),
 }
 HANDLE = ("--solution", "made:0:0")
-WITHOUT_CARLA = "CARLA's client has wheels for Linux and Python 3.10 to 3.12"
 
 
 def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]:
@@ -54,10 +54,7 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
 
 @pytest.fixture(
     scope="module",
-    params=[
-        pytest.param(name, marks=() if name in ("crossing", "lead_vehicle_stopped") else pytest.mark.slow)
-        for name in SCENES
-    ],
+    params=[pytest.param(name, marks=() if name == "lead_vehicle_stopped" else pytest.mark.slow) for name in SCENES],
 )
 def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Comparison]:
     study, point = SCENES[request.param]
@@ -92,7 +89,7 @@ def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Co
 
 
 def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[Path, Comparison]) -> None:
-    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
+    carla = pytest.importorskip("carla")
     out, comparison = exported
     road, row = carla.Map("road", (out / "road.xodr").read_text()), comparison.rows[-1]
     track, lanes = comparison.tracks["vut"], [lane for lane in comparison.road if lane.kind == "road"]
@@ -125,25 +122,19 @@ def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
 
 
 @pytest.fixture
-def for_carla(tmp_path: Path) -> tuple[Path, np.ndarray]:
+def for_carla(tmp_path: Path) -> tuple[Any, dict[str, Any], np.ndarray]:
+    """The exported script's functions, its record, and the setting."""
+    pytest.importorskip("carla", reason="CARLA's client has wheels for Linux and Python 3.10 to 3.12")
     results, _, setting = results_of("rain", tmp_path)
     run("export", str(results), *HANDLE, "--to", "carla", "--out", str(tmp_path / "out"))
-    return tmp_path / "out", setting
+    script = SimpleNamespace(**runpy.run_path(str(tmp_path / "out/run_in_carla.py")))
+    return script, json.loads((tmp_path / "out/vehicle.json").read_text()), setting
 
 
-def script_in(folder: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("run_in_carla", folder / "run_in_carla.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def test_carla_gets_all_twelve_values_in_its_units(for_carla: tuple[Any, dict[str, Any], np.ndarray]) -> None:
+    import carla
 
-
-def test_carla_gets_all_twelve_values_in_its_units(for_carla: tuple[Path, np.ndarray]) -> None:
-    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
-    folder, setting = for_carla
-    script, scene = script_in(folder), json.loads((folder / "vehicle.json").read_text())
+    script, scene, setting = for_carla
     empty = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl() for _ in range(4)])
     physics = script.apply_values(empty, scene)
     assert len(physics.wheels) == 4
@@ -165,10 +156,10 @@ def test_carla_gets_all_twelve_values_in_its_units(for_carla: tuple[Path, np.nda
     assert 30 < wheel_values[0][2] < 40, "centimetres"
 
 
-def test_carla_gets_pedals_places_and_walker(for_carla: tuple[Path, np.ndarray]) -> None:
-    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
-    folder, setting = for_carla
-    script, scene = script_in(folder), json.loads((folder / "vehicle.json").read_text())
+def test_carla_gets_pedals_places_and_walker(for_carla: tuple[Any, dict[str, Any], np.ndarray]) -> None:
+    import carla
+
+    script, scene, setting = for_carla
     comparison = compare_setting(load_study("rain"), assemble(load_study("rain")), setting)
     control, end = script.pedals(scene, 3), comparison.moments[-1].end
     assert control.throttle == pytest.approx(comparison.runs.trace.throttle[3, -1])
@@ -183,11 +174,11 @@ def test_carla_gets_pedals_places_and_walker(for_carla: tuple[Path, np.ndarray])
     assert np.sign(step.direction.y) == -np.sign(walker["places"][11][2] - y), "y points to the right in CARLA"
 
 
-def test_the_script_drives_the_whole_record(for_carla: tuple[Path, np.ndarray]) -> None:
+def test_the_script_drives_the_whole_record(for_carla: tuple[Any, dict[str, Any], np.ndarray]) -> None:
     """Calls only: no server was at hand."""
-    carla = pytest.importorskip("carla", reason=WITHOUT_CARLA)
-    folder, _ = for_carla
-    script, scene = script_in(folder), json.loads((folder / "vehicle.json").read_text())
+    import carla
+
+    script, scene, _ = for_carla
     vehicle, walker, world = MagicMock(), MagicMock(), MagicMock()
     world.spawn_actor.side_effect = [vehicle, walker, MagicMock()]
     vehicle.get_physics_control.return_value = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl()] * 4)
@@ -208,15 +199,8 @@ def test_bad_input_is_refused(tmp_path: Path) -> None:
     refused(*common, str(out), "--solution", "made:0:7", message=("there is no solution made:0:7", "expected"))
     refused(*common, str(results), *HANDLE, message=("--out", f"{results} exists", "a new directory"))
     refused(*common, str(out), *HANDLE, "--point", "nowhere", message=("--point", "nowhere"))
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("study", "without"), [("wear", "treadDepth, brakeTorque"), ("lgsvl", "wheelMass, maxRpm, minRpm")]
-)
-def test_a_vehicle_without_counterpart_is_refused(tmp_path: Path, study: str, without: str) -> None:
-    results, _, _ = results_of(study, tmp_path)
-    out = tmp_path / "out"
-    message = (without, "no counterpart in CARLA", "--to openscenario")
-    refused("export", str(results), *HANDLE, "--to", "carla", "--out", str(out), message=message)
+    for study, without in (("wear", "treadDepth, brakeTorque"), ("lgsvl", "wheelMass, maxRpm, minRpm")):
+        results, _, _ = results_of(study, tmp_path / study)
+        message = (without, "no counterpart in CARLA", "--to openscenario")
+        refused("export", str(results), *HANDLE, "--to", "carla", "--out", str(out), message=message)
     assert not out.exists()

@@ -23,15 +23,13 @@ from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.replay import animation
 from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene, find_ffmpeg
 from safevar_sumo.replay.comparison import COLOURS, Comparison, compare_setting, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.results import handles_of
-from safevar_sumo.study import load_study
-from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import refused
 
@@ -65,22 +63,6 @@ def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Ca
     )
     assert list_differences(rated, {"rating_points": 3.0, "outcome": "stopped"}) == [], "a single cell has no points"
     assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
-
-
-@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
-def test_a_film_shows_what_is_simulated(study: str) -> None:
-    system = assemble(load_study(study))
-    settings = np.stack([system.characteristics.original, system.characteristics.lower])
-    result = compare_setting(load_study(study), system, system.characteristics.lower)
-    for name, values in score(system, settings, simulate(system, settings)).metrics.items():
-        assert np.array_equal(values, result.evaluations.metrics[name], equal_nan=True)
-    vut = result.tracks["vut"]
-    assert np.array_equal(vut.x, result.runs.trace.position)
-    assert vut.length == result.runs.trace.vehicle_length
-    assert not np.isnan(vut.y).any()
-    for row, (_, _, end) in enumerate(result.moments):
-        assert result.runs.trace.active[end, row]
-        assert not result.runs.trace.active[end + 1 :, row].any()
 
 
 @pytest.fixture(scope="module")
@@ -117,27 +99,9 @@ def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -
             end = comparison.moments[row].end + 1
             assert list(line.get_xdata()) == list(trace.time[:end])
             assert list(line.get_ydata()) == list(values[:end, row])
-    words = " ".join(text.get_text() for text in figure.legends[0].get_texts())
-    assert comparison.verdict(0) in words
-    assert comparison.verdict(1) in words
-    heading = figure.get_suptitle()
-    for change in comparison.changes:
-        assert change in heading
-
-
-def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
-    """AEB releases the brake once there is no gap, which is after the collision."""
-    study = study_at(load_study("euro_ncap_pedestrian"), "CPLA, speed 60, clear", "point")
-    system = assemble(study)
-    setting = system.characteristics.original.copy()
-    for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
-        setting[system.characteristics.names.index(name)] = value
-    shown, runs = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
-    trace, end = shown.runs.trace, shown.moments[-1].end
-    assert shown.verdict(1).startswith("collides")
-    assert runs.trace.brake[end, 0] == 0
-    assert trace.brake[end, 1] == trace.brake[end - 1, 1] == runs.trace.brake[end - 1, 0] == 1
-    assert shown.evaluations.metrics["safety_degree"][1] == -runs.collision_speed[0]
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert all(any(comparison.verdict(row) in text for text in words) for row in (0, 1))
+    assert all(change in figure.get_suptitle() for change in comparison.changes)
 
 
 @pytest.fixture
@@ -213,8 +177,15 @@ def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Compari
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["gif", "html", pytest.param("mp4", marks=pytest.mark.slow)])
-def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["gif", "html", "mp4"])
+def test_the_same_bytes_twice(
+    kind: str, comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of few frames."""
+    save = animation._save
+    monkeypatch.setattr(animation, "SECONDS_PER_FRAME", 0.25)
+    if kind == "mp4":
+        monkeypatch.setattr(animation, "_save", lambda scene, stride, *rest: save(scene, 20, *rest))
     for name in ("a", "b"):
         animate(comparison, tmp_path / f"{name}.{kind}")
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()

@@ -22,7 +22,6 @@ from selenium.webdriver.common.by import By
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.replay.animation import animate
 from safevar_sumo.replay.comparison import compare_setting
-from safevar_sumo.report import input as report_input, make_report
 from safevar_sumo.sumo.system import assemble
 
 ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.cells[2].textContent))"
@@ -42,11 +41,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
 
 
 @pytest.fixture(scope="module")
-def report(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("page") / "report.html"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_input, "SAMPLED_VEHICLES", 256)
-        file.write_text(make_report([slippery], paper=True), encoding="utf-8")
+    file.write_text(page, encoding="utf-8")
     return file
 
 
@@ -139,8 +136,7 @@ def test_tables_sort_and_a_row_opens_its_replay(browser: Chrome, report: Path) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width", [390, 1400])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1400, "dark")])
 def test_it_fits_the_screen_and_everybody_can_read_it(
     width: int, scheme: str, browser: Chrome, report: Path, axe: str
 ) -> None:

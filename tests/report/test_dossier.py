@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.errors import InputError
 from safevar_sumo.report.dossier import FIRST, MEASURES, _Dossier, value_at
 from safevar_sumo.report.measurements import count_constants, measure_validation
@@ -109,6 +111,13 @@ def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
     assert stated[1] == [*stated[0], text]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _coarse_scans() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scans, "SCAN_VALUES", 21)
+        yield
+
+
 @pytest.fixture(scope="module")
 def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path, str]:
     """A dossier with all sections, the working directory of its commands, and its page."""
@@ -129,8 +138,11 @@ def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[di
 
 
 @pytest.mark.slow
-def test_every_number_is_made_by_its_command(packed: tuple[dict[str, Any], Path, str]) -> None:
+def test_every_number_is_made_by_its_command(
+    packed: tuple[dict[str, Any], Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     dossier, folder, _ = packed
+    monkeypatch.chdir(folder)
     assert dossier["first"] == FIRST
     outputs: dict[str, Any] = {}
     statements = [statement for section in dossier["sections"] for statement in section["statements"]]
@@ -138,9 +150,12 @@ def test_every_number_is_made_by_its_command(packed: tuple[dict[str, Any], Path,
         if statement["numbers"]:
             command = statement["command"]
             if command not in outputs:
-                words = [sys.executable, *shlex.split(command)[1:]]
-                done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=True)
-                outputs[command] = json.loads(done.stdout)
+                _, *words = shlex.split(command)
+                if words[:2] == ["-m", "safevar_sumo"]:
+                    output = run(*words[2:]).stdout
+                else:
+                    output = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
+                outputs[command] = json.loads(output)
             for path, number in statement["numbers"].items():
                 assert value_at(outputs[command], path) == number, (command, path)
     assert len(outputs) == 7, "manifest, checks, rows, explain, tolerance, risk, status"
@@ -167,6 +182,9 @@ def test_the_pack_with_all_sections_verifies(packed: tuple[dict[str, Any], Path,
     _, folder, _ = packed
     result = json.loads(run("verify", str(folder / "pack.zip"), "--json").stdout)
     assert result["same"] == result["claims"]
-    names = {claim["claim"] for claim in result["table"]}
-    assert {"checks", "dossier", "validation rows", "answer explain", "answer tolerance", "answer risk"} <= names
+    names = [claim["claim"] for claim in result["table"]]
+    assert sum(name.startswith("solution ") for name in names) == len(
+        pd.read_csv(folder / "results/slippery/solutions.csv")
+    )
+    assert {"checks", "dossier", "validation rows", "answer explain", "answer tolerance", "answer risk"} <= set(names)
     assert any(name.startswith("setting explain.") for name in names)

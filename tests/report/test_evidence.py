@@ -14,9 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from safevar_sumo.report import pack as packs
 from safevar_sumo.report.pack import DESCRIPTION, Description, describe, read_pack, write_pack
-from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
 from tests.analysis.test_repair import planted as planted
 from tests.in_process import refused, run
@@ -39,19 +37,14 @@ name = "mine"
 [ads]
 model = "mine:Mine"
 parameters = { limits = "limits.txt" }
+[scenario.parameters]
+network = "roads"
 [search]
 algorithms = ["rs"]
 population = 5
 evaluations = 20
 runs = 1
 """
-
-
-@pytest.fixture(scope="module")
-def pack(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("pack") / "pack.zip"
-    run("evidence", str(slippery), "--out", str(out), "--risk")
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +57,13 @@ def bare(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def mine(in_tmp: Path) -> Path:
-    """Results of a study with user code, which reads a file."""
-    (in_tmp / "there").mkdir()
+    """Results of a study with an own network and user code, which reads a file."""
+    there = in_tmp / "there"
+    shutil.copytree(NETWORKS / "pedestrian_crossing", there / "roads")
     for name, text in {"mine.py": MINE, "mine.toml": STUDY, "limits.txt": "6.0"}.items():
-        (in_tmp / "there" / name).write_text(text)
-    return searched_here(in_tmp / "there")
-
-
-def searched_here(folder: Path) -> Path:
-    run("study", str(folder / "mine.toml"), "--out", str(folder / "results"), "--quiet", "--jobs", "1")
-    return folder / "results"
+        (there / name).write_text(text)
+    run("study", str(there / "mine.toml"), "--out", str(there / "results"), "--quiet", "--jobs", "1")
+    return there / "results"
 
 
 def changed(source: Path, target: Path, name: str, change: Callable[[str], str], *, sealed: bool = True) -> str:
@@ -116,27 +106,9 @@ def not_same(*arguments: str) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_every_claim_is_the_same_in_another_folder(pack: Path, slippery: Path, in_tmp: Path) -> None:
-    result = json.loads(run("verify", str(pack), "--json").stdout)
-    solutions = len(load_runs(slippery).solutions)
-    assert result["claims"] == result["same"] == len(result["table"])
-    names = [claim["claim"] for claim in result["table"]]
-    assert sum(name.startswith("solution ") for name in names) == solutions
-    assert "answer risk" in names
-
-
-@pytest.mark.slow
-def test_the_packed_answer_has_the_bytes_that_its_command_prints(pack: Path, slippery: Path) -> None:
-    description, files = read_pack(pack)
-    (study,) = description.studies
-    (answer,) = study.answers
-    assert answer.command == "python -m safevar_sumo risk results/slippery --json"
-    printed = run(*answer.command.replace("results/slippery", str(slippery)).split()[3:]).stdout
-    assert files[f"{study.folder}/answers/risk.json"].decode() == printed
-
-
-@pytest.mark.slow
-def test_a_changed_claim_differs(pack: Path, tmp_path: Path) -> None:
+def test_a_changed_answer_differs(slippery: Path, tmp_path: Path) -> None:
+    pack = tmp_path / "pack.zip"
+    run("evidence", str(slippery), "--out", str(pack), "--risk")
     path = changed(pack, tmp_path / "it.zip", "risk.json", digit_of(r'"probability": 0\.(\d+)'))
     claim = next(claim for claim in not_same(path) if claim["claim"] != "dossier")
     assert claim["claim"] == "answer risk"
@@ -153,20 +125,13 @@ def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_changed_solution_differs_and_is_named(bare: Path, tmp_path: Path) -> None:
-    path = changed(bare, tmp_path / "it.zip", "solutions.csv", digit_of(r"\n(?:[^,]*,){14}-?\d+\.(\d+)"))
-    (claim,) = not_same(path)
-    assert claim["claim"] == "solution nsga2:0:0"
-    assert claim["packed"].split()[0] == claim["here"].split()[0] == "f_safe"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "pattern", "claims"),
     [
         ("study.toml", r"tyre_friction = 0\.(\d+)", {"study"}),
         ("manifest.json", r'"results": (\d)', {"inputs"}),
         ("manifest.json", r'"f_num_diff": (\d)', {"original vehicle"}),
+        ("solutions.csv", r"\n(?:[^,]*,){14}-?\d+\.(\d+)", {"solution nsga2:0:0"}),
         (DESCRIPTION, r'"solutions":(\d+)', {"number of solutions and runs"}),
     ],
 )
@@ -196,15 +161,6 @@ def test_what_no_claim_covers_is_damage(bare: Path, tmp_path: Path) -> None:
         for text in (b"[" * 100_000, b"", b"a,b\n1,2\n", b"\xff\xfe"):
             write_pack(tmp_path / "it.zip", description, {**files, f"1-slippery/{name}": text})
             refused("verify", str(tmp_path / "it.zip"), message=("1-slippery is damaged",))
-
-
-@pytest.mark.slow
-def test_a_changed_study_is_another_study_throughout(bare: Path, tmp_path: Path) -> None:
-    change = digit_of(r'"tyre_friction": 0\.(\d)')
-    claims = not_same(changed(bare, tmp_path / "it.zip", "manifest.json", change))
-    assert {"inputs", "study"} <= {claim["claim"] for claim in claims}
-    (named,) = [claim for claim in claims if claim["claim"] == "inputs"]
-    assert "tyre_friction" in named["here"]
 
 
 @pytest.fixture
@@ -255,7 +211,7 @@ def test_paths_that_leave_the_pack_are_refused(in_tmp: Path, name: str) -> None:
     assert os.listdir() == ["it.zip"]
 
 
-def test_links_bombs_and_other_files_are_refused(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
     link = zipfile.ZipInfo("link")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile("link.zip", "w") as archive:
@@ -263,58 +219,31 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path, monkeypatch: pyte
     refused("verify", "link.zip", message=("'link' is a symbolic link",))
     Path("text.zip").write_text("no archive")
     refused("verify", "text.zip", message=("is no zip archive",))
-    zeros = bytes(10_000_000)
-    monkeypatch.setattr(packs, "MAX_BYTES", len(zeros) - 1)
-    with zipfile.ZipFile("bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("zeros", zeros)
-    refused("verify", "bomb.zip", message=("unpacked it has",))
-
-
-@pytest.mark.slow
-def test_ten_gigabytes_of_zeros_are_refused_at_once(in_tmp: Path) -> None:
-    with (
-        zipfile.ZipFile("bomb.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-        archive.open("zeros", "w", force_zip64=True) as file,
-    ):
-        for _ in range(1_000):
-            file.write(bytes(10_000_000))
+    with zipfile.ZipFile("bomb.zip", "w") as archive:
+        archive.writestr("zeros", "")
+        archive.filelist[0].file_size = 10_000_000_000
     refused("verify", "bomb.zip", message=("unpacked it has 10.0 GB, at most 1 are allowed",))
 
 
 @pytest.mark.slow
-def test_user_code_runs_only_when_told(mine: Path, in_tmp: Path) -> None:
+def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(mine: Path, in_tmp: Path) -> None:
     run("evidence", str(mine), "--out", "it.zip")
-    for file in ("mine.py", "limits.txt"):
-        (mine.parent / file).unlink()
-    refused("verify", "it.zip", message=("would run code", "mine.py", "limits.txt", "--run-code"))
+    shutil.rmtree(mine.parent)
+    code = ("mine.py", "limits.txt", "roads/scenario.sumocfg")  # SUMO's options may name outputs
+    refused("verify", "it.zip", message=("would run code", *code, "--run-code"))
     result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
     assert result["same"] == result["claims"] > 4
     path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
     refused("verify", path, "--run-code", message=("code/limits.txt is not the file of the study's identity",))
-    assert sorted(os.listdir()) == ["it.zip", "other.zip", "there"]
-
-
-@pytest.mark.slow
-def test_an_own_network_travels_along(in_tmp: Path) -> None:
-    shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "there" / "roads")
-    (in_tmp / "there" / "mine.toml").write_text(
-        STUDY.replace(
-            '[ads]\nmodel = "mine:Mine"\nparameters = { limits = "limits.txt" }',
-            '[scenario.parameters]\nnetwork = "roads"',
-        )
-    )
-    run("evidence", str(searched_here(in_tmp / "there")), "--out", "it.zip")
-    shutil.rmtree(in_tmp / "there")
-    refused("verify", "it.zip", message=("roads/scenario.sumocfg", "--run-code"))  # SUMO's options may name outputs
-    result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
-    assert result["same"] == result["claims"] > 4
+    assert sorted(os.listdir()) == ["it.zip", "other.zip"]
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("planted")
-def test_repairs_are_packed_and_made_again(in_tmp: Path) -> None:
-    study = Path("planted.toml").read_text().replace("step_length = 0.005", "step_length = 0.02")
-    Path("planted.toml").write_text(re.sub(r"(always|colour) = \{ .*\n", "", study))  # one parameter may change
+def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
+    study = Path("planted.toml").read_text().replace("gap = 12.0, always", "gap = 30.0, always")
+    study = study.replace("at_least = 5", "at_least = 7.9").replace("step_length = 0.005", "step_length = 0.02")
+    Path("planted.toml").write_text(re.sub(r"(always|colour) = \{ .*\n", "", study))  # which it keeps already
     run("study", "planted.toml", "--out", "results", "--quiet", "--jobs", "1")
     run("evidence", "results", "--out", "it.zip", "--repair")
     result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)

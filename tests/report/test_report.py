@@ -24,89 +24,53 @@ import safevar_sumo
 from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
-from safevar_sumo.report import SECTIONS, input as report_input, make_report, page as report_page
+from safevar_sumo.report import SECTIONS, input as report_input, make_report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
-from safevar_sumo.report.sections import describe_conditions
 from safevar_sumo.results.manifest import write_manifest
-from safevar_sumo.scenarios import Point, weather_of
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
-from tests.analysis.known_regions import Plant
 from tests.in_process import searched
 
 
 class Outline(HTMLParser):
-    """Headings in order, tags that are open, ids, links and pictures of a page."""
+    """All tags of a page with their attributes, and those that are open at its end."""
 
     VOID = ("meta", "img", "input", "br", "link", "hr")
 
     def __init__(self, page: str) -> None:
         super().__init__()
-        self.headings: list[int] = []
-        self.ids: list[str] = []
-        self.links: list[str] = []
-        self.fetched: list[str] = []
-        self.alternatives: list[str | None] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.open: list[str] = []
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        group = dict(attrs)
-        if tag not in self.VOID:
-            self.open.append(tag)
-        if re.fullmatch("h[1-6]", tag):
-            self.headings.append(int(tag[1]))
-        self.ids += [str(group["id"])] if "id" in group else []
-        self.links += [str(group["href"])] if tag == "a" else []
-        self.fetched += [str(group[name]) for name in ("src", "srcset", "data", "poster") if name in group]
-        if tag == "img":
-            self.alternatives.append(group.get("alt"))
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_starttag(tag, attrs)
-        if tag not in self.VOID:
+        self.tags.append((tag, dict(attrs)))
+        self.open.append(tag)
+        if tag in self.VOID:
             self.open.pop()
 
     def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
-@pytest.fixture
-def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report_input, "SAMPLED_VEHICLES", 400)
-
-
-@pytest.fixture(scope="module")
-def page(slippery: Path, explained: Explained) -> str:
-    """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1 to 3.9."""
-    study = load_cases([slippery])[0].study
-    friction = list(study.vehicle.characteristics).index("tireFric")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_page, "explain_failures", lambda *_, **__: explained)
-        patch.setattr(report_input, "SAMPLED_VEHICLES", 400)
-        patch.setattr(local, "LocalPool", lambda *_: Plant(study, lambda rows: rows[:, friction] < 1.5))
-        shows: list[tuple[str, int, int]] = []
-        page = make_report([slippery], paper=True, jobs=1, progress=lambda *values: shows.append(values))
-        assert shows[0][1] == 0
-        assert shows[-1] == ("tables and figures", 0, 1)
-        assert all(done <= total for _, done, total in shows)
-        return page
+        assert tag in self.VOID or self.open.pop() == tag
 
 
 @pytest.mark.slow
 def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
     outline = Outline(page)
     assert outline.open == []
-    assert outline.headings[0] == 1
-    assert all(later - earlier <= 1 for earlier, later in pairwise(outline.headings)), "no heading is skipped"
-    assert len(outline.ids) == len(set(outline.ids))
-    assert all(link.startswith("#") and link[1:] in outline.ids for link in outline.links)
-    assert all(source.startswith("data:") for source in outline.fetched)
-    assert all(outline.alternatives)
+    headings = [int(tag[1]) for tag, _ in outline.tags if re.fullmatch("h[1-6]", tag)]
+    assert headings[0] == 1
+    assert all(later - earlier <= 1 for earlier, later in pairwise(headings)), "no heading is skipped"
+    ids = [group["id"] for _, group in outline.tags if "id" in group]
+    assert len(ids) == len(set(ids))
+    assert {group["href"] for tag, group in outline.tags if tag == "a"} <= {f"#{one}" for one in ids}
+    fetched = [
+        group[name] for _, group in outline.tags for name in ("src", "srcset", "data", "poster") if name in group
+    ]
+    assert all(str(source).startswith("data:") for source in fetched)
+    assert all(group.get("alt") for tag, group in outline.tags if tag == "img")
     assert not re.search(r"@import|url\((?!#|%23)", page)
     assert len(page.encode()) < 3_000_000
 
@@ -252,20 +216,6 @@ def test_a_study_that_cannot_be_simulated_has_no_page(slippery: Path, tmp_path: 
     write_manifest(tmp_path / "copy", manifest)
     with pytest.raises(InputError, match="gone"):
         make_report([tmp_path / "copy"], only=["tested"], jobs=1)
-
-
-@pytest.mark.parametrize(
-    ("weather", "has_effect"), [("carla_hard_rain", False), ("clear", True), ("hard_rain", True), ("night", True)]
-)
-def test_a_weather_without_effect_is_called_so(weather: str, has_effect: bool) -> None:
-    material: Any = SimpleNamespace(
-        system=SimpleNamespace(matrix=()), point="", case=SimpleNamespace(weather=weather_of(weather, "weather"))
-    )
-    assert describe_conditions(material).startswith(f"weather: {weather}")
-    assert ("no effect on road and sensors" not in describe_conditions(material)) is has_effect
-    points = (Point(None, weather_of("clear", "weather"), "x clear", (("test", "x"),)),)  # type: ignore[arg-type]
-    matrix: Any = SimpleNamespace(system=SimpleNamespace(matrix=points), point="")
-    assert describe_conditions(matrix).endswith("at all 1 points of a matrix (x, clear: 1 point)")
 
 
 def first_command(study: Study) -> list[str]:

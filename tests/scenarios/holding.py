@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -31,6 +32,19 @@ class Hold(Ads):
         throttle, brake = memory = memory or (seen.throttle, seen.brake)
         brakes = np.broadcast_to(seen.time >= self._brakes_at, seen.speed.shape)
         return Command(np.where(brakes, 0.0, throttle), np.where(brakes, 1.0, brake)), memory
+
+
+class Pedals(Ads):
+    """A driving system whose pedals are a function of the observation."""
+
+    def __init__(self, pedals: Callable[[Observation], tuple[Any, Any]]) -> None:
+        self._pedals = pedals
+
+    def start(self, n: int, nominal: Nominal, step: float) -> None: ...
+
+    def drive(self, seen: Observation, memory: None) -> tuple[Command, None]:
+        throttle, brake = (np.zeros(len(seen.speed)) + value for value in self._pedals(seen))
+        return Command(throttle, brake), None
 
 
 def driven(

@@ -24,10 +24,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import made_up_runs
-from tests.scenarios.holding import Hold, at_contact, driven
-
-NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5 / 3.6, 4.0, 1.0)}
-"""Speed [m/s], lateral start and acceleration distance [m] of the protocol."""
+from tests.scenarios.holding import at_contact, driven
 
 
 @pytest.mark.parametrize(
@@ -43,23 +40,6 @@ def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_i
     assert at_contact(run, run.trace.time) == pytest.approx(6.0, abs=1e-6)
     struck = at_contact(run, run.trace.lateral[:, 0]) / VUT_WIDTH + 0.5
     assert struck == pytest.approx(location / 100, abs=1e-6)
-
-
-@pytest.mark.parametrize("test", NUMBERS)
-def test_the_pedestrian_moves_as_the_closed_form_says(test: str) -> None:
-    """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact
-    location at 6 s.
-    """
-    speed, start, run_up = NUMBERS[test]
-    trace = driven(Crossing(test=test, speed=20.0), Hold(np.array([0.0]))).trace
-    acceleration = speed**2 / (2 * run_up)
-    begin = 6.0 - (speed / acceleration + (start - run_up) / speed)
-    since = np.maximum(trace.time - begin, 0.0)
-    way = np.where(
-        since < speed / acceleration, acceleration * since**2 / 2, run_up + speed * (since - speed / acceleration)
-    )
-    assert trace.lateral[:, 0] == pytest.approx(-start + way, abs=1e-6)
-    assert trace.lateral_speed[-1, 0] == pytest.approx(speed)
 
 
 @settings(max_examples=40)

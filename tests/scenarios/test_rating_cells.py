@@ -13,10 +13,10 @@ import pytest
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
+from tests.scenarios.holding import CARLA, Hold, at_contact, driven
+from tests.sumo.test_recording import assert_same
 
 KMH = 1 / 3.6
 NEAR, FAR = 1, -1
@@ -171,13 +171,7 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
     settings = np.repeat(system.characteristics.original[np.newaxis], n, axis=0)
-    (here,), (there,) = (simulate_all_points(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
-    assert here.runs.outcome.tolist() == there.runs.outcome.tolist()
-    assert set(here.runs.outcome) > {Outcome.COLLISION}
-    for name in ("collision_speed", "relative_speed", "warning_ttc"):
-        np.testing.assert_array_equal(getattr(here.runs, name), getattr(there.runs, name), err_msg=name)
-    for ours, theirs in zip(here.runs.contact, there.runs.contact, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    assert set(assert_same(system, settings)) > {Outcome.COLLISION}
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
@@ -231,19 +225,3 @@ def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some
     )
     assert not collided[:, 0].any()
     assert collided[:, 1].any()
-
-
-STOPS_AT_ONCE = Hold(np.array([0.0]))
-
-
-def test_the_braking_car_moves_as_the_closed_form_says() -> None:
-    """The car drives at 80 km/h and from 3 s on brakes at 4 m/s^2 down to 2 km/h; the vehicle stands behind it."""
-    trace = driven(CarToCar(test="CCRb", speed=80), STOPS_AT_ONCE, system=NATIVE).trace
-    first, last = 80 * KMH, 2 * KMH
-    since = np.clip(trace.time - 3, 0, (first - last) / 4)
-    after = np.maximum(trace.time - 3 - (first - last) / 4, 0)
-    place = first * np.minimum(trace.time, 3) + first * since - 2 * since**2 + last * after
-    assert trace.gap[:, 0] + trace.position[:, 0] - trace.position[0, 0] == pytest.approx(first + place, abs=0.05)
-    assert trace.obstacle_speed[:, 0] == pytest.approx(
-        np.where(trace.time < 3, first, np.maximum(first - 4 * (trace.time - 3), last))
-    )

@@ -11,15 +11,11 @@ import pytest
 from deap import tools
 from hypothesis import given, strategies as st
 
-from safevar_sumo.api.running import load_for_search
-from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
-from safevar_sumo.search.baselines import _Ranges, _scores
+from safevar_sumo.search.baselines import _Ranges
 from safevar_sumo.search.evolution import Individual, fitness_class, run_tournament
 from safevar_sumo.search.genetic import choose_survivor, select_survivors
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import POPULATION, SUN, evaluated, searched, sphere
 
@@ -159,12 +155,6 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
     assert ranges.max_changes == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 
 
-def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:
-    """SD 1, 2, 3 by min-max 0, 0.5, 1; numbers 1, 2, 2 of 2 give 0, 1, 1; changes 0.2, 0.4, 1."""
-    scores = _scores(window([[60, 50], [70, 60], [100, 0]], [1.0, 2.0, 3.0]), PUBLISHED_SCORING, 6.0)
-    assert scores == pytest.approx([0.2 / 8, (3 + 0.4 + 1) / 8, (6 + 1 + 1) / 8])
-
-
 def test_a_grid_closes_on_itself() -> None:
     around = MoCell(grid=(3, 4))._neighbours(12)
     assert sorted(around[0]) == [0, 1, 3, 4, 5, 7, 8, 9, 11], "the corner's neighbours are on all sides"
@@ -178,25 +168,6 @@ def test_a_child_that_neither_dominates_nor_is_dominated_enters_only_if_a_neighb
     assert choose_survivor(cell, child, [cell]) is cell
     assert choose_survivor(cell, child, [cell, far]) is cell
     assert choose_survivor(cell, child, [cell, worst]) is child
-
-
-@pytest.mark.parametrize(
-    ("search", "problem"),
-    [
-        (
-            {"mocell": {"grid": [3, 4]}},
-            "search.mocell.grid = [3, 4] has 12 cells\nexpected: two sides whose product is search.population = 10",
-        ),
-        ({"mocell": {"neighbourhood": "hexagonal"}}, "search.mocell.neighbourhood = 'hexagonal'"),
-        ({"spea2": {"archive": 0}}, "search.spea2.archive = 0"),
-        ({"spea2": {"archives": 7}}, "did you mean 'archive'?"),
-        ({"spea": {"archive": 7}}, "did you mean 'spea2'?"),
-    ],
-)
-def test_options_that_cannot_be_used_are_refused(search: dict[str, object], problem: str) -> None:
-    with pytest.raises(InputError) as refused:
-        load_for_search(load_study("smoke", search={"algorithms": ["spea2", "mocell"], **search}))
-    assert problem in str(refused.value)
 
 
 @pytest.mark.parametrize(

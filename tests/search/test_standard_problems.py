@@ -36,12 +36,9 @@ from tests.search.problems import evaluated
 EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 
 
-def zdt(shape: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
-    def objectives(x: np.ndarray) -> np.ndarray:
-        first, g = x[:, 0], 1 + 9 * x[:, 1:].mean(axis=1)
-        return np.stack([first, g * shape(first, g)], axis=1)
-
-    return objectives
+def zdt3(x: np.ndarray) -> np.ndarray:
+    first, g = x[:, 0], 1 + 9 * x[:, 1:].mean(axis=1)
+    return np.stack([first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))], axis=1)
 
 
 def dtlz2(x: np.ndarray) -> np.ndarray:
@@ -64,14 +61,8 @@ class StandardProblem(NamedTuple):
     reference: tuple[float, ...]
 
 
-PROBLEMS = {
-    "zdt1": StandardProblem(30, zdt(lambda first, g: 1 - np.sqrt(first / g)), (11.0, 11.0)),
-    "zdt2": StandardProblem(30, zdt(lambda first, g: 1 - (first / g) ** 2), (11.0, 11.0)),
-    "zdt3": StandardProblem(
-        30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (11.0, 11.0)
-    ),
-    "dtlz2": StandardProblem(12, dtlz2, (2.0, 2.0, 2.0)),
-}
+PROBLEMS = {"zdt3": StandardProblem(30, zdt3, (11.0, 11.0)), "dtlz2": StandardProblem(12, dtlz2, (2.0, 2.0, 2.0))}
+"""A front in parts, and a concave one of three objectives."""
 
 
 class Unfiltered(CharacteristicSet):
@@ -179,12 +170,17 @@ def front_of_nsga2(standard: StandardProblem, seed: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("problem", sorted(PROBLEMS))
 @pytest.mark.parametrize(
-    ("name", "theirs"), [("spea2", front_of_pymoo), ("mocell", front_of_mocell), ("nsga2", front_of_nsga2)]
+    ("name", "theirs", "problem"),
+    [
+        ("spea2", front_of_pymoo, "dtlz2"),
+        ("mocell", front_of_mocell, "dtlz2"),
+        ("mocell", front_of_mocell, "zdt3"),
+        ("nsga2", front_of_nsga2, "zdt3"),
+    ],
 )
 def test_hypervolumes_reach_those_of_the_second_implementation(
-    problem: str, name: str, theirs: Callable[[StandardProblem, int], np.ndarray]
+    name: str, theirs: Callable[[StandardProblem, int], np.ndarray], problem: str
 ) -> None:
     standard = PROBLEMS[problem]
     ours, others = (

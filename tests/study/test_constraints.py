@@ -5,7 +5,6 @@ refused.
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings, strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
@@ -21,7 +19,7 @@ from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import region_of
 from tests.in_process import run
-from tests.search.problems import SUN, searched
+from tests.search.problems import SUN
 
 ROUND = """
 def spread(values):
@@ -86,8 +84,8 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert set(frame["algorithm"]) == set(ALGORITHMS)
     assert len(frame) > 200
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
-    below = ("--unsafe", "below=2.5")
-    explained = json.loads(run("explain", "out", *below, "--top", "4", "--json").stdout)
+    below = ("--unsafe", "below=2.5", "--fits", "0")
+    explained = json.loads(run("explain", "out", *below, "--top", "2", "--limit", "500", "--json").stdout)
     tolerance = json.loads(
         run(
             "tolerance", "bound.toml", *below, "--pairs", "--json", "--characteristics", "tireFric,mass,maxBrakeTorque"
@@ -108,8 +106,8 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert [values for values in reported if not is_feasible(values)] == []
     assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
     for question in (
-        "explain out --unsafe below=2.5",
-        "tolerance bound.toml --unsafe below=2.5 --characteristics mass",
+        "explain out --unsafe below=2.5 --fits 0 --limit 500",
+        "tolerance bound.toml --unsafe below=2.5 --fits 0 --characteristics mass",
         "risk bound.toml --samples 200 --unsafe below=2.5",
         "rules bound.toml --samples 200 --unsafe below=2.5",
     ):
@@ -118,79 +116,8 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         ), question
 
 
-@pytest.mark.slow
-@settings(max_examples=10, deadline=None)
-@given(st.data())
-def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data: st.DataObject) -> None:
-    names = data.draw(st.lists(st.sampled_from(SUN.names), min_size=1, max_size=4, unique=True))
-    widths, units = (SUN.upper - SUN.lower).tolist(), {member.unit for member in SUN if member.name in names}
-    weights = {
-        name: data.draw(st.sampled_from([-2.0, -1.0, 0.5, 1.0])) / widths[SUN.names.index(name)] for name in names
-    }
-    middle = sum(weight * float(SUN.original[SUN.names.index(name)]) for name, weight in weights.items())
-    room = data.draw(st.tuples(st.floats(0.1, 1), st.floats(0.1, 1)))
-    unit = units.pop() if len(units) == 1 else "-"
-    study = load_study(
-        "smoke", constraints=[{"sum": weights, "unit": unit, "at_least": middle - room[0], "at_most": middle + room[1]}]
-    )
-    for name in ALGORITHMS:
-        _, populations = searched(name, data.draw(st.integers(0, 9)), 60, region=region_of(study))
-        for asked in populations:
-            value = sum(weight * asked[:, SUN.names.index(name)] for name, weight in weights.items())
-            assert np.all((value >= middle - room[0] - 1e-6) & (value <= middle + room[1] + 1e-6)), name
-            assert np.array_equal(SUN.filter(asked), asked)
-        assert sum(map(len, populations)) == 60
-
-
 def constrained(*constraints: Mapping[str, Any]) -> Study:
     return load_study("smoke", constraints=list(constraints))
-
-
-MASS, HEAD = "sum = { mass = 1 }\n", "[[constraints]]\n"
-ALL_FIXED = HEAD.join(
-    f"sum = {{ {name} = 1 }}\nat_least = {value}\nat_most = {value}\n"
-    for name, value in zip(SUN.names, SUN.original, strict=True)
-)
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        (f"{MASS}at_least = 2500", "the original vehicle: violates a constraint: mass = 2404 kg (mass = 2404 kg)"),
-        (
-            "sum = { mass = 1, maxBrakeTorque = -1 }\nunit = 'kg'\nat_most = 900",
-            "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected: at most 900 kg",
-        ),
-        (f"{MASS}at_least = 3000", "no setting in the domains satisfies all of them: mass at least 3000 kg"),
-        (
-            f"{MASS}at_least = 2404\n{HEAD}sum = {{ mass = 2, tireFric = 1 }}\nunit = 'kg'\nat_most = 4800",
-            "no setting in the domains satisfies all of them: mass at least 2404 kg; 2 mass + tireFric at most 4800 kg",
-        ),
-        (ALL_FIXED, "leave only the original vehicle"),
-        (f"{MASS}upper = 1", "constraints[0].upper: there is no such key\nexpected: one of at_least"),
-        (
-            "sum = { mas = 1 }\nat_least = 1",
-            "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?",
-        ),
-        (
-            f"{MASS}at_least = 1\nunit = 't'",
-            "constraints[0]: unit = 't' for the sum of mass [kg]\nexpected: one of -, kg",
-        ),
-        (
-            "sum = { mass = 1, radius = 1 }\nat_least = 1",
-            "constraints[0]: unit = None for the sum of mass [kg], radius [cm]",
-        ),
-        (MASS, "neither at_least nor at_most"),
-        (f"{MASS}at_least = 2\nat_most = 1", "at_least = 2 and at_most = 1"),
-        ("at_least = 2", "neither sum nor function"),
-        (f"{MASS}function = 'a:b'\nat_most = 2", "both sum and function"),
-        ("function = 'no_such_module:f'\nat_most = 2", "constraints[0].function = 'no_such_module:f'"),
-    ],
-)
-def test_constraints_that_cannot_be_used_are_refused(text: str, problem: str) -> None:
-    with pytest.raises(InputError) as refused:
-        region_of(load_study("smoke", **tomllib.loads(HEAD + text)))
-    assert problem in str(refused.value)
 
 
 def test_an_equation_leaves_what_satisfies_it() -> None:
@@ -224,6 +151,6 @@ def test_tolerance_refuses_characteristics_that_an_equality_ties_and_answers_for
         InputError,
         match="fewer than 1 in 1000 random settings satisfy the constraints, which leaves no box to test: mass",
     ):
-        sv.tolerance(tied, characteristics=["mass", "radius"], unsafe="collision", jobs=1)
-    free = sv.tolerance(tied, characteristics=["radius"], unsafe="collision", jobs=1)
+        sv.tolerance(tied, characteristics=["mass", "radius"], unsafe="collision", jobs=1, fits=0)
+    free = sv.tolerance(tied, characteristics=["radius"], unsafe="collision", jobs=1, fits=0)
     assert free.joint.samples > 0

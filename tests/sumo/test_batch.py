@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from safevar_sumo.ads import Ads
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import Outcome, Trace, differences
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
 from safevar_sumo.sumo.batch import _Outcomes
@@ -27,14 +25,6 @@ def drawn(system: System, n: int, seed: int) -> np.ndarray:
     return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
 
 
-def same_bits(one: Evaluations, other: Evaluations) -> bool:
-    numbers = [
-        (one.collision_speed, other.collision_speed),
-        *((one.metrics[name], other.metrics[name]) for name in one.metrics),
-    ]
-    return bool(np.array_equal(one.outcome, other.outcome)) and all(a.tobytes() == b.tobytes() for a, b in numbers)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 @settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -46,8 +36,8 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
     population = drawn(system, n, seed)
     together = evaluate(system, population)
     some = data.draw(st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True))
-    assert same_bits(together.take(some), evaluate(system, population[some]))
-    assert same_bits(together.take([0]), evaluate(system, population[:1]))
+    for rows in (some, [0]):
+        assert not [*differences(together.take(rows).results, evaluate(system, population[rows]).results)]
 
 
 def test_the_original_vehicle_does_not_collide(any_system: System, request: pytest.FixtureRequest) -> None:
@@ -120,48 +110,6 @@ def test_the_sample_in_which_the_encounter_ends_is_active_only_at_a_collision() 
 def test_the_last_sample_counts() -> None:
     assert judged((3, False, None), (3, False, None))[1] == [True, True]
     assert judged((3, False, None), (0, False, None))[0] == Outcome.STOPPED
-
-
-class _Pedals(Ads):
-    """Drives each vehicle with its own constant throttle, and brakes it from its own time on."""
-
-    def __init__(self, throttle: np.ndarray, brakes_at: np.ndarray) -> None:
-        self._throttle, self._brakes_at = throttle, brakes_at
-
-    def start(self, n: int, nominal: Nominal, step: float) -> None:
-        return None
-
-    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        brakes = seen.time >= self._brakes_at
-        return Command(np.where(brakes, 0.0, self._throttle), np.where(brakes, 1.0, 0.0)), memory
-
-
-def driven(study: str, n: int, brakes_until: float = 9.0) -> tuple[System, SimulationRuns]:
-    """The original vehicle n times, with pedals that lead to n different encounters."""
-    system = assemble(load_study(study))
-    rng = np.random.default_rng(7)
-    ads = _Pedals(rng.uniform(0.3, 1.0, n), rng.uniform(1.5, brakes_until, n))
-    system = System(**{**{name: getattr(system, name) for name in System.__dataclass_fields__}, "ads": ads})
-    return system, simulate(system, np.repeat(system.characteristics.original[np.newaxis], n, axis=0))
-
-
-@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
-def test_sumo_reports_a_collision_if_and_only_if_bodies_overlap(study: str) -> None:
-    _, run = driven(study, 120)
-    _check_against_geometry(study, run)
-    assert 10 < np.count_nonzero(run.outcome == Outcome.COLLISION) < 110
-
-
-def _check_against_geometry(study: str, run: SimulationRuns) -> None:
-    trace, collided = run.trace, run.outcome == Outcome.COLLISION
-    half_width, person, thickness = (2.1284 / 2, 0.478, 0.215) if study == "sun" else (1.85 / 2, 0.0, 0.0)
-    beside = np.abs(trace.lateral) <= half_width + thickness + 0.02 if study == "sun" else np.ones_like(trace.active)
-    within = (trace.gap < -0.02) & (trace.gap > -trace.vehicle_length - person + 0.02)
-    surely_beside = np.abs(trace.lateral) <= half_width - 0.02 if study == "sun" else beside
-    overlaps = (trace.active & within & surely_beside).any(axis=0)
-    touches = (trace.active & (trace.gap <= 0.02) & beside).any(axis=0)
-    assert np.all(collided[overlaps])
-    assert np.all(touches[collided])
 
 
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])

@@ -11,16 +11,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import Ads
-from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.driving_robot import DrivingRobot
-from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
+from safevar_sumo.records import Command, FloatArray, Outcome, SimulationRuns, differences
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import Body, find_touches
+from tests.scenarios.holding import Pedals
 
 BASE = load_study("euro_ncap_pedestrian")
 TESTS = [
@@ -47,12 +46,6 @@ def drawn(system: System, n: int) -> np.ndarray:
     return c.filter(np.random.default_rng(3).uniform(c.lower, c.upper, (n, len(c))))
 
 
-def same(one: Evaluations, other: Evaluations) -> bool:
-    return bool((one.outcome == other.outcome).all()) and all(
-        one.metrics[name].tobytes() == other.metrics[name].tobytes() for name in one.metrics
-    )
-
-
 @pytest.mark.slow
 def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> None:
     population = drawn(SYSTEM, 3)
@@ -65,26 +58,11 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     assert len(points) == 10
     for one in points[::3]:
         alone = evaluate(SYSTEM.at(one.point), population)
-        assert same(alone, one.evaluations), one.point.name
+        assert not [*differences(alone.results, one.evaluations.results)], one.point.name
     whole = evaluate(SYSTEM, population)
     assert whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
     collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
-
-
-@pytest.mark.parametrize(
-    ("tests", "message"),
-    [
-        ([TESTS[2], TESTS[2]], "2 points are 'CPLA"),
-        ([MatrixTest(name="x", over={"spede": [1]})], "spede"),
-        ([MatrixTest(name="x", over={"speed": [-1]})], "speed"),
-        ([MatrixTest(name="x", weathers=["sunny"])], "sunny"),
-        ([MatrixTest(name="x", model="nothing")], "nothing"),
-    ],
-)
-def test_the_error_names_the_wrong_value_in_a_matrix(tests: list[MatrixTest], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        assemble(study(tests))
 
 
 SUN = assemble(load_study("sun"))
@@ -93,27 +71,14 @@ MAX_RPM = SUN.characteristics.names.index("max_rpm")
 EAST = np.array([1.0, 0.0])
 
 
-class Pedals(Ads):
-    """Throttle and brake over time [s]."""
-
-    def __init__(
-        self, throttle: float = 0.5, *, brakes: tuple[float, float] = (99.0, 99.0), lets_go: float = 99.0
-    ) -> None:
-        self._throttle, self._brakes, self._lets_go = throttle, brakes, lets_go
-
-    def start(self, n: int, nominal: Nominal, step: float) -> Any:
-        return None
-
-    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        brakes, nothing = self._brakes[0] <= seen.time < self._brakes[1], np.zeros_like(seen.speed)
-        throttle = 0.0 if brakes or seen.time >= self._lets_go else self._throttle
-        return Command(nothing + throttle, nothing + (0.5 if brakes else 0.0)), memory
+HOLDS_HALF = Pedals(lambda seen: (0.5, 0))
+"""Half of the throttle."""
 
 
 def run(
     scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN
 ) -> SimulationRuns:
-    system = replace(system, scenario=scenario, ads=ads or Pedals())
+    system = replace(system, scenario=scenario, ads=ads or HOLDS_HALF)
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 
 
@@ -149,7 +114,7 @@ def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_b
     assert runs.outcome[0] == Outcome.INVALID_TEST
     assert runs.test_speed_error[0] * 3.6 < -0.5
     assert np.isnan(runs.collision_speed[0])
-    assert run(steep, Pedals(brakes=(0.0, 99.0)), system=WEAK).outcome[0] == Outcome.STOPPED
+    assert run(steep, Pedals(lambda seen: (0, 0.5)), system=WEAK).outcome[0] == Outcome.STOPPED
 
 
 @pytest.mark.parametrize(("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)])
@@ -177,17 +142,17 @@ def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_unless_it_col
     assert not evaluations.valid[0]
     assert not evaluations.failed[0]
     assert np.isnan(evaluations.f_safe[0])
-    assert evaluate(replace(steep, ads=Pedals()), original).outcome[0] == Outcome.COLLISION, (
+    assert evaluate(replace(steep, ads=HOLDS_HALF), original).outcome[0] == Outcome.COLLISION, (
         "at 10 km/h, where the speed is held"
     )
 
 
 def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_vehicle() -> None:
     far = CarToCar(test="CCRs", speed=50.0, headway=20.0)
-    coasts = run(far, Pedals(lets_go=2.0))
+    coasts = run(far, Pedals(lambda seen: (0.5 * (seen.time < 2), 0)))
     assert coasts.outcome[0] != Outcome.INVALID_TEST
     assert coasts.trace.throttle[41:, 0].max() == 0
-    faster = run(far, Pedals(1.0, brakes=(1.0, 1.1)))
+    faster = run(far, Pedals(lambda seen: (0, 0.5) if 1.0 <= seen.time < 1.1 else (1, 0)))
     assert abs(faster.test_speed_error[0]) * 3.6 < 0.5
     assert faster.trace.speed.max() * 3.6 > 60
 
