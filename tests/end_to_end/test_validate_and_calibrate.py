@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -117,6 +119,17 @@ def test_the_best_so_far_is_saved_now_and_then_and_if_a_calibration_is_interrupt
     assert Path("best.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# ")
     assert told in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
+
+
+@pytest.mark.slow
+def test_the_published_landscape_is_searched_without_a_simulation(data: Path) -> None:
+    script = Path(__file__).parents[2] / "docs" / "landscape.py"
+    command = [sys.executable, script, "sun", data, "--runs", "1", "--evaluations", "100"]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[1:]
+    rows, published = {line[:25].strip(): line[25:].split() for line in lines}, pd.read_csv(data)["SaftyDegree"]
+    assert rows["safety degree, mean [m]"][0] == f"{published.mean():.2f}"
+    assert rows["collisions [%]"][0] == f"{100 * (published <= 0).mean():.1f}0"
+    assert all(1 <= float(number) <= 12 for number in rows["characteristics changed"])
 
 
 @pytest.fixture(scope="module")
