@@ -105,7 +105,8 @@ def make_dossier(
         **{validation["file"]: (_measure(directory, validation["file"]), validation) for validation in validations},
         **answers,
     }
-    made = _Dossier(study, sources, list(answers), [validation["file"] for validation in validations])
+    files = [validation["file"] for validation in validations]
+    made = _Dossier(study, sources, list(answers), files, counts["runs"])
     sections = {
         "Intended use and scope": made.scope(),
         "Toolchain": made.toolchain(),
@@ -149,6 +150,7 @@ class _Dossier:
     sources: Mapping[str, tuple[str, Any]]
     questions: Sequence[str]
     validations: Sequence[str]
+    finished_runs: int
 
     @property
     def level(self) -> str:
@@ -332,6 +334,9 @@ class _Dossier:
 
     def open_points(self) -> Iterator[Statement]:
         yield Statement("No vehicle was driven: every statement is about models.")
+        runs = len(self.study.search.algorithms) * self.study.search.runs
+        if self.finished_runs < runs:
+            yield Statement(f"The search is not finished: {self.finished_runs} of {runs} runs.")
         if not self.validations:
             yield Statement("Reference data is missing: `evidence --reference FILE.csv` adds section 4.")
         if not self.study.evidence.threshold:

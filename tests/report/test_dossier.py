@@ -101,10 +101,12 @@ def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
     stated = []
     for answer in (record, [record, {"limit": {}}, limits]):
         sources = {"status": ("", {"simulated": 9}), "tolerance": ("", answer)}
-        made = _Dossier(load_study("native"), sources, ["tolerance"], [])
+        made = _Dossier(load_study("native"), sources, ["tolerance"], [], 29)
         statements = [one for one in made.results() if one.numbers and "simulated" not in one.numbers]
         assert all(value_at(answer, path) == value for one in statements for path, value in one.numbers.items())
-        assert any("the original vehicle never reaches" in one.text for one in made.open_points())
+        points = [one.text for one in made.open_points()]
+        assert any("the original vehicle never reaches" in one for one in points)
+        assert "The search is not finished: 29 of 30 runs." in points
         stated.append([one.text for one in statements])
     assert len(stated[0]) == 2
     text = "With the limits of the study: 0 of 1228 settings unsafe, at most 0.30% of all."
