@@ -130,6 +130,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, number in (("SOBOL_SETS", 64), ("DIAGONAL_SETS", 32)):
         monkeypatch.setattr(smallest, name, number)
     monkeypatch.setattr(attack, "RANDOM_ATTACKS", 64)
+    monkeypatch.setattr(attack, "GENERATIONS", 3)
     monkeypatch.setattr(compute, "SOBOL_VEHICLES", 32)
     monkeypatch.setattr(attack, "MAX_UNSAFE_SHARE", 0.01)
     (tmp_path / "models.py").write_text(MODELS)
@@ -170,7 +171,7 @@ def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -
 class Adding:
     """A problem without simulations: the changes of the parameters, up to 0.85 each, add up to what a vehicle needs."""
 
-    takes_arrays, margin, study = True, MARGIN, SimpleNamespace(search=SimpleNamespace(seed=3))
+    arrays, margin, study = True, MARGIN, SimpleNamespace(search=SimpleNamespace(seed=3))
 
     def __init__(self, parameters: int, need: float) -> None:
         self.today, self.parameters, self._need = np.full(parameters, 0.1), range(parameters), need

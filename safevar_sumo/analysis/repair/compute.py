@@ -116,7 +116,10 @@ def _problem_of(evaluator: Evaluator, options: RepairOptions) -> Problem:
     if options.curve is not None and options.curve not in evaluator.characteristics.names:
         evaluator.characteristics.setting({options.curve: 0.0}, "curve")  # raises the error of an unknown name
     margin = study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if options.margin is None else options.margin
-    return Problem(evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), margin=margin)
+    problem = Problem(
+        evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), margin=margin
+    )
+    return replace(problem, arrays=problem.takes_arrays())
 
 
 def _without_unread(problem: Problem, vehicles: FloatArray) -> tuple[Problem, list[str]]:

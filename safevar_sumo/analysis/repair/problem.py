@@ -199,13 +199,15 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 class Problem:
     """A study's ADS with parameters that may change, and the safety degree `margin` to keep within a promise.
 
-    Sets of parameters are arrays of shape (M, P) in [0, 1], shares of the range from lower to upper bound.
+    Sets of parameters are arrays of shape (M, P) in [0, 1], shares of the range from lower to upper bound. With
+    `arrays`, one ADS drives vehicles with different parameters; otherwise each set has an own instance.
     """
 
     evaluator: Evaluator
     promise: Promise
     parameters: list[Parameter]
     margin: float
+    arrays: bool = False
 
     @property
     def study(self) -> Study:
@@ -239,26 +241,19 @@ class Problem:
         """Row i: parameters i in vehicle i, at the worst of some points; without any, at the worst of all. The settings
         are the worn characteristics.
         """
-        evaluations = self._evaluate(shares, vehicles, stage, points, arrays=self.takes_arrays)
+        selection = Selection(tuple(one.name for one in self.parameters), tuple(points), self.arrays)
+        rows = np.concatenate([self.promise.settings(vehicles), self.values(shares)], axis=1)
         worn = self.promise.worn
         return replace(
-            evaluations,
+            self.evaluator.evaluate_selection(rows, selection, stage),
             settings=vehicles,
             f_diff=worn.largest_change(vehicles),
             f_num_diff=worn.number_changed(vehicles),
         )
 
-    def _evaluate(
-        self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int], *, arrays: bool
-    ) -> Evaluations:
-        selection = Selection(tuple(one.name for one in self.parameters), tuple(points), arrays)
-        rows = np.concatenate([self.promise.settings(vehicles), self.values(shares)], axis=1)
-        return self.evaluator.evaluate_selection(rows, selection, stage)
-
-    @cached_property
     def takes_arrays(self) -> bool:
         """Whether one ADS may drive vehicles with different parameters: a shipped one, or the user's if a sample has
-        the same results to the bit. Otherwise each set of parameters has an own instance.
+        the same results to the bit.
         """
         table = self.study.ads
         if table.kind or table.model in ADS:
@@ -267,10 +262,12 @@ class Problem:
         vehicles = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.worn), 1))
         stage = "does the driving system take arrays?"
         try:
-            together = self._evaluate(shares, vehicles, stage, (), arrays=True)
+            together = replace(self, arrays=True).evaluate(shares, vehicles, stage)
         except UserCodeError:
             return False
-        return not any(differences(self._evaluate(shares, vehicles, stage, (), arrays=False).results, together.results))
+        return not any(
+            differences(replace(self, arrays=False).evaluate(shares, vehicles, stage).results, together.results)
+        )
 
     def degrees(
         self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()

@@ -61,7 +61,7 @@ class Search:
         self.best = dict[Subset, FloatArray]()
         self._bounds = dict[Subset, float]()
         self._failures = list[Failure]()
-        self._thinning = 1 if problem.takes_arrays else THINNING
+        self._thinning = 1 if problem.arrays else THINNING
 
     def add(self, vehicles: FloatArray) -> None:
         """Add counterexamples, which are tried first."""
