@@ -127,12 +127,16 @@ grip = { at_least = 5 }
 
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name, number in (("SOBOL_SETS", 64), ("DIAGONAL_SETS", 32)):
-        monkeypatch.setattr(smallest, name, number)
-    monkeypatch.setattr(attack, "RANDOM_ATTACKS", 64)
-    monkeypatch.setattr(attack, "GENERATIONS", 3)
-    monkeypatch.setattr(compute, "SOBOL_VEHICLES", 32)
-    monkeypatch.setattr(attack, "MAX_UNSAFE_SHARE", 0.01)
+    for module, name, number in (
+        (smallest, "SOBOL_SETS", 64),
+        (smallest, "DIAGONAL_SETS", 32),
+        (attack, "RANDOM_ATTACKS", 64),
+        (attack, "GENERATIONS", 2),
+        (attack, "MAX_UNSAFE_SHARE", 0.01),
+        (compute, "SOBOL_VEHICLES", 32),
+        (compute, "CURVE_PROMISES", 5),
+    ):
+        monkeypatch.setattr(module, name, number)
     (tmp_path / "models.py").write_text(MODELS)
     (tmp_path / "planted.toml").write_text(STUDY)
     return tmp_path / "planted.toml"
