@@ -165,6 +165,11 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     assert np.isnan(scoring.values(failed)[:, 2]).all()
 
 
+def test_the_safety_degree_is_the_published_objective_and_any_other_metric_its_own() -> None:
+    names = [Objective.of(metric).name for metric in METRICS.values()]
+    assert names == ["f_safe", "tet", "tit", "ave_dece"]
+
+
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", RUN) == pytest.approx(5.0, rel=1e-9)
     assert value("ave_dece", RUN, COARSE) == pytest.approx(5.0)
