@@ -24,6 +24,8 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 MAX_PARAMETERS = 8
+DIGITS = 4
+"""Significant digits of a changed parameter: the value that is printed is the one that has been tried."""
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
 MAX_CORNERS = 256
@@ -222,14 +224,16 @@ class Problem:
         return np.asarray((today - lower) / (upper - lower))
 
     def values(self, shares: FloatArray) -> FloatArray:
-        """The parameters' values in their units; today's exactly where a share is today's."""
+        """The parameters' values in their units, with `DIGITS` digits; today's exactly where a share is today's."""
         columns = []
         for one, share, today in zip(self.parameters, shares.T, self.today, strict=True):
             if one.log:
                 value = one.lower * (one.upper / one.lower) ** share
             else:
                 value = one.lower + share * (one.upper - one.lower)
-            columns.append(np.where(share == today, one.today, np.clip(value, one.lower, one.upper)))
+            distinct, row_of = np.unique(value, return_inverse=True)
+            rounded = np.array([float(f"{one_value:.{DIGITS}g}") for one_value in distinct.tolist()])[row_of]
+            columns.append(np.where(share == today, one.today, np.clip(rounded, one.lower, one.upper)))
         return np.stack(columns, axis=1)
 
     def changed_values(self, one: FloatArray) -> dict[str, float]:
