@@ -54,6 +54,7 @@ class RecordedWorld:
         self._lanes, self._is_frozen = self._vut.way.at(self._lane_number), np.zeros(self.n, dtype=bool)
         self._fronts: FloatArray | None = None
         self._struck: dict[int, int] = {}
+        """The bodies that vehicles strike in this step, by vehicle: numbers among `_others`, all bodies beside them."""
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
         self._last_coordinates = self._last_fronts @ self._vut.along
         self._motion, self._sizes = _joined_tracks(recordings)

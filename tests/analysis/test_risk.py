@@ -15,7 +15,7 @@ import pytest
 import scipy
 
 from safevar_sumo import risk
-from safevar_sumo.analysis.risk import rare as rare_failures
+from safevar_sumo.analysis.risk import compute, rare as rare_failures
 from safevar_sumo.analysis.risk.answer import Risk
 from safevar_sumo.analysis.risk.variation import VariationModel
 from safevar_sumo.errors import InputError
@@ -230,6 +230,9 @@ def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same(monkey
     beyond = rare(linear(9.0), 2, method="subset_simulation")
     assert (beyond.method, beyond.probability) == ("subset_simulation", 0)
     assert "no failure was found" in beyond.remark
+    monkeypatch.setattr(compute, "is_plateau", lambda responses: False)
+    flat = rare(lambda u: np.select([u[:, 0] > end for end in (6, 3, 2, 1)], [-1, 1, 2, 3], 5.0), 2)
+    assert (flat.method, "a plateau before failures" in flat.remark) == ("monte_carlo", True)
     lost = rare(lambda u: np.where(u[:, 0] > 9.0, -1.0, 5.0 + 0.001 * u[:, 1]), 2, method="cross_entropy")
     assert (lost.method, lost.failures) == ("monte_carlo", 0)
     assert "lost all failures" in lost.remark

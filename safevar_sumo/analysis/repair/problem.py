@@ -269,9 +269,8 @@ class Problem:
             together = replace(self, arrays=True).evaluate(shares, vehicles, stage)
         except UserCodeError:
             return False
-        return not any(
-            differences(replace(self, arrays=False).evaluate(shares, vehicles, stage).results, together.results)
-        )
+        alone = self.evaluate(shares, vehicles, stage)
+        return not any(differences(alone.results, together.results))
 
     def degrees(
         self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()

@@ -177,7 +177,8 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float]
     def level_stagnates() -> bool:
         nonlocal is_stagnant
         thresholds = list(algorithm.getThresholdPerStep())
-        return len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
+        is_stagnant = len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
+        return is_stagnant
 
     algorithm.setStopCallback(level_stagnates)
     ot.RandomGenerator.SetSeed(seed)
