@@ -88,7 +88,6 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
 def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
-    make_directory(out)
     paths, notes = save_figures(cases, out, format_name)
     _print_notes([*(remark for case in cases for remark in case.remarks), *notes])
     for path in paths:

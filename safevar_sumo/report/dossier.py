@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
@@ -57,6 +58,7 @@ STATE_WITH = {
 """What a safety case has to say beside an answer."""
 
 
+ROUNDINGS = {"ceil": ROUND_CEILING, "floor": ROUND_FLOOR}
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 
 
@@ -79,6 +81,13 @@ class _Reading(Formatter):
         path = f"{self.at}{field_name}"
         self.numbers[path] = value = value_at(self.answer, path)
         return float("nan") if value is None else value, field_name
+
+    def format_field(self, value: Any, format_spec: str) -> Any:
+        """A limit of a safe range is rounded into the range, by `ceil` or `floor`, to four digits."""
+        if format_spec in ROUNDINGS:
+            context = Context(prec=4, rounding=ROUNDINGS[format_spec])
+            value, format_spec = float(context.create_decimal(repr(value))), ".6g"
+        return super().format_field(value, format_spec)
 
 
 def value_at(answer: Any, path: str) -> Any:
@@ -319,7 +328,7 @@ class _Dossier:
         first, at = (tolerance[0], "0.") if has_limits else (tolerance, "")
         for index, row in enumerate(first["alone"]):
             if row["safe"]:
-                text = "Alone: no unsafe value of {characteristic} found from {safe.0:.4g} to {safe.1:.4g}"
+                text = "Alone: no unsafe value of {characteristic} found from {safe.0:ceil} to {safe.1:floor}"
                 yield self._say("tolerance", f"{text}{unit_text(row['unit'])}.", at=f"{at}alone.{index}.")
         if first.get("joint"):
             bound = "at most {unsafe_at_most:.2%} unsafe with {confidence:.0%} confidence"

@@ -238,7 +238,7 @@ def make_pack(
     if len({path.stem for path in references}) < len(references):
         raise InputError("references", "two files have the same name", "files of different names")
     cases = list[tuple[Path, Case]]()
-    for directory in map(Path, directories):
+    for directory in dict.fromkeys(map(Path, directories)):
         case = study_or_case(directory, results_only=True)
         assert isinstance(case, Case)
         if not case.has_runs:

@@ -102,7 +102,7 @@ def verify(
     path
         The pack.
     sample
-        Number of claims, drawn at random; by default all.
+        Number of claims, drawn at random, besides that of the search; by default all.
     search
         Whether to repeat the whole search, too.
     run_code
@@ -129,10 +129,12 @@ def verify(
     with ExitStack() as stack:
         for part in parts:
             part.unpack_code(path, Path(stack.enter_context(tempfile.TemporaryDirectory())))
-        names = [(part, name) for part in parts for name in part.names(search)]
+        names = [(part, name) for part in parts for name in part.names]
         if sample is not None and sample < len(names):
             drawn = np.random.default_rng().choice(len(names), sample, replace=False)
             names = [names[index] for index in sorted(drawn.tolist())]
+        if search:
+            names += [(part, "search") for part in parts]
         claims = list[Claim]()
         for part in parts:
             with local_pool(jobs or available_cores(), part.subject.study.search.time_limit) as pool:
@@ -195,8 +197,9 @@ class _Part:
                 raise InputError(path, f"{CODE}/{name} is not the file of the study's identity", PACK)
         self.subject = subject_of(packed, files, [str(folder)] if packed.code else [])
 
-    def names(self, search: bool) -> list[str]:
-        """The names of all claims."""
+    @property
+    def names(self) -> list[str]:
+        """The names of all claims but that of the search."""
         validations = self.subject.in_folder(VALIDATIONS)
         return [
             "inputs",
@@ -208,7 +211,6 @@ class _Part:
             "checks",
             *(f"validation {name}" for name in validations),
             "dossier",
-            *(["search"] if search else []),
         ]
 
     def claims(self, names: Sequence[str], pool: Pool) -> Iterator[Claim]:

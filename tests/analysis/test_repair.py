@@ -18,6 +18,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.analysis.repair import attack, compute, smallest
 from safevar_sumo.analysis.repair.answer import NotRepairable, write_repair
+from safevar_sumo.analysis.repair.problem import Parameter, Problem
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.shipped import STUDY_SCHEMA
@@ -220,6 +221,13 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
     (summary,) = json.loads(done.stdout)
     assert summary["repairs"] == 0
     assert not out.exists()
+
+
+def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
+    nothing: Any = None
+    rows = [Parameter("a", "m", "", low, high, False, low) for low, high in ((1000.0, 1001.0), (0.0, 20.0))]
+    problem = Problem(evaluator=nothing, promise=nothing, parameters=rows, margin=0.3)
+    assert problem.values(np.array([[0.45678, 0.41234567]])).tolist() == [[1000.457, 8.247]]
 
 
 def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_searched(

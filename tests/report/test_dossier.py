@@ -91,7 +91,7 @@ def test_constants_are_counted_by_origin() -> None:
 
 
 def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
-    alone = {"characteristic": "decel", "unit": "m/s^2", "safe": [4.8, 9.5]}
+    alone = {"characteristic": "decel", "unit": "m/s^2", "safe": [4.80012, 9.49999]}
     record = {
         "driven": False,
         "alone": [alone],
@@ -108,6 +108,7 @@ def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
         assert any("the original vehicle never reaches" in one for one in points)
         assert "The search is not finished: 29 of 30 runs." in points
         stated.append([one.text for one in statements])
+    assert stated[0][0].endswith("from 4.801 to 9.499 m/s^2."), "rounded to the safe side"
     assert len(stated[0]) == 2
     text = "With the limits of the study: 0 of 1228 settings unsafe, at most 0.30% of all."
     assert stated[1] == [*stated[0], text]

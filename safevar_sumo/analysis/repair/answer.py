@@ -256,7 +256,7 @@ class Repairs:
 
     def _changes_in_words(self, repair: Repair) -> str:
         return ", ".join(
-            f"{one.name} {one.today:.4g} -> {repair.values[one.name]:.4g}{unit_text(one.unit)} ({one.meaning})"
+            f"{one.name} {one.today:.6g} -> {repair.values[one.name]:.10g}{unit_text(one.unit)} ({one.meaning})"
             for one in self.parameters
             if one.name in repair.values
         )
@@ -271,13 +271,14 @@ def write_repair(path: Path, result: Repairs) -> None:
         If the file cannot be written.
     """
     study, values = result.study, result.repairs[0].values
+    comment = result.verdict + (f" Only {study.origin.point} was simulated." if study.origin.point else "")
     if not study.origin.called and study.name not in study_names():
-        write_study(path, result.repaired_study(), result.verdict)
+        write_study(path, result.repaired_study(), comment)
         return
     base = os.path.abspath(study.origin.called) if study.origin.called else study.name
     name = {"name": path.stem} if re.fullmatch(NAME_PATTERN, path.stem) else {"name": f"{study.name}-repaired"}
     tables = {"extends": base, **name, "ads": {"parameters": values}}
-    text = f"{SCHEMA_LINE}# {result.verdict}\n\n{tomli_w.dumps(tables)}"
+    text = f"{SCHEMA_LINE}# {comment}\n\n{tomli_w.dumps(tables)}"
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
 

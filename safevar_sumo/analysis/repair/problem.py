@@ -25,7 +25,9 @@ from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 MAX_PARAMETERS = 8
 DIGITS = 4
-"""Significant digits of a changed parameter: the value that is printed is the one that has been tried."""
+"""Significant digits of a changed parameter, or of its range if that needs more decimals: the value that is printed is
+the one that has been tried.
+"""
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
 MAX_CORNERS = 256
@@ -224,7 +226,7 @@ class Problem:
         return np.asarray((today - lower) / (upper - lower))
 
     def values(self, shares: FloatArray) -> FloatArray:
-        """The parameters' values in their units, with `DIGITS` digits; today's exactly where a share is today's."""
+        """The parameters' values in their units, rounded (`DIGITS`); today's exactly where a share is today's."""
         columns = []
         for one, share, today in zip(self.parameters, shares.T, self.today, strict=True):
             if one.log:
@@ -232,7 +234,9 @@ class Problem:
             else:
                 value = one.lower + share * (one.upper - one.lower)
             distinct, row_of = np.unique(value, return_inverse=True)
-            rounded = np.array([float(f"{one_value:.{DIGITS}g}") for one_value in distinct.tolist()])[row_of]
+            sizes = np.minimum(np.where(distinct == 0, np.inf, np.abs(distinct)), one.upper - one.lower)
+            decimals = (DIGITS - 1 - np.floor(np.log10(sizes))).astype(int).tolist()
+            rounded = np.array(list(map(round, distinct.tolist(), decimals)))[row_of]
             columns.append(np.where(share == today, one.today, np.clip(rounded, one.lower, one.upper)))
         return np.stack(columns, axis=1)
 

@@ -39,6 +39,7 @@ from safevar_sumo.analysis.research_questions.statistics import (
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.records import FloatArray
+from safevar_sumo.results import make_directory
 from safevar_sumo.study import SAFETY_DEGREE
 
 if TYPE_CHECKING:
@@ -346,7 +347,7 @@ def save_figures(cases: Sequence[Case], directory: Path, file_format: str) -> tu
         If the directory cannot be written, or no figure can be drawn.
     """
     figures, reasons = draw_figures(cases)
-    directory.mkdir(parents=True, exist_ok=True)
+    make_directory(directory)
     files = []
     for name, figure in figures.items():
         file_name = re.sub(r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name).strip("-")
