@@ -12,11 +12,11 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.campaign import local
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import load_study, study_names

@@ -10,8 +10,8 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.model_spread import studies_of_sets
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.campaign.batches import evaluate_all
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Inputs, Selection, Task
 from safevar_sumo.campaign.identity import ask_why_no_verdict, inputs_of

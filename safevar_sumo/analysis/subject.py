@@ -21,7 +21,7 @@ from safevar_sumo.terminal import Progress, open_progress
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.analysis.research_questions.case import Case
+    from safevar_sumo.analysis.case import Case
     from safevar_sumo.campaign.pool import Pool
 
 Answer = TypeVar("Answer")
@@ -115,7 +115,7 @@ def load(directory: str | Path) -> Results:
     InputError
         If the directory holds no results, or a file in it is damaged.
     """
-    from safevar_sumo.analysis.research_questions.case import load_cases
+    from safevar_sumo.analysis.case import load_cases
 
     return Results(Path(directory), load_cases([directory])[0])
 

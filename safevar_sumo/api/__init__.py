@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from safevar_sumo.analysis.case import Case
     from safevar_sumo.analysis.research_questions.answer import Answer
-    from safevar_sumo.analysis.research_questions.case import Case
 
 
 class Tables(dict[str, "pd.DataFrame"]):
@@ -95,6 +95,6 @@ def figures(*results: Results | str | Path) -> Figures:
 
 
 def _load_cases(results: tuple[Results | str | Path, ...]) -> list[Case]:
-    from safevar_sumo.analysis.research_questions.case import load_cases
+    from safevar_sumo.analysis.case import load_cases
 
     return load_cases([source.directory if isinstance(source, Results) else source for source in results])

@@ -30,7 +30,7 @@ from safevar_sumo.study import Study, load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.research_questions.case import Case
+    from safevar_sumo.analysis.case import Case
 
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 

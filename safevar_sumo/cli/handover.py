@@ -14,8 +14,8 @@ import click
 import numpy as np
 from rich.console import Console
 
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_questions
-from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS
 from safevar_sumo.cli.arguments import (

@@ -9,7 +9,7 @@ import click
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.api.simulation import evaluate_settings
 from safevar_sumo.cli.arguments import (
     check_output,

@@ -196,9 +196,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1
     and RQ2 in brief.
     """
+    from safevar_sumo.analysis.case import build_case
     from safevar_sumo.analysis.evaluator import Evaluator
     from safevar_sumo.analysis.explain.compute import summarise_failures
-    from safevar_sumo.analysis.research_questions.case import build_case
 
     # Loads more slowly than all other modules.
     from safevar_sumo.analysis.research_questions.comparisons import summary_lines

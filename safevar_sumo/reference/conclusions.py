@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import ANY, change_numbers, count_changes
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
 from safevar_sumo.records import FloatArray, JsonObject

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, are_collisions
+from safevar_sumo.analysis.case import NSGA2, Case, are_collisions
 from safevar_sumo.analysis.research_questions.tables import TITLES
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject

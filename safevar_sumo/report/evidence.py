@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import Case, are_collisions, build_case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
@@ -24,7 +25,6 @@ from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.repair.compute import find_repairs
-from safevar_sumo.analysis.research_questions.case import Case, are_collisions, build_case
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.subject import answer_question, study_or_case

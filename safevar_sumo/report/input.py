@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since

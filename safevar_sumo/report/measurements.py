@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import scipy
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.model_spread import HALF_WIDTH, compute_model_spreads
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import load
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool

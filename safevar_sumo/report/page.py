@@ -17,6 +17,7 @@ from urllib.parse import quote
 import pandas as pd
 from markupsafe import Markup
 
+from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.compute import explain_failures
@@ -24,7 +25,6 @@ from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.figures import draw_figures
 from safevar_sumo.analysis.research_questions.tables import lay_out
 from safevar_sumo.analysis.risk.compute import estimate_risk

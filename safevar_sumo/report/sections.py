@@ -13,12 +13,12 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.analysis.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause
 from safevar_sumo.analysis.explain.failure import Explanation
 from safevar_sumo.analysis.model_spread import compute_model_spreads
 from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.research_questions.tables import BoldText
 from safevar_sumo.analysis.words import number_of, points_in_words, question_command
 from safevar_sumo.errors import InputError

@@ -3,6 +3,8 @@
 from safevar_sumo.study.characteristics import (
     CharacteristicTable as CharacteristicTable,
     Constraint as Constraint,
+    Limit as Limit,
+    limits_of as limits_of,
     unit_text as unit_text,
 )
 from safevar_sumo.study.file import (
@@ -13,7 +15,6 @@ from safevar_sumo.study.file import (
     user_code_packages as user_code_packages,
     write_study as write_study,
 )
-from safevar_sumo.study.limits import Limit as Limit, limits_of as limits_of
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,

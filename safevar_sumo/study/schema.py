@@ -17,9 +17,9 @@ from safevar_sumo.study.characteristics import (
     Constraint,
     Correlation,
     Distribution,
+    Limit,
     PositiveNumber,
 )
-from safevar_sumo.study.limits import Limit
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]

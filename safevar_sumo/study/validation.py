@@ -13,8 +13,12 @@ import msgspec
 from jsonschema import ValidationError
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
-from safevar_sumo.study.characteristics import CharacteristicTable, constraint_mistakes, variation_mistakes
-from safevar_sumo.study.limits import limit_mistakes
+from safevar_sumo.study.characteristics import (
+    CharacteristicTable,
+    constraint_mistakes,
+    limit_mistakes,
+    variation_mistakes,
+)
 from safevar_sumo.study.schema import FMU_KEYS, Parameters, Study, Tables
 
 T = TypeVar("T")

@@ -17,6 +17,7 @@ from click.testing import CliRunner
 from hypothesis import given, strategies as st
 from rich.console import Console
 
+from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
@@ -33,7 +34,6 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.compute import explain_failures, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
-from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scipy
 
+from safevar_sumo.analysis.case import build_case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, measure_braking
 from safevar_sumo.analysis.explain.causes import (
@@ -27,7 +28,6 @@ from safevar_sumo.analysis.preventability import (
     assess_preventability,
     classify_collisions,
 )
-from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.results import record, solutions_frame

@@ -14,8 +14,8 @@ import scipy
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo import risk, rules, tolerance
+from safevar_sumo.analysis.case import build_case
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.rules.compute import Rule, Rules
 from safevar_sumo.analysis.tolerance import ToleranceOptions, boxes, compute
 from safevar_sumo.analysis.tolerance.answer import Tolerance

@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.analysis.case import build_case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures, summarise_failures
-from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.plugins.check import check

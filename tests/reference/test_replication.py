@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
-from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference.agreement import rank_correlation, shipped_totals_of
 from safevar_sumo.reference.conclusions import (

@@ -19,7 +19,7 @@ from click.testing import CliRunner, Result
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from safevar_sumo.analysis.research_questions.case import Case, load_cases
+from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.campaign import local
 from safevar_sumo.report import input as report_input, make_report, page as report_page
 from tests.analysis.known_regions import Plant

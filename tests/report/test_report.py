@@ -22,8 +22,8 @@ from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo.ads.reference_drivers import FullBraking
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number

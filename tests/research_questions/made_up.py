@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.case import Case, build_case
+from safevar_sumo.analysis.case import Case, build_case
 from safevar_sumo.study import CharacteristicTable, Study, load_study
 
 ORIGINAL = {"safety_degree": 2.0, "tet": 1.0, "tit": 0.5, "ave_dece": 6.0}

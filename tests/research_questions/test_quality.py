@@ -18,8 +18,8 @@ import pytest
 import scipy
 from hypothesis import given, strategies as st
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.research_questions.statistics import (
     EXACT_TEST,
     compare_samples,

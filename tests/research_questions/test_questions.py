@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy
 
+from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import (
     compare_weathers,
     count_collisions,
@@ -229,9 +229,8 @@ def test_collisions_and_their_share() -> None:
 def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
-    other = made_up(
-        row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=MetricsTable(ttc_threshold=9))
-    )
+    changes = {"metrics": MetricsTable(ttc_threshold=9), "step_length": 0.05}
+    other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", **changes))
     assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [("made-up", "wet")]
     result = only(compare_weathers(clear, wet), characteristic="mass")
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
@@ -240,7 +239,7 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     )
     assert (result["rank"], result["rank_other"]) == (1, 1)
     with pytest.raises(
-        InputError, match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold"
+        InputError, match=r"differ in the weather alone; these two also differ in step_length, metrics\.ttc_threshold"
     ):
         answer_questions([clear, other], "weather")
     with pytest.raises(InputError, match="these two have equally clear weather"):

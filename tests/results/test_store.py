@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 import safevar_sumo as sv
-from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.compare.answer import Side, SystemComparison
 from safevar_sumo.analysis.evaluator import MAX_REJECTIONS, Evaluator, sobol_points
 from safevar_sumo.analysis.rating.compute import rate
-from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import compare_weathers
 from safevar_sumo.analysis.research_questions.statistics import compare_samples, fewest_runs, signed_rank_test
 from safevar_sumo.analysis.subject import study_in

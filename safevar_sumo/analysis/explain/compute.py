@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
@@ -31,7 +32,6 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import at_point
 from safevar_sumo.analysis.words import list_of_changes, question_command
 from safevar_sumo.errors import InputError

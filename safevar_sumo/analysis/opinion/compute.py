@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause, draw_neighbours
@@ -21,7 +22,6 @@ from safevar_sumo.analysis.figures import FONT_SIZE, new_figure
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehicle
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import ending_in_words, join_phrases, list_of_changes, number_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe

@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.figures import FONT_SIZE, new_panels
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.vehicles import DECIMALS, LEGEND, POINT_KINDS, RatedVehicle, draw_matrix, max_points
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, Protocol

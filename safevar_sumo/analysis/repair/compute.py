@@ -2,7 +2,7 @@
 
 The steps of the algorithm: 0. what no driving system survives; 1. counterexamples; 2. the smallest changes that survive
 them (`smallest`); 3. attacks on these, whose failures are new counterexamples (`attack`); 4. the end, when attacks find
-nothing, or the largest promise that can be kept; 5. proof on fresh wear; 6. what the repair has not seen (`held_out`).
+nothing, or the largest promise that can be kept; 5. proof on fresh wear; 6. what the repair has not seen (`price`).
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import cause_key, describe_causes, find_minimal_causes
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.repair.answer import Exchange, NotRepairable, Repair, Repairs
 from safevar_sumo.analysis.repair.attack import Proof, attack, prove
-from safevar_sumo.analysis.repair.held_out import check_unseen
-from safevar_sumo.analysis.repair.price import Prices
+from safevar_sumo.analysis.repair.price import Prices, check_unseen
 from safevar_sumo.analysis.repair.problem import Problem, Promise, parameters_of
 from safevar_sumo.analysis.repair.smallest import Search
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated

@@ -19,7 +19,7 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
-from safevar_sumo.study.limits import limit_mistakes
+from safevar_sumo.study.characteristics import limit_mistakes
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 

@@ -12,14 +12,8 @@ from typing import NamedTuple
 
 import pandas as pd
 
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
 from safevar_sumo.analysis.research_questions import changes, comparisons
-from safevar_sumo.analysis.research_questions.case import (
-    ALGORITHM_TITLES,
-    NSGA2,
-    Case,
-    UnanswerableError,
-    solutions_for_metric,
-)
 from safevar_sumo.analysis.research_questions.statistics import fewest_runs
 from safevar_sumo.errors import unknown_name
 

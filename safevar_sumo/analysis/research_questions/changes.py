@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from safevar_sumo.ads import REACTION_PARAMETERS
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, are_collisions
+from safevar_sumo.analysis.case import NSGA2, Case, UnanswerableError, are_collisions
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -256,7 +256,8 @@ def _differences(one: Case, other: Case) -> list[str]:
     for study in studies:
         for name in (*REACTION_PARAMETERS, *(key.removeprefix("ads.parameters.") for key in own_keys)):
             study["ads"]["parameters"].pop(name, None)
-    return [
+    whole = [key for key in ("matrix", "constraints", "step_length") if studies[0][key] != studies[1][key]]
+    return whole + [
         f"{table}.{key}"
         for table in ("scenario", "vehicle", "ads", "metrics")
         for key in studies[0][table] | studies[1][table]

@@ -17,13 +17,7 @@ from itertools import combinations, product
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.case import (
-    ALGORITHM_TITLES,
-    NSGA2,
-    Case,
-    UnanswerableError,
-    solutions_for_metric,
-)
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
 from safevar_sumo.analysis.research_questions.statistics import (
     ALPHA,
     INDICATOR_TITLES,

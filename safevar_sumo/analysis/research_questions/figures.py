@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.figures import (
     BLUE,
     FONT_SIZE,
@@ -23,7 +24,6 @@ from safevar_sumo.analysis.figures import (
     save,
 )
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq32
 from safevar_sumo.analysis.research_questions.comparisons import rank_algorithms
 from safevar_sumo.analysis.research_questions.statistics import (

@@ -15,7 +15,7 @@ import pandas as pd
 import scipy
 from numpy.typing import ArrayLike
 
-from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
+from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import scipy
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.answer import SOBOL, Estimate, Risk, effect_columns
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns

@@ -16,9 +16,9 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Interval, clopper_pearson
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, escape_dollars, new_figure
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.metrics import Unsafe

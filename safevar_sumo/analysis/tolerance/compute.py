@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.boxes import SafeBox, find_safe_box, random_settings

@@ -64,8 +64,9 @@ class JointLimits(NamedTuple):
         """The result of the box's test."""
         bound = f"with {100 * CONFIDENCE:.0f} % confidence at most {100 * self.at_most:.2f} % of all are"
         if not self.kept:
+            drawn = f"{self.unsafe} of {self.samples} settings drawn at random"
             return (
-                f"The limits are not kept: {self.unsafe} of {self.samples} settings drawn at random within them, all "
+                f"The limits are not kept: {drawn if self.unsafe else 'settings that a search found'} within them, all "
                 f"other characteristics as in the original, are unsafe; {bound}."
             )
         return (
