@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.risk.answer import Estimate
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -125,6 +125,11 @@ def estimate_rare(response: Response, method: str, confidence: float) -> Estimat
         failures.
     """
     seed, estimates = response.evaluator.study.search.seed, list[tuple[float, float]]()
+    interval = clopper_pearson(response.failures, response.samples, confidence)  # of independent vehicles so far
+    remark = (
+        f"the method found no failure: either there is none, or the response does not lead to it; the interval is "
+        f"that of the first {response.samples} vehicles"
+    )
     repeats, is_subset = REPEATS, method == "subset_simulation"
     while len(estimates) < repeats:
         estimate_once = _run_subset_simulation if is_subset else _run_cross_entropy
@@ -134,8 +139,7 @@ def estimate_rare(response: Response, method: str, confidence: float) -> Estimat
     probabilities, coefficients = np.array(estimates).T
     mean = float(np.mean(probabilities))
     failures, errors = response.failures, response.errors  # without those around the design point
-    coefficient_of_variation, interval, design_point = math.nan, (0.0, MIN_PROBABILITY), None
-    remark = "no failure was found: either there is none, or the response does not lead to it"
+    coefficient_of_variation, design_point = math.nan, None
     if mean > 0:
         observed = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
         estimated = INFLATION * math.sqrt(float(np.mean(np.square(coefficients))) / repeats)
