@@ -70,10 +70,10 @@ class ThisProcess:
         future.set_result(carry_out_job(job, report, self._evaluate))
         return future
 
-    def _evaluate(self, work: bytes, settings: FloatArray) -> Evaluations:
-        self.batches.append((work, settings))
+    def _evaluate(self, packed_task: bytes, settings: FloatArray) -> Evaluations:
+        self.batches.append((packed_task, settings))
         start = time.process_time()
-        evaluations = evaluate_batch(work, settings)
+        evaluations = evaluate_batch(packed_task, settings)
         self.simulation += time.process_time() - start
         return evaluations
 
@@ -110,8 +110,8 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
 
 
 def compute(batches: list[Computed]) -> None:
-    for work, settings in batches:
-        evaluate_batch(work, settings)
+    for packed_task, settings in batches:
+        evaluate_batch(packed_task, settings)
 
 
 def ceiling(batches: list[Computed]) -> float:

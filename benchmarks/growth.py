@@ -27,15 +27,15 @@ FIRST = 5000
 
 def records_of(study: Study, evaluations: int) -> Iterator[Record]:
     """Measure the first and the last `FIRST` evaluations of one worker, and its memory after both."""
-    work, spans = Task(study=study).packed, []
+    packed_task, spans = Task(study=study).packed, []
     with local_pool(1, study.search.time_limit) as pool:
-        evaluate_batches([Batch(work, drawn(study, MAX_VEHICLES))], pool)
+        evaluate_batches([Batch(packed_task, drawn(study, MAX_VEHICLES))], pool)
         worker = next(child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
         first = 0
         for done in range(0, evaluations, FIRST):
             before = sum(worker.cpu_times()[:2])
             for batch in range(FIRST // MAX_VEHICLES):
-                evaluate_batches([Batch(work, drawn(study, MAX_VEHICLES, seed=done + batch))], pool)
+                evaluate_batches([Batch(packed_task, drawn(study, MAX_VEHICLES, seed=done + batch))], pool)
             spans.append(sum(worker.cpu_times()[:2]) - before)
             first = first or worker.memory_info().rss
         last = worker.memory_info().rss

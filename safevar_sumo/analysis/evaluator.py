@@ -12,9 +12,9 @@ import numpy as np
 
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.model_spread import studies_of_sets
-from safevar_sumo.campaign.batches import evaluate_all
+from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Inputs, Selection, Task
-from safevar_sumo.campaign.identity import ask_why_no_verdict, inputs_of
+from safevar_sumo.campaign.identity import inputs_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
 from safevar_sumo.errors import InputError, SimulationError

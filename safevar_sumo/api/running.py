@@ -10,8 +10,9 @@ from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import Campaign, Observer, RunKey, RunProgress, algorithm_of, all_runs, run_campaign
+from safevar_sumo.campaign.batches import ask_why_no_verdict
 from safevar_sumo.campaign.cluster import cluster_pool
-from safevar_sumo.campaign.identity import ask_why_no_verdict, identity_of
+from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn

@@ -1,4 +1,4 @@
-"""Carries out a study: its runs, dealt out in shares to the workers of a pool.
+"""Carries out a study: its runs, dealt out in shares to the workers of a pool (`pool.py` defines the words).
 
 A search is a generator that requests evaluations of settings. The run of the search looks each setting up in its
 journal and memory, has new settings evaluated, journals the evaluations and sends them to the search; a resumed run
@@ -14,8 +14,9 @@ from safevar_sumo.campaign.campaign import (
     forecast as forecast,
     run_campaign as run_campaign,
 )
-from safevar_sumo.campaign.pool import RunKey as RunKey, RunProgress as RunProgress
 from safevar_sumo.campaign.run import (
+    RunKey as RunKey,
+    RunProgress as RunProgress,
     algorithm_of as algorithm_of,
     all_runs as all_runs,
     random_generator_of as random_generator_of,

@@ -1,47 +1,55 @@
-"""Evaluation of many settings by a pool, in batches, for questions; and checks of results against SUMO."""
+"""What a pool computes for a study besides its runs: many settings for a question, in batches; whether simulations tell
+anything about the ADS; and the check of user code.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Callable
+from contextlib import suppress
+from importlib.metadata import version
 
-import msgspec
 import numpy as np
+import platformdirs
 
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Inputs, Selection, Task, network_digests
-from safevar_sumo.campaign.identity import check_code, inputs_of
-from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
-from safevar_sumo.errors import InputError
-from safevar_sumo.protocol.rater import study_for_sumo_check
-from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
-from safevar_sumo.study import Study
+from safevar_sumo.campaign.evaluation import (
+    EVERYTHING,
+    VERIFIED_SETTINGS,
+    Inputs,
+    Selection,
+    Task,
+    refuse_unlike_sumo,
+    tasks_for_sumo,
+)
+from safevar_sumo.campaign.identity import inputs_of
+from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches, evaluate_original
+from safevar_sumo.campaign.run import user_algorithm_packages
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import RESULTS
+from safevar_sumo.study import Study, tables_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, is_recorded, settings_per_batch
 
 BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the time left is known."""
-ECONOMICAL_SHARE = 1 / 4
-"""Size of a batch, as a share of the most economical one, from which the steps of a simulation cost no more than its
-vehicles: smaller batches are one for each worker.
+ECONOMICAL_FRACTION = 1 / 4
+"""Fraction of the most economical batch size from which on the steps of a simulation cost no more than its vehicles.
+Settings that fill only smaller batches make one batch for each worker.
 """
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
-"""Results of `choose_batch_size`, by packed study."""
+"""Results of `choose_batch_size`, by packed task."""
 _verified_counts: dict[bytes, int] = {}
-"""Number of settings with verified results, by packed study."""
-
-
-def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
-    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
-    SUMO.
-    """
-    system = selection.of(assemble(study, study.source))
-    return settings_per_batch(system, Engine.RECORDED), is_recorded(system)
+"""Number of settings with verified results, by packed task."""
+_passed_checks: set[str] = set()
+"""Identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
 
 
 def evaluate_all(
     study: Study,
     settings: FloatArray,
     pool: Pool,
-    done: Callable[[int], None] = lambda number: None,
+    done: Callable[[int], None] = lambda size: None,
     verified: int = VERIFIED_SETTINGS,
     selection: Selection = EVERYTHING,
     inputs: Inputs | None = None,
@@ -54,20 +62,23 @@ def evaluate_all(
     a caller that evaluates many times may keep the `inputs` (`inputs_of`).
     """
     inputs = inputs_of(study, pool) if inputs is None else inputs
-    work = Task(study=study, inputs=inputs, selection=selection).packed
+    packed_task = Task(study=study, inputs=inputs, selection=selection).packed
     check_code(study, inputs, pool)
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
-    if work not in _batch_sizes:
-        _batch_sizes[work] = choose_batch_size(study, selection)
-    best_size, is_recorded = _batch_sizes[work]
-    share = len(distinct_settings) / pool.workers
-    size = math.ceil(min(best_size, max(share / BATCHES_PER_WORKER, min(share, ECONOMICAL_SHARE * best_size))))
-    batches = [Batch(work, distinct_settings[start : start + size]) for start in range(0, len(distinct_settings), size)]
-    sample_size = max(min(verified - _verified_counts.get(work, 0), len(distinct_settings)), 0)
+    if packed_task not in _batch_sizes:
+        _batch_sizes[packed_task] = choose_batch_size(study, selection)
+    best_size, has_recorded_scene = _batch_sizes[packed_task]
+    per_worker = len(distinct_settings) / pool.workers
+    size = math.ceil(
+        min(best_size, max(per_worker / BATCHES_PER_WORKER, min(per_worker, ECONOMICAL_FRACTION * best_size)))
+    )
+    starts = range(0, len(distinct_settings), size)
+    batches = [Batch(packed_task, distinct_settings[start : start + size]) for start in starts]
+    sample_size = max(min(verified - _verified_counts.get(packed_task, 0), len(distinct_settings)), 0)
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
-    must_verify = is_recorded and len(sample) > 0 and selection == EVERYTHING
-    works = filter(None, works_for_sumo(study, inputs)) if must_verify else ()
-    verifications = [Batch(sumo_work, distinct_settings[sample]) for sumo_work in works]
+    must_verify = has_recorded_scene and sample_size > 0 and selection == EVERYTHING
+    verifying_tasks = filter(None, tasks_for_sumo(study, inputs)) if must_verify else ()
+    verifications = [Batch(verifying_task, distinct_settings[sample]) for verifying_task in verifying_tasks]
 
     def show_done(number: int, size: int) -> None:
         if number < len(batches):
@@ -78,42 +89,42 @@ def evaluate_all(
     if must_verify:
         in_sumo, *recorded = results[len(batches) :]
         refuse_unlike_sumo(study, recorded[0] if recorded else evaluations.take(sample), in_sumo)
-        _verified_counts[work] = _verified_counts.get(work, 0) + len(sample)
+        _verified_counts[packed_task] = _verified_counts.get(packed_task, 0) + sample_size
     return evaluations.take(row_of.ravel())
 
 
-def works_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
-    """The packed study with which SUMO verifies results, and a packed study with comparable results from recorded
-    scenes.
-
-    SUMO repeats only a few cells of a rating; the second study then has the same cells. Otherwise it is empty.
+def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
+    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
+    SUMO.
     """
-    sumo_study = study_for_sumo_check(study, assemble(study).weather)
-    if sumo_study is study:
-        return Task(study=study, inputs=inputs, engine=Engine.LIBSUMO).packed, b""
-    inputs = {**inputs, "network": network_digests(assemble(sumo_study))}
-    recorded = Task(study=sumo_study, inputs=inputs)
-    return msgspec.structs.replace(recorded, engine=Engine.LIBSUMO).packed, recorded.packed
+    system = selection.of(assemble(study, study.source))
+    return settings_per_batch(system, Engine.RECORDED), is_recorded(system)
 
 
-def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings with different results in a recorded scene and in SUMO; skip settings that SUMO could not
-    simulate.
+def ask_why_no_verdict(study: Study, pool: Pool) -> str:
+    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
+    packed_task = Task(study=study, inputs=inputs_of(study, pool), purpose="empty road").packed
+    result = evaluate_original(study, packed_task, pool, must_succeed=False)
+    return "" if len(result) else next(iter(result.reasons.values()), "")  # a failed simulation has a row
+
+
+def check_code(study: Study, inputs: Inputs, pool: Pool) -> None:
+    """Check the user code of a study in a worker, unless it has passed before with the same files.
 
     Raises
     ------
-    InputError
-        With the first such setting and both values.
+    UserCodeError
+        With file, line and advice of the first finding that makes results wrong.
     """
-    both = ~(recorded.failed | in_sumo.failed)
-    if not both.any():
-        return  # evaluations that have failed lack the user's metrics
-    recorded, in_sumo = recorded.take(both), in_sumo.take(both)
-    for row, difference in differences(in_sumo.results, recorded.results, ROUNDING):
-        pairs = zip(study.vehicle.characteristics, recorded.settings[row], strict=True)
-        values = ", ".join(f"{name} = {value:.17g}" for name, value in pairs)
-        raise InputError(
-            f"study {study.name!r}",
-            f"{difference} in the recorded scene and in SUMO with {values}",
-            "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
-        )
+    if not (user_code_names(study) or user_algorithm_packages(study)):
+        return
+    identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
+    digest = hashlib.sha256(identity.encode()).hexdigest()
+    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / digest
+    if digest in _passed_checks or marker.exists():
+        return
+    evaluate_original(study, Task(study=study, inputs=inputs, purpose="check").packed, pool)
+    _passed_checks.add(digest)
+    with suppress(OSError):  # without the marker, the next process checks again
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()

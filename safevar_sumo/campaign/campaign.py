@@ -1,6 +1,4 @@
-"""A study's runs, dealt out to the workers of a pool in shares; and the cost of such a campaign, from a short
-measurement.
-"""
+"""A campaign: runs of a study, dealt out in shares to the workers of a pool; and its cost, from a short measurement."""
 
 from __future__ import annotations
 
@@ -14,11 +12,11 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from safevar_sumo.campaign.batches import works_for_sumo
-from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.identity import check_code, evaluate_original, identity_of
-from safevar_sumo.campaign.pool import Pool, RunKey, RunProgress, RunResult, Share, carry_out
-from safevar_sumo.campaign.run import all_runs
+from safevar_sumo.campaign.batches import check_code
+from safevar_sumo.campaign.evaluation import Task, tasks_for_sumo
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.pool import Pool, Share, carry_out, evaluate_original
+from safevar_sumo.campaign.run import RunKey, RunProgress, RunResult, all_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.protocol.rater import is_rated
@@ -38,7 +36,7 @@ CHARACTERS_PER_NUMBER = 18
 NUMBERS_BESIDE_METRICS = 5
 """Values in a journal besides the metrics of a setting: f_diff, f_num_diff, collision speed, position, outcome."""
 BATCHES_PER_SHARE = 2
-"""Number of largest batches that the populations of a share's runs fill at most."""
+"""Number of largest batches that the populations of all runs of a share fill, at most."""
 MAX_RUNS = 256
 """Maximum number of runs in a share: each keeps a file open."""
 
@@ -81,7 +79,7 @@ def run_campaign(
     results: ResultsDirectory,
     pool: Pool,
     observer: Observer,
-    batch: int | None = None,
+    batch_size: int | None = None,
     *,
     engine: Engine = Engine.LIBSUMO,
     retry_failed: bool = False,
@@ -96,7 +94,7 @@ def run_campaign(
         The directory of their journals.
     pool
         Carries the shares of the runs.
-    batch
+    batch_size
         Maximum number of settings in a batch, which may hold settings of several runs.
     engine
         What moves the vehicles; before a run is finished, results from recorded scenes are verified in SUMO.
@@ -108,16 +106,16 @@ def run_campaign(
     SafevarError
         If a journal cannot be written, or the study is at fault.
     """
-    batch = batch or MAX_COPIES
-    work = Task(study=study, inputs=results.inputs, engine=engine).packed
+    batch_size = batch_size or MAX_COPIES
+    packed_task = Task(study=study, inputs=results.inputs, engine=engine).packed
     check_code(study, results.inputs, pool)
-    original = _evaluate_original(study, work, results, pool, observer)
+    original = _evaluate_original(study, packed_task, results, pool, observer)
     results.begin(original)
-    sumo_work, recorded_work = works_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
+    sumo_tasks = tasks_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
     directory, identity = results.path.absolute(), results.digest
-    runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch / study.search.population), MAX_RUNS)
+    runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / study.search.population), MAX_RUNS)
     shares = [
-        Share(work, sumo_work, recorded_work, batch, tuple(dealt), directory, identity, original, retry_failed)
+        Share(packed_task, *sumo_tasks, batch_size, tuple(dealt), directory, identity, original, retry_failed)
         for dealt in deal(list(keys), pool.workers, runs_at_once)
     ]
     run_results, busy = _collect(shares, pool, observer)
@@ -134,13 +132,13 @@ def run_campaign(
 
 
 def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
-    """Deal runs out in shares of equal size and with equally many runs of each algorithm, a multiple of the number of
+    """Deal runs out in shares of at most `runs_at_once` runs; the number of shares is a multiple of the number of
     workers.
 
     All runs of a share are under way at the same time: they fill large batches, which cost least for each setting.
     """
     count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
-    return [keys[number::count] for number in range(count)]
+    return [keys[number::count] for number in range(count)]  # like cards: each share gets runs of all algorithms
 
 
 def _collect(shares: Sequence[Share], pool: Pool, observer: Observer) -> tuple[dict[RunKey, RunResult], list[RunKey]]:
@@ -161,7 +159,7 @@ def _collect(shares: Sequence[Share], pool: Pool, observer: Observer) -> tuple[d
 
 
 def _evaluate_original(
-    study: Study, work: bytes, results: ResultsDirectory, pool: Pool, observer: Observer
+    study: Study, packed_task: bytes, results: ResultsDirectory, pool: Pool, observer: Observer
 ) -> Evaluations:
     """Evaluate the original vehicle, or read its journal; raises an error if the runs need another one."""
     try:
@@ -170,10 +168,10 @@ def _evaluate_original(
                 observer.warned(journal.remark_on_tail)
             original = journal.content.evaluations
             if not len(original):
-                original = evaluate_original(study, work, pool)
+                original = evaluate_original(study, packed_task, pool)
                 journal.append([0], original, original.files)
     except JournalBusyError:  # another process, such as a job of an array, writes this journal
-        original = evaluate_original(study, work, pool)
+        original = evaluate_original(study, packed_task, pool)
     if not original.valid[0]:
         raise InputError(
             study.source,
@@ -187,8 +185,8 @@ def _evaluate_original(
 
 
 class Forecast(NamedTuple):
-    """Upper limits for a campaign: evaluations, `seconds`, and `size` of the results [bytes]; `rate` is in evaluations
-    per second.
+    """Upper limits of a campaign's evaluations, `seconds`, and `size` of results [bytes]; and its evaluations per
+    second, `rate`.
     """
 
     evaluations: int
@@ -207,7 +205,7 @@ class _Stopwatch:
     def __init__(self, run_count: int) -> None:
         self._run_count = run_count
         self._asked: dict[object, int] = {}
-        self._start = (time.perf_counter(), 0)
+        self._start = (time.perf_counter(), 0)  # [s], and the evaluations until then
         self._is_warm = False
         self.rate = 0.0
 
@@ -228,11 +226,11 @@ class _Stopwatch:
 
 
 def forecast(
-    study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.RECORDED
+    study: Study, runs: int, pool: Pool, batch_size: int = MAX_COPIES, engine: Engine = Engine.RECORDED
 ) -> Forecast:
     """Estimate upper limits for a number of runs, from a short measurement of some of them in a temporary directory."""
     system = assemble(study, study.source)
-    settings_at_once = min(batch, max(PROBE_VEHICLES // len(system.points), 1))
+    settings_at_once = min(batch_size, max(PROBE_VEHICLES // len(system.points), 1))
     search = study.search
     probe = msgspec.structs.replace(
         study, search=msgspec.structs.replace(search, population=min(search.population, settings_at_once))
@@ -243,7 +241,7 @@ def forecast(
     with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
         results = ResultsDirectory(Path(folder), probe, identity_of(probe, system, pool), system.measuring.scoring)
         with suppress(_Enough):
-            run_campaign(probe, keys, results, pool, stopwatch, batch, engine=engine)
+            run_campaign(probe, keys, results, pool, stopwatch, batch_size, engine=engine)
     evaluations = runs * search.evaluations
     numbers = len(CharacteristicSet.of(study)) + len(METRICS) + NUMBERS_BESIDE_METRICS
     return Forecast(

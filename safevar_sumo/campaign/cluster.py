@@ -27,12 +27,13 @@ CLUSTER = (
 CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
 SECONDS_BETWEEN_LOOKS = 0.5
+"""Time between two looks at whether a job has ended without a message [s]."""
 MAX_JOBS = 1024
 """Maximum number of jobs at the same time."""
 GONE = "the cluster does not answer any more"
 VERSIONED_PACKAGES = ("safevar_sumo", "libsumo", "numpy")
 """Packages that must have the same version in this process and on every worker."""
-_libsumo_lock = threading.Lock()
+_libsumo_lock = threading.Lock()  # a process has one libsumo
 
 
 @contextmanager
@@ -69,7 +70,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
 
 
 class ClusterPool:
-    """Carries jobs out on a Dask cluster; Dask repeats what a dead worker did. For each job, a thread waits for its
+    """Carries out jobs on a Dask cluster, which repeats the job of a dead worker. For each job, a thread waits for
     messages.
     """
 
@@ -116,20 +117,19 @@ class ClusterPool:
 
 
 def _carry(time_limit: float, versions: dict[str, str], job: Job, queue: str) -> None:
-    """Carry out a job in a worker; it ends at its next message if the caller is gone."""
+    """Carry out a job in a worker; a message, put into a Dask queue, ends the job if the caller is gone."""
     from distributed import Queue, get_worker
 
     worker, messages = get_worker(), Queue(queue)
-    task = worker.state.tasks[worker.get_current_task()]
+    dask_task = worker.state.tasks[worker.get_current_task()]
 
     def report(message: Message | None) -> None:
-        if task.state == "cancelled":
+        if dask_task.state == "cancelled":
             raise PoolLostError("the caller is gone")
         messages.put(pickle.dumps(message))  # Dask's own serialization turns records into lists
 
     if _versions() != versions:
         raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
-    # a process has one libsumo
     with _libsumo_lock, open(os.devnull, "w") as null_file:
         carry_out_job(job, report, partial(evaluate_in_time, time_limit=time_limit, last_words=null_file))
     report(None)

@@ -1,4 +1,6 @@
-"""Evaluation of a batch, a pure function for any process on any machine."""
+"""A task, what a worker computes with every setting of a study; the evaluation of a batch of settings, a pure function
+for any process on any machine; and the check of its results against SUMO.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import changed_files, digests, note_inputs, unload_user_modules
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.protocol.rater import study_for_sumo_check
+from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
@@ -26,19 +29,23 @@ from safevar_sumo.sumo.system import System, assemble
 
 Inputs = dict[str, dict[str, str]]
 """Digests of files, by layer and name."""
-
-
 VERIFIED_SETTINGS = 50
-"""Number of settings to verify in SUMO: of a study in questions; and of each run of a campaign, besides the
-solutions.
-"""
+"""Number of settings to verify in SUMO: of a study in questions; of each run of a campaign, besides its solutions."""
 Evaluate = Callable[[bytes, FloatArray], Evaluations]
-"""A function that does a packed task with settings, as `evaluate_batch` does."""
+"""A function of a packed task and settings, as `evaluate_batch`."""
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Which parameters of the ADS have values in every row of the settings, after the characteristics; the numbers of
-    the only points to simulate, without any all; with `arrays`, one ADS drives all rows, with arrays as parameters.
+    """What a task simulates instead of the whole study.
+
+    Attributes
+    ----------
+    parameters
+        Parameters of the ADS whose values follow the characteristics in every row of the settings.
+    points
+        Numbers of the points of a matrix to simulate; all if empty.
+    arrays
+        Whether one ADS drives all rows, with arrays as parameters.
     """
 
     parameters: tuple[str, ...] = ()
@@ -52,11 +59,11 @@ class Selection(msgspec.Struct, frozen=True):
 
 
 EVERYTHING = Selection()
-"""All points, with the parameters of the study."""
+"""All points, and the study's own values of the ADS's parameters."""
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker computes of a study.
+    """What a worker computes with every setting of a study.
 
     Attributes
     ----------
@@ -68,8 +75,8 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     afresh
         Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
     purpose
-        What to do with the settings; "check" only checks the user code, "empty road" only applies `why_no_verdict`: the
-        sentence, if any, is the only one of the result's `reasons`.
+        "evaluate" the settings; or, without settings, "check" the user code, or apply `why_no_verdict` on an "empty
+        road", whose sentence, if any, is the only one of the result's `reasons`.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     selection
@@ -86,25 +93,25 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def packed(self) -> bytes:
-        """The task as bytes."""
+        """The task as bytes: so it is sent to workers, and serves as the key of a cache."""
         return msgspec.msgpack.encode(self)
 
 
 @lru_cache(maxsize=8)
-def task_of(work: bytes) -> Task:
+def task_of(packed_task: bytes) -> Task:
     """The unpacked task."""
-    return msgspec.msgpack.decode(work, type=Task)
+    return msgspec.msgpack.decode(packed_task, type=Task)
 
 
-def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
-    """Do a packed task with settings, shape (k, n).
+def evaluate_batch(packed_task: bytes, settings: FloatArray) -> Evaluations:
+    """Carry out a packed task with k settings, shape (k, n).
 
     Raises
     ------
     InputError
         If files of the study have changed since the campaign began.
     """
-    task = task_of(work)
+    task = task_of(packed_task)
     if task.purpose == "check":
         from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
 
@@ -126,13 +133,14 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         else:
             evaluations = evaluate(system, settings, task.engine)
     files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
-    known = task.inputs.get("sources", {})
-    refuse_changed_files([name for name, digest in files_read.items() if known.get(name, digest) != digest])
-    return replace(evaluations, files={name: digest for name, digest in files_read.items() if name not in known})
+    known_files = task.inputs.get("sources", {})
+    refuse_changed_files([name for name, digest in files_read.items() if known_files.get(name, digest) != digest])
+    new_files = {name: digest for name, digest in files_read.items() if name not in known_files}
+    return replace(evaluations, files=new_files)
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate rows of n characteristics and the values of some parameters of the ADS, at the points of a task."""
+    """Evaluate rows of n characteristics and values of the selected parameters of the ADS, at the selected points."""
     selection, n = task.selection, len(system.characteristics)
     settings, values, system = rows[:, :n], rows[:, n:], selection.of(system)
     if not values.size:
@@ -140,15 +148,15 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     if selection.arrays and len(rows) <= settings_per_batch(system, task.engine):
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
         return replace(evaluate(system, settings, task.engine), settings=rows)
-    distinct_values, set_of_row = np.unique(values, axis=0, return_inverse=True)
-    batches, order = [], []
-    for number, own_values in enumerate(distinct_values):
-        members = np.flatnonzero(set_of_row.ravel() == number)
-        own_study = with_parameters(task.study, dict(zip(selection.parameters, own_values.tolist(), strict=True)))
-        own_system = replace(system, ads=assemble(own_study).ads)
-        batches.append(replace(evaluate(own_system, settings[members], task.engine), settings=rows[members]))
-        order.append(members)
-    return Evaluations.concatenate(batches).take(np.argsort(np.concatenate(order)))
+    parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
+    groups, rows_of_groups = [], []
+    for number, parameter_set in enumerate(parameter_sets.tolist()):
+        group = np.flatnonzero(set_of_row.ravel() == number)
+        study = with_parameters(task.study, dict(zip(selection.parameters, parameter_set, strict=True)))
+        evaluations = evaluate(replace(system, ads=assemble(study).ads), settings[group], task.engine)
+        groups.append(replace(evaluations, settings=rows[group]))
+        rows_of_groups.append(group)
+    return Evaluations.concatenate(groups).take(np.argsort(np.concatenate(rows_of_groups)))  # in the order of the rows
 
 
 def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
@@ -157,13 +165,13 @@ def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
     return msgspec.structs.replace(study, ads=ads)
 
 
-def evaluate_in_time(work: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:
-    """Evaluate a batch; a process that takes longer than the time limit [s] writes to a file what it is doing, and
-    ends.
+def evaluate_in_time(packed_task: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:
+    """Evaluate a batch. A process that takes longer than the time limit [s] writes to the file `last_words` what it is
+    doing, and ends.
     """
     faulthandler.dump_traceback_later(time_limit, exit=True, file=last_words)
     try:
-        return evaluate_batch(work, settings)
+        return evaluate_batch(packed_task, settings)
     finally:
         faulthandler.cancel_dump_traceback_later()
 
@@ -174,8 +182,8 @@ def system_of(task: Task) -> System:
 
 
 @lru_cache(maxsize=4)
-def _assemble_packed(work: bytes) -> System:
-    return assemble(task_of(work).study)
+def _assemble_packed(packed_task: bytes) -> System:
+    return assemble(task_of(packed_task).study)
 
 
 def refuse_changed_files(files: list[str]) -> None:
@@ -196,3 +204,38 @@ def network_digests(system: System) -> dict[str, str]:
     return {
         f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in open_network(folder).digests
     }
+
+
+def tasks_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
+    """The packed task with which SUMO verifies results, and one with comparable results from recorded scenes.
+
+    SUMO repeats only a few cells of a rating; the second task then has the same cells. Otherwise it is empty, and the
+    results to verify are comparable themselves.
+    """
+    sumo_study = study_for_sumo_check(study, assemble(study).weather)
+    if sumo_study is study:
+        return Task(study=study, inputs=inputs, engine=Engine.LIBSUMO).packed, b""
+    recorded = Task(study=sumo_study, inputs={**inputs, "network": network_digests(assemble(sumo_study))})
+    return msgspec.structs.replace(recorded, engine=Engine.LIBSUMO).packed, recorded.packed
+
+
+def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
+    """Refuse settings with different results in a recorded scene and in SUMO, except failed simulations.
+
+    Raises
+    ------
+    InputError
+        With the first such setting and both values.
+    """
+    is_comparable = ~(recorded.failed | in_sumo.failed)
+    if not is_comparable.any():
+        return  # evaluations that have failed lack the user's metrics
+    recorded, in_sumo = recorded.take(is_comparable), in_sumo.take(is_comparable)
+    for row, difference in differences(in_sumo.results, recorded.results, ROUNDING):
+        pairs = zip(study.vehicle.characteristics, recorded.settings[row], strict=True)
+        values = ", ".join(f"{name} = {value:.17g}" for name, value in pairs)
+        raise InputError(
+            f"study {study.name!r}",
+            f"{difference} in the recorded scene and in SUMO with {values}",
+            "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
+        )

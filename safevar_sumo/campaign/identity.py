@@ -1,22 +1,14 @@
-"""The identity of a study, all inputs of its results: which files count, and the check of user code, once for each
-identity.
-"""
+"""The identity of a study: all inputs of its results, among them the digests of the files that count."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import platform
-from contextlib import suppress
-from importlib.metadata import version
 
 import msgspec
-import numpy as np
-import platformdirs
 
 from safevar_sumo.campaign.evaluation import Inputs, Task, network_digests
-from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
+from safevar_sumo.campaign.pool import Pool, evaluate_original
 from safevar_sumo.campaign.run import algorithm_of, user_algorithm_packages
 from safevar_sumo.plugins import (
     Files,
@@ -27,16 +19,13 @@ from safevar_sumo.plugins import (
     note_inputs,
     unload_user_modules,
 )
-from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS, evaluation_keys
-from safevar_sumo.study import Study, fmus_of, tables_of, user_code_names
+from safevar_sumo.study import Study, fmus_of, user_code_names
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.vehicles import CharacteristicSet
 
 _files_read: dict[tuple[bytes, str], Files] = {}
-"""Files that models have read in this process, by packed study and working directory."""
-_passed_checks: set[str] = set()
-"""Identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
+"""Files that models have read in this process, by packed task and working directory."""
 
 
 def identity_of(study: Study, system: System, pool: Pool | None = None) -> JsonObject:
@@ -49,7 +38,7 @@ def identity_of(study: Study, system: System, pool: Pool | None = None) -> JsonO
     Parameters
     ----------
     pool
-        Simulates the original vehicle, which shows the files that models read; without a pool, `sources` is empty.
+        Simulates the original vehicle, which shows the files that models read. Without a pool, `sources` is empty.
     """
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
@@ -114,38 +103,3 @@ def _files_read_by_algorithms(study: Study) -> Files:
         for label in study.search.labels:
             algorithm_of(label, study)
     return digests(reading.files(packages), study.origin.places)
-
-
-def evaluate_original(study: Study, work: bytes, pool: Pool, *, must_succeed: bool = True) -> Evaluations:
-    """The evaluation of the original vehicle of a packed study; by default a failure is an error."""
-    original = CharacteristicSet.of(study).original[np.newaxis]
-    return evaluate_batches([Batch(work, original, must_succeed)], pool)[0]
-
-
-def ask_why_no_verdict(study: Study, pool: Pool) -> str:
-    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
-    work = Task(study=study, inputs=inputs_of(study, pool), purpose="empty road").packed
-    result = evaluate_original(study, work, pool, must_succeed=False)
-    return "" if len(result) else next(iter(result.reasons.values()), "")  # a failed simulation has a row
-
-
-def check_code(study: Study, inputs: Inputs, pool: Pool) -> None:
-    """Check the user code of a study in a worker, unless it has passed before with the same files.
-
-    Raises
-    ------
-    UserCodeError
-        With file, line and advice of the first finding that makes results wrong.
-    """
-    if not (user_code_names(study) or user_algorithm_packages(study)):
-        return
-    identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
-    name = hashlib.sha256(identity.encode()).hexdigest()
-    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / name
-    if name in _passed_checks or marker.exists():
-        return
-    evaluate_original(study, Task(study=study, inputs=inputs, purpose="check").packed, pool)
-    _passed_checks.add(name)
-    with suppress(OSError):  # without the marker, the next process checks again
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()

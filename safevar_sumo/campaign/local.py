@@ -37,7 +37,7 @@ from safevar_sumo.plugins.files import is_user_file
 MAX_START_TIME = 120.0
 """Longest time until a worker process is ready for its first batch [s]."""
 TIMEOUT_MARK = "Timeout ("
-"""Begin of what the interpreter writes when a process exceeds its time limit."""
+"""What the interpreter writes first when a process exceeds its time limit."""
 _start_lock = threading.Lock()
 
 
@@ -47,18 +47,18 @@ def available_cores() -> int:
 
 
 @contextmanager
-def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
+def local_pool(workers: int, time_limit: float) -> Iterator[LocalPool]:
     """A pool whose worker processes start when they are first needed, and end with the context.
 
     Parameters
     ----------
-    jobs
+    workers
         Number of worker processes.
     time_limit
         Time limit of a batch [s]; a worker that exceeds it ends.
     """
     with defer_interrupts():
-        pool = LocalPool(jobs, time_limit)
+        pool = LocalPool(workers, time_limit)
         try:
             yield pool
         finally:
@@ -66,14 +66,14 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
 
 
 class LocalPool:
-    """Carries jobs out in processes. For each process, a thread of this process waits for its messages.
+    """Carries out jobs in worker processes. For each of them, a thread of this process waits for messages.
 
     Workers share no queue and no lock: a worker may die at any moment without harm to the others.
     """
 
-    def __init__(self, jobs: int, time_limit: float) -> None:
-        self.workers, self._time_limit = jobs, time_limit
-        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=block_interrupts)
+    def __init__(self, workers: int, time_limit: float) -> None:
+        self.workers, self._time_limit = workers, time_limit
+        self._threads = ThreadPoolExecutor(workers, thread_name_prefix="worker", initializer=block_interrupts)
         self._thread_data = threading.local()
         self._live_workers: set[_Worker] = set()
         self._closed = False
@@ -128,7 +128,7 @@ class LocalPool:
 class _Worker:
     """A process and the pipe to it. The process is spawned, because libsumo must not be forked.
 
-    Its last words are a file: where the process was when it exceeded the time limit of a batch or crashed.
+    The file of its last words says where the process was when it exceeded the time limit of a batch or crashed.
     """
 
     def __init__(self, time_limit: float) -> None:

@@ -1,5 +1,13 @@
-"""Jobs for the workers of a pool: batches of settings for questions, and shares of a study's runs; what workers report;
-and the loop that carries jobs out although workers die.
+"""A pool of workers, and the loop that carries jobs out although workers die.
+
+One word, one meaning, in this folder:
+
+- a task is what is computed with every setting of a study: the study, the engine, a selection of points (`Task`); it
+  travels packed, as bytes;
+- a batch is settings that are evaluated together with one task;
+- a run is one search of a study, by an algorithm and a number, and a share is the runs that one worker carries out;
+- a job is what a pool gives to a worker: a batch for a question, or a share of a study's runs;
+- a message is what the worker reports of its job.
 
 Ctrl-C while a pool works is noted at once, but raised only where the main thread waits for a message and holds no lock.
 An interrupt inside `concurrent.futures` may leave a lock behind for which the thread of a worker waits for ever; an
@@ -20,9 +28,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol, TypeVar
 
+import numpy as np
+
+from safevar_sumo.campaign.run import RunKey, RunProgress, RunResult
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import Failure, run_name
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
 
 Item = TypeVar("Item")
 SECONDS_BETWEEN_CHECKS = 0.2
@@ -40,76 +52,41 @@ class PoolLostError(SafevarError):
     """The pool cannot compute any more batches."""
 
 
-class RunKey(NamedTuple):
-    """One run of an algorithm; the number `run` counts from 0."""
-
-    algorithm: str
-    run: int
-
-    def __str__(self) -> str:
-        return run_name(self.algorithm, self.run)
-
-
-class RunProgress(NamedTuple):
-    """The state of a run.
+class Batch(NamedTuple):
+    """k filtered settings of n characteristics to evaluate with a task, shape (k, n).
 
     Attributes
     ----------
-    asked
-        Number of requested evaluations.
-    replayed
-        Number of requested evaluations that the journal held when the worker began.
-    collisions
-        Number of distinct settings that collided.
-    best
-        The lowest safety degree [m or -m/s]; None before the first valid evaluation.
+    must_succeed
+        Whether a failure is an error, not an outcome.
+    deaths
+        Why workers died since the job's last result: reasons by the setting that they attempted to simulate, b"" for
+        several settings.
     """
 
-    key: RunKey
-    asked: int
-    replayed: int
-    collisions: int
-    best: float | None
-
-
-class RunResult(NamedTuple):
-    """A finished run: its state, its solutions, settings that could not be simulated, and the number of invalid
-    tests.
-    """
-
-    progress: RunProgress
-    solutions: Evaluations
-    failures: list[Failure]
-    invalid_tests: int
-
-
-class Batch(NamedTuple):
-    """Filtered settings of a packed study to evaluate, shape (k, n).
-
-    With `must_succeed` a failure is an error, not an outcome. `deaths` says, for each attempt since the job's last
-    result, why workers died: by setting, or b"" for several settings.
-    """
-
-    work: bytes
+    packed_task: bytes
     settings: FloatArray
     must_succeed: bool = False
     deaths: Mapping[bytes, tuple[str, ...]] = {}
 
 
 class Share(NamedTuple):
-    """A share of a study's runs, which one worker carries out.
+    """Some of a study's runs, which one worker carries out together.
 
     Attributes
     ----------
-    work
-        The packed study, whose batches have at most `batch` settings of several runs.
-    sumo_work, recorded_work
-        Packed studies that verify results in SUMO; `sumo_work` is empty if SUMO simulates everything anyway,
-        `recorded_work` if the results of the runs are comparable themselves.
+    packed_task
+        The task of all settings.
+    sumo_task, recorded_task
+        Packed tasks that verify results, see `tasks_for_sumo`; both are empty if SUMO simulates everything anyway.
+    batch_size
+        Maximum number of settings in a batch, which may hold settings of several runs.
     keys
-        The runs.
-    directory, identity
-        The directory of the journals, which the worker must see, and the digest of the study's identity.
+        The runs that are not finished.
+    directory
+        The directory of the journals, which the worker must see.
+    identity
+        The digest of the study's identity.
     original
         The original vehicle's evaluation.
     retry_failed
@@ -118,10 +95,10 @@ class Share(NamedTuple):
         See `Batch`.
     """
 
-    work: bytes
-    sumo_work: bytes
-    recorded_work: bytes
-    batch: int
+    packed_task: bytes
+    sumo_task: bytes
+    recorded_task: bytes
+    batch_size: int
     keys: tuple[RunKey, ...]
     directory: Path
     identity: str
@@ -132,9 +109,9 @@ class Share(NamedTuple):
 
 Job = Batch | Share
 Message = bytes | Evaluations | list[RunProgress] | RunResult | RunKey | str
-"""What a worker reports of its job: the setting that it attempts to simulate, b"" for several; the result of a batch;
-the state of all runs of a share after a round of batches; a finished run; a run that another process carries out; or a
-warning.
+"""What a worker reports of its job, by type: the setting that it attempts to simulate, b"" for several; the result of a
+batch; the state of all runs of a share after a round of batches; a finished run; a run that another process carries
+out; or a warning.
 """
 Report = Callable[[Message], None]
 
@@ -151,9 +128,9 @@ class Pool(Protocol):
 
 
 def evaluate_batches(
-    batches: Sequence[Batch], pool: Pool, done: Callable[[int, int], None] = lambda batch, size: None
+    batches: Sequence[Batch], pool: Pool, done: Callable[[int, int], None] = lambda number, size: None
 ) -> list[Evaluations]:
-    """Evaluate batches; calls `done` with the number of each batch that is finished, and its size."""
+    """Evaluate batches; calls `done` with the number of each finished batch, counted from 0, and its size."""
     results = dict[int, Evaluations]()
     with closing(carry_out(batches, pool)) as messages:
         for number, message in messages:
@@ -163,8 +140,14 @@ def evaluate_batches(
     return [results[number] for number in range(len(batches))]
 
 
+def evaluate_original(study: Study, packed_task: bytes, pool: Pool, *, must_succeed: bool = True) -> Evaluations:
+    """Evaluate the original vehicle of a study with a task; by default a failure is an error."""
+    original = CharacteristicSet.of(study).original[np.newaxis]
+    return evaluate_batches([Batch(packed_task, original, must_succeed)], pool)[0]
+
+
 class _JobUnderWay:
-    """A job, its number, the attempt that its worker makes now, and the workers that died outside of an attempt."""
+    """A job, its number, the setting that its worker attempts now, and how many workers died outside of an attempt."""
 
     def __init__(self, number: int, job: Job) -> None:
         self.number, self.job = number, job
@@ -172,55 +155,56 @@ class _JobUnderWay:
         self._losses = 0
 
     def note(self, message: Message) -> None:
-        """Note a worker's message: the next worker does not repeat what is finished, and knows of deaths since then."""
+        """Note a worker's message, so that a next worker neither repeats finished runs nor hears of older deaths."""
         if isinstance(message, bytes):
             self._attempt = message
         elif isinstance(message, list):
             self._attempt, self._losses, self.job = None, 0, self.job._replace(deaths={})
         elif isinstance(message, RunResult | RunKey) and isinstance(self.job, Share):
-            finished = message if isinstance(message, RunKey) else message.progress.key
-            self.job = self.job._replace(keys=tuple(key for key in self.job.keys if key != finished))
+            ended_key = message if isinstance(message, RunKey) else message.progress.key
+            self.job = self.job._replace(keys=tuple(key for key in self.job.keys if key != ended_key))
 
     def note_death(self, error: WorkerLostError) -> None:
-        """Note the death of a worker; raises its error if it is no attempt's fault and occurs again and again."""
+        """Note the death of a worker; raises its error if workers die again and again outside of attempts."""
         if self._attempt is None:
             self._losses += 1
             if self._losses > MAX_LOSSES:
                 raise error
         else:
-            deaths = self.job.deaths
-            reasons = (*deaths.get(self._attempt, ()), str(error))
-            self.job, self._attempt = self.job._replace(deaths={**deaths, self._attempt: reasons}), None
+            reasons = (*self.job.deaths.get(self._attempt, ()), str(error))
+            self.job = self.job._replace(deaths={**self.job.deaths, self._attempt: reasons})
+            self._attempt = None
 
 
 def carry_out(jobs: Sequence[Job], pool: Pool) -> Generator[tuple[int, Message]]:
-    """Carry out jobs on a pool, each again after the death of its worker; yields the number of a job and a message."""
+    """Carry out jobs on a pool, each again if its worker dies; yields every message with its job's number."""
+    # An event is a message of a worker or, when the job ends, the future of the job.
     events: SimpleQueue[tuple[_JobUnderWay, Message | Future[None]]] = SimpleQueue()
-    waiting, under_way, is_over = deque(map(_JobUnderWay, range(len(jobs)), jobs)), 0, False
+    waiting, busy_workers, is_over = deque(map(_JobUnderWay, range(len(jobs)), jobs)), 0, False
 
-    def put(job: _JobUnderWay, event: Message | Future[None]) -> None:
+    def put(started: _JobUnderWay, event: Message | Future[None]) -> None:
         if is_over and not isinstance(event, Future):
             raise PoolLostError("nobody waits for this job any more")
-        events.put((job, event))
+        events.put((started, event))
 
     try:
-        while waiting or under_way:
-            while waiting and under_way < pool.workers:
-                job = waiting.popleft()
-                under_way += 1
-                pool.carry(job.job, partial(put, job)).add_done_callback(partial(put, job))
-            job, event = wait_for_next(events)
+        while waiting or busy_workers:
+            while waiting and busy_workers < pool.workers:
+                started = waiting.popleft()
+                busy_workers += 1
+                pool.carry(started.job, partial(put, started)).add_done_callback(partial(put, started))
+            started, event = wait_for_next(events)
             if not isinstance(event, Future):
-                job.note(event)
-                yield job.number, event
+                started.note(event)
+                yield started.number, event
                 continue
-            under_way -= 1
+            busy_workers -= 1
             error = PoolLostError("the pool was closed") if event.cancelled() else event.exception()
-            if error is None and isinstance(job.job, Share) and job.job.keys:
+            if error is None and isinstance(started.job, Share) and started.job.keys:
                 error = WorkerLostError("a worker ended before its runs")
             if isinstance(error, WorkerLostError):
-                job.note_death(error)
-                waiting.appendleft(job)
+                started.note_death(error)
+                waiting.appendleft(started)
             elif error is not None:
                 raise error
     finally:

@@ -1,4 +1,4 @@
-"""The runs of a study: their algorithms and random numbers; and one run under way, its search and its known
+"""The runs of a study: their names, algorithms and random numbers; and a run under way, its search and its known
 evaluations.
 """
 
@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.evaluation import VERIFIED_SETTINGS
-from safevar_sumo.campaign.pool import RunKey, RunProgress, RunResult
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Files, Lookup, digests, instance_of, note_inputs
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results import Failure, Journal
+from safevar_sumo.results import Failure, Journal, run_name
 from safevar_sumo.search import ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -25,6 +24,49 @@ RANDOM_SAMPLES = 10
 evaluations with a probability of 1 - 0.99^300 = 95 %.
 """
 INVALID_TEST = Outcome.INVALID_TEST.value
+
+
+class RunKey(NamedTuple):
+    """The name of a run: its algorithm, and its number from 0."""
+
+    algorithm: str
+    run: int
+
+    def __str__(self) -> str:
+        return run_name(self.algorithm, self.run)
+
+
+class RunProgress(NamedTuple):
+    """The state of a run.
+
+    Attributes
+    ----------
+    asked
+        Number of requested evaluations.
+    replayed
+        Number of requested evaluations that the journal held when the worker began.
+    collisions
+        Number of distinct settings that collided.
+    best
+        The lowest safety degree [m or -m/s]; None before the first valid evaluation.
+    """
+
+    key: RunKey
+    asked: int
+    replayed: int
+    collisions: int
+    best: float | None
+
+
+class RunResult(NamedTuple):
+    """A finished run: its last state, its solutions, settings that could not be simulated, and the number of settings
+    that left the speed tolerance of a test.
+    """
+
+    progress: RunProgress
+    solutions: Evaluations
+    failures: list[Failure]
+    invalid_tests: int
 
 
 def all_runs(study: Study) -> list[RunKey]:
@@ -65,7 +107,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
 
 def make_search(key: RunKey, study: Study, problem: Problem, note_files: Callable[[Files], None]) -> Search:
     """Make the search of a run; after each step, calls `note_files` with the files that a user's algorithm has read."""
-    packages, rng, ended = user_algorithm_packages(study), random_generator_of(study, key), False
+    packages, rng, has_ended = user_algorithm_packages(study), random_generator_of(study, key), False
     search: Search | None = None
     answer: Any = None  # None starts a generator
     while True:
@@ -74,10 +116,10 @@ def make_search(key: RunKey, study: Study, problem: Problem, note_files: Callabl
                 search = search or algorithm_of(key.algorithm, study).search(problem, rng)
                 output: Any = search.send(answer)  # settings, or the result at the end
             except StopIteration as end:
-                ended, output = True, end.value
+                has_ended, output = True, end.value
         if packages:
             note_files(digests(reading.files(packages), study.origin.places))
-        if ended:
+        if has_ended:
             return output  # type: ignore[no-any-return]
         answer = yield output
 
@@ -94,7 +136,7 @@ def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
 
 
 class _Known(NamedTuple):
-    """A known setting: its `position` in the run, and its `row` in `evaluations`."""
+    """A setting that is evaluated: its `position` in the run, and its `row` in the `evaluations` of its batch."""
 
     position: int
     evaluations: Evaluations
@@ -215,7 +257,10 @@ class Run:
         return RunResult(self.progress, self.result, failures, self._invalid_tests)
 
     def _requested(self) -> tuple[list[int], Evaluations]:
-        """The known settings that this run requested, in the order of their positions."""
+        """Positions and evaluations of the known settings within the run's budget, in the order of their positions.
+
+        A journal may hold more: those of a search with a larger budget.
+        """
         known = [setting for setting in self._known.values() if setting.position < self._budget]
         known.sort(key=lambda setting: setting.position)
         return [setting.position for setting in known], _join(known) if known else self.journal.content.evaluations
@@ -233,5 +278,6 @@ class Run:
 def _join(known: Sequence[_Known]) -> Evaluations:
     """The evaluations of known settings, in their order."""
     batches = list({id(evaluations): evaluations for _, evaluations, _ in known}.values())
+    # strict=False: the last sum is where the last batch ends
     starts = dict(zip(map(id, batches), accumulate(map(len, batches), initial=0), strict=False))
     return Evaluations.concatenate(batches).take([starts[id(evaluations)] + row for _, evaluations, row in known])

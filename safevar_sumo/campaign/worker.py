@@ -1,8 +1,8 @@
-"""What a worker does with its job: it evaluates a batch, or carries out a share of a study's runs: searches, simulates
-in batches over its runs, writes their journals, verifies their results.
+"""What a worker does with its job. It evaluates a batch; or it carries out a share of a study's runs: it searches,
+simulates in batches over its runs, writes their journals and verifies their results.
 
-The worker may die at any moment: the next one continues from the journals. It meets again what killed the first one,
-and so it is told why the first one died: these attempts count as failed without a repetition.
+A worker may die at any moment; the next one continues from the journals. It would meet again what killed the workers
+before it. So it is told why they died: these attempts count as failed and are not repeated.
 """
 
 from __future__ import annotations
@@ -14,10 +14,16 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from safevar_sumo.campaign.batches import refuse_unlike_sumo
-from safevar_sumo.campaign.evaluation import Evaluate, Task, refuse_changed_files, system_of, task_of
-from safevar_sumo.campaign.pool import Job, Report, RunKey, Share, WorkerLostError
-from safevar_sumo.campaign.run import Run, make_search, random_generator_of
+from safevar_sumo.campaign.evaluation import (
+    Evaluate,
+    Task,
+    refuse_changed_files,
+    refuse_unlike_sumo,
+    system_of,
+    task_of,
+)
+from safevar_sumo.campaign.pool import Job, Report, Share, WorkerLostError
+from safevar_sumo.campaign.run import Run, RunKey, make_search, random_generator_of
 from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, differences
@@ -47,39 +53,43 @@ def carry_out_job(job: Job, report: Report, evaluate: Evaluate) -> None:
     Raises
     ------
     SafevarError
-        If a journal cannot be written, the study is at fault, or a result is another one by itself or in SUMO.
+        If a journal cannot be written, the study is at fault, or a setting has another result alone or in SUMO.
     """
     attempts = Attempts(job, report, evaluate)
     if isinstance(job, Share):
         _ShareCarrier(job, report, attempts).carry_out()
     else:
-        report(Evaluations.concatenate([*attempts.evaluate(job.work, job.settings, must_succeed=job.must_succeed)]))
+        evaluations = attempts.evaluate(job.packed_task, job.settings, must_succeed=job.must_succeed)
+        report(Evaluations.concatenate([*evaluations]))
 
 
 class Attempts:
-    """Evaluates the batches of a job: once more if they fail, then row by row, which finds the setting that fails.
+    """Evaluates the batches of a job. A batch that fails is evaluated once more, then row by row, to find the setting
+    that fails.
 
-    A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome
+    A setting that fails again alone, while the original vehicle can be simulated, gets the outcome
     `simulator-error`. Faults of the environment (disk, network files, memory) and of user code end the study, which the
     same command resumes later; so do too many failing settings in a row.
     """
 
     def __init__(self, job: Job, report: Report, evaluate: Evaluate) -> None:
         self._deaths = {setting: list(reasons) for setting, reasons in job.deaths.items()}
-        self._report, self._evaluate, self._study = report, evaluate, task_of(job.work).study
+        self._report, self._evaluate, self._study = report, evaluate, task_of(job.packed_task).study
         self._characteristics, self._failures_in_a_row = CharacteristicSet.of(self._study), 0
 
-    def evaluate(self, work: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Iterator[Evaluations]:
-        """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after
+    def evaluate(
+        self, packed_task: bytes, settings: FloatArray, *, must_succeed: bool = False
+    ) -> Iterator[Evaluations]:
+        """Evaluate k filtered settings, shape (k, n); yields their evaluations in their order, all at once or, after
         failures, row by row.
 
         With `must_succeed` a failure is an error, not an outcome.
         """
         for _ in range(ATTEMPTS):
             try:
-                evaluations = self._attempt(work, settings)
+                evaluations = self._attempt(packed_task, settings)
             except UserCodeError as error:
-                raise self._with_command(error, self._culprit(work, settings)) from None
+                raise self._with_command(error, self._culprit(packed_task, settings)) from None
             except FAILURES as error:
                 failure = error
             else:
@@ -88,7 +98,7 @@ class Attempts:
                 return
         if len(settings) > 1 and not isinstance(failure, EnvironmentFault):
             for row in range(len(settings)):
-                yield from self.evaluate(work, settings[[row]], must_succeed=must_succeed)
+                yield from self.evaluate(packed_task, settings[[row]], must_succeed=must_succeed)
             return
         names = user_code_names(self._study)
         if names and isinstance(failure, WorkerLostError):
@@ -97,7 +107,7 @@ class Attempts:
         if must_succeed or isinstance(failure, EnvironmentFault):
             raise failure
         try:
-            self._attempt(work, self._characteristics.original[np.newaxis])
+            self._attempt(packed_task, self._characteristics.original[np.newaxis])
         except FAILURES as fault:
             raise EnvironmentFault(f"{failure}; the original vehicle cannot be simulated either: {fault}") from None
         self._failures_in_a_row += 1
@@ -105,32 +115,32 @@ class Attempts:
             raise failure
         yield self._failed_evaluation(settings, failure)
 
-    def _attempt(self, work: bytes, settings: FloatArray) -> Evaluations:
+    def _attempt(self, packed_task: bytes, settings: FloatArray) -> Evaluations:
         """Evaluate a batch, unless an earlier worker died of this attempt."""
         setting = settings.tobytes() if len(settings) == 1 else b""
         if self._deaths.get(setting):
             raise WorkerLostError(self._deaths[setting].pop(0))
         self._report(setting)
-        return self._evaluate(work, settings)
+        return self._evaluate(packed_task, settings)
 
     def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
-        undefined, own = np.full(1, np.nan), setting[:, : len(self._characteristics)]  # without an ADS's parameters
+        undefined, values = np.full(1, np.nan), setting[:, : len(self._characteristics)]  # without the ADS's parameters
         return Evaluations(
             settings=setting,
             outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
             collision_speed=undefined,
             metrics=dict.fromkeys(METRICS, undefined),
-            f_diff=self._characteristics.largest_change(own),
-            f_num_diff=self._characteristics.number_changed(own),
+            f_diff=self._characteristics.largest_change(values),
+            f_num_diff=self._characteristics.number_changed(values),
             reasons={setting[0].tobytes(): " ".join(str(error).split())},
         )
 
-    def _culprit(self, work: bytes, settings: FloatArray) -> FloatArray:
-        """A setting on which user code fails, found by halving, shape (1, n)."""
+    def _culprit(self, packed_task: bytes, settings: FloatArray) -> FloatArray:
+        """A setting on which user code fails, shape (1, n), found by halving the batch."""
         while len(settings) > 1:
             half = settings[: len(settings) // 2]
             try:
-                self._attempt(work, half)
+                self._attempt(packed_task, half)
             except UserCodeError:
                 settings = half
             else:
@@ -146,8 +156,8 @@ class Attempts:
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
-    """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was
-    reduced.
+    """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the only point to which
+    the study was reduced.
     """
     characteristics, origin = CharacteristicSet.of(study), study.origin
     words = [f"{PROGRAM_COMMAND} simulate", shlex.quote(origin.called or study.name)]
@@ -166,7 +176,7 @@ class _ShareCarrier:
     """Carries out a share."""
 
     def __init__(self, share: Share, report: Report, attempts: Attempts) -> None:
-        self._share, self._report, self._attempts, self._task = share, report, attempts, task_of(share.work)
+        self._share, self._report, self._attempts, self._task = share, report, attempts, task_of(share.packed_task)
         self._study = self._task.study
         self._files = dict(self._task.inputs.get("sources", {}))
         """Digests of the files that user code has read so far."""
@@ -174,7 +184,7 @@ class _ShareCarrier:
         """Files that user code has read and that no journal holds yet."""
 
     def carry_out(self) -> None:
-        """Carry out all runs, together as far as their searches go."""
+        """Advance all runs in rounds, until their searches have ended: each round simulates what they wait for."""
         if not (self._share.directory / MANIFEST).exists():
             raise InputError(
                 "out", f"a worker does not see {self._share.directory}", "a directory on a disk that all workers share"
@@ -221,9 +231,7 @@ class _ShareCarrier:
             yield Run(key, make_search(key, self._study, problem, self._note_files), journal, search.evaluations)
 
     def _note_files(self, files: Mapping[str, str]) -> None:
-        """Note files that user code has read, which the next line of a journal then names; refuses files that have
-        changed.
-        """
+        """Note files that user code has read, so that the next line of a journal names them; refuses changed files."""
         refuse_changed_files([name for name, digest in files.items() if self._files.get(name, digest) != digest])
         new_files = {name: digest for name, digest in files.items() if name not in self._files}
         self._files |= new_files
@@ -235,7 +243,7 @@ class _ShareCarrier:
         if not owners:
             return
         settings = np.concatenate([run.missing_settings for run in runs])
-        for evaluations in self._evaluate(self._share.work, settings, self._share.batch):
+        for evaluations in self._evaluate(self._share.packed_task, settings, self._share.batch_size):
             self._note_files(evaluations.files)
             owners_of_rows, owners = owners[: len(evaluations)], owners[len(evaluations) :]
             for run in dict.fromkeys(owners_of_rows):
@@ -243,27 +251,27 @@ class _ShareCarrier:
                 run.receive(evaluations.take(rows), self._new_files)
                 self._new_files = {}
 
-    def _evaluate(self, work: bytes, settings: FloatArray, size: int) -> Iterator[Evaluations]:
+    def _evaluate(self, packed_task: bytes, settings: FloatArray, size: int) -> Iterator[Evaluations]:
         """Evaluate settings in equal batches of at most `size` settings."""
         for batch in np.array_split(settings, math.ceil(len(settings) / size)):
-            yield from self._attempts.evaluate(work, batch)
+            yield from self._attempts.evaluate(packed_task, batch)
 
     def _verify(self, runs: Sequence[Run]) -> None:
-        """Simulate settings of ended runs again: one by one with user code loaded afresh, and in SUMO if the runs used
-        recorded scenes.
+        """Simulate settings of ended runs again: alone, if there is user code, and in SUMO, if the runs used recorded
+        scenes.
         """
         if user_code_names(self._study):
             for run in runs:
                 self._verify_isolation(run)
-        if self._share.sumo_work:
+        if self._share.sumo_task:
             self._verify_in_sumo(runs)
 
     def _verify_isolation(self, run: Run) -> None:
-        """Refuse a run with an evaluation that differs from that of the same setting alone, with user code afresh."""
+        """Refuse a run with a setting whose evaluation is another one alone, with user code loaded afresh."""
         task = self._task
-        work = Task(study=task.study, inputs=task.inputs, engine=task.engine, afresh=True).packed
+        packed_task = Task(study=task.study, inputs=task.inputs, engine=task.engine, afresh=True).packed
         for expected in run.sample_evaluations(self._generator("recheck", run.key)):
-            (isolated,) = self._attempts.evaluate(work, expected.settings)
+            (isolated,) = self._attempts.evaluate(packed_task, expected.settings)
             if expected.failed[0] or isolated.failed[0]:
                 continue
             for _, difference in differences(isolated.results, expected.results):
@@ -279,13 +287,13 @@ class _ShareCarrier:
         if not any(map(len, samples)):
             return
 
-        def evaluate(work: bytes) -> Evaluations:
-            return Evaluations.concatenate([*self._evaluate(work, recorded.settings, MAX_COPIES)])
+        def evaluate(packed_task: bytes) -> Evaluations:
+            return Evaluations.concatenate([*self._evaluate(packed_task, recorded.settings, MAX_COPIES)])
 
         recorded = Evaluations.concatenate(samples)
-        in_sumo = evaluate(self._share.sumo_work)
-        if self._share.recorded_work:  # SUMO repeats a few cells of a rating; the runs have no values of single cells
-            recorded = evaluate(self._share.recorded_work)
+        in_sumo = evaluate(self._share.sumo_task)
+        if self._share.recorded_task:  # SUMO repeats a few cells of a rating; the runs have no values of single cells
+            recorded = evaluate(self._share.recorded_task)
         refuse_unlike_sumo(self._study, recorded, in_sumo)
         failed_rows = np.flatnonzero(in_sumo.failed)
         if len(failed_rows):

@@ -181,8 +181,10 @@ class StudyFit:
 
     def batches(self, study: Study) -> list[Batch]:
         """The batches that simulate the study, which may have other parameter values."""
-        work, size = Task(study=study, inputs=self._inputs).packed, self._batch_size
-        return [Batch(work, self._settings[start : start + size]) for start in range(0, len(self._settings), size)]
+        packed_task, size = Task(study=study, inputs=self._inputs).packed, self._batch_size
+        return [
+            Batch(packed_task, self._settings[start : start + size]) for start in range(0, len(self._settings), size)
+        ]
 
     def misfit(self, batches: Sequence[Evaluations]) -> Misfit:
         """The loss and the residuals, from the evaluations of all batches."""

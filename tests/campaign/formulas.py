@@ -49,7 +49,7 @@ class FormulaPool:
         self.sizes: list[int] = []
         self._threads = ThreadPoolExecutor(workers) if workers > 1 else None
 
-    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
+    def evaluate(self, packed_task: bytes, settings: np.ndarray) -> Evaluations:
         if self._limit is not None:
             if not self._limit:
                 raise PoolLostError("broken down")

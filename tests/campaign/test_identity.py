@@ -62,13 +62,13 @@ def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -
     study = msgspec.structs.replace(
         study, scenario=msgspec.structs.replace(study.scenario, parameters={"network": str(tmp_path / "mine")})
     )
-    work = Task(study=study, inputs={"network": network_digests(assemble(study))}).packed
+    packed_task = Task(study=study, inputs={"network": network_digests(assemble(study))}).packed
     original = CharacteristicSet.of(study).original[None]
-    evaluate_batch(work, original)
+    evaluate_batch(packed_task, original)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
     traffic.write_text(traffic.read_text() + "<!-- -->")
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: is not the file"):
-        evaluate_batch(work, original)
+        evaluate_batch(packed_task, original)
 
 
 ADS = """

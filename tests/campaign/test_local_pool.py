@@ -51,8 +51,8 @@ def pool() -> Iterator[LocalPool]:
         yield pool
 
 
-def evaluate(pool: LocalPool, settings: np.ndarray = ORIGINAL, work: bytes = SMOKE) -> Evaluations:
-    return evaluate_batches([Batch(work, settings)], pool)[0]
+def evaluate(pool: LocalPool, settings: np.ndarray = ORIGINAL, packed_task: bytes = SMOKE) -> Evaluations:
+    return evaluate_batches([Batch(packed_task, settings)], pool)[0]
 
 
 def carry(pool: LocalPool, settings: np.ndarray) -> Future[None]:
@@ -90,7 +90,7 @@ def test_what_takes_too_long_is_stopped() -> None:
 def test_an_error_of_the_study_arrives_as_it_is_and_a_bug_with_its_traceback(pool: LocalPool) -> None:
     wrong = SMOKE.replace(b"world_on_rails", b"world_on_roads")
     with pytest.raises(InputError, match="world_on_roads") as caught:
-        evaluate(pool, work=wrong)
+        evaluate(pool, packed_task=wrong)
     assert "expected" in str(caught.value)
     with pytest.raises(RuntimeError, match=r"(?s)Traceback.*evaluate_batch"):
         evaluate(pool, ORIGINAL[:, :3])
@@ -139,7 +139,7 @@ class Told:
         self.tried: list[int] = []
         self._times = Counter[bytes]()
 
-    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
+    def evaluate(self, packed_task: bytes, settings: np.ndarray) -> Evaluations:
         self.tried.append(len(settings))
         error = self.fault(settings, self._times[settings.tobytes()])
         self._times[settings.tobytes()] += 1
