@@ -26,9 +26,10 @@ from safevar_sumo.terminal import Answer, WholeTable, constraints_in_words
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_DISTINCT_CAUSES, MAX_NECESSARY = 10, 4
-"""Maximum number of distinct causes in the table of all failures, and of characteristics named as necessary most often.
-"""
+MAX_DISTINCT_CAUSES = 10
+"""Maximum number of distinct causes in the table of all failures."""
+MAX_NECESSARY = 4
+"""Maximum number of characteristics that a sentence names as necessary."""
 FRAME_COLUMNS = (
     "failure",
     "algorithm",
@@ -57,7 +58,8 @@ class Explained(Answer):
     Attributes
     ----------
     original, nearest
-        Evaluations of the original vehicle, and of the least safe of the evaluated settings; of none, an empty one.
+        Evaluations of the original vehicle, and of the least safe of the evaluated settings; `nearest` is empty if no
+        setting was evaluated.
     explanations
         Explanations of the chosen failures.
     necessity, distinct
@@ -65,7 +67,7 @@ class Explained(Answer):
     looked_at, failures, analysed
         Number of evaluated settings, of failures among these, and of failures that the statistics cover.
     otherwise
-        Number of solutions that ended otherwise than in the results: with another outcome than the recorded one.
+        Number of solutions with another outcome than the recorded one.
     preventability
         Shares of the collisions among the evaluated settings that reference drivers avoid.
     no_verdict
@@ -108,42 +110,39 @@ class Explained(Answer):
 
     @property
     def counts(self) -> str:
-        """The criterion, how many settings are unsafe by it, and in which range with other fitted vehicle models."""
+        """How many settings are unsafe, the criterion, and the unsafe share with other fitted vehicle models."""
         vehicles = number_of(self.looked_at, "different vehicle")
         counts = f"{self.failures} of {vehicles} are unsafe: {self.unsafe.description}."
-        counts += (
-            f" {number_of(self.otherwise, 'setting')} with another outcome than recorded." if self.otherwise else ""
-        )
+        if self.otherwise:
+            counts += f" {number_of(self.otherwise, 'setting')} with another outcome than recorded."
         return f"{counts} {self.across_fits}" if self.across_fits else counts
 
     @property
     def verdict(self) -> list[str]:
-        """The verdict in sentences: the situation, the failure to lead with, the robust one, and who would have avoided
-        the collisions.
+        """The verdict in sentences: the situation, the leading failure, the robust one, and who would have avoided the
+        collisions.
 
-        The failure to lead with has the fewest changes; of several the robust one, else the most severe.
+        The leading failure has the fewest changes; of several, it is the robust one, or else the most severe one.
         """
         situation = situation_in_words(assemble(self.study), self.original, self.nearest, self.looked_at)
-        parts, reasons = [situation], self.by_reason
-        robust, first = reasons.get(ROBUST), reasons.get(REASONS["fewest"], next(iter(self.explanations), None))
-        if first is None or first.cause is None:
-            return parts if self.no_verdict else [*parts, "Nothing unsafe was found."]
-        if not first.cause.changes:
-            return [*parts, "No change is needed for it to be unsafe."]
-        if robust is not None and len(robust.changed) == len(first.changed):
-            first = robust
-        parts.append(first.finding)
-        if first.robustness.borderline:
-            parts.append(
-                f"The robust failure with the fewest changes: {robust.finding}"
-                if robust
-                else "No failure tested is robust."
-            )
-        return [part[0].upper() + part[1:] for part in [*parts, str(self.preventability)] if part]
+        sentences, by_reason = [situation], self.by_reason
+        robust, leading = by_reason.get(ROBUST), by_reason.get(REASONS["fewest"], next(iter(self.explanations), None))
+        if leading is None or leading.cause is None:
+            return sentences if self.no_verdict else [*sentences, "Nothing unsafe was found."]
+        if not leading.cause.changes:
+            return [*sentences, "No change is needed for it to be unsafe."]
+        if robust is not None and len(robust.changed) == len(leading.changed):
+            leading = robust
+        sentences.append(leading.finding)
+        if leading.robustness.borderline and robust:
+            sentences.append(f"The robust failure with the fewest changes: {robust.finding}")
+        elif leading.robustness.borderline:
+            sentences.append("No failure tested is robust.")
+        return [text[0].upper() + text[1:] for text in [*sentences, str(self.preventability)] if text]
 
     def sentences(self) -> list[str]:
-        """The answer in sentences: the verdict as a paragraph, the counts, and why and by how little the first failure
-        fails.
+        """The answer in sentences: the verdict as a paragraph, the counts, why the first failure is unsafe, the limits
+        of its cause, and the most frequent necessary changes and minimal cause of all failures.
         """
         sentences = [" ".join(self.verdict), self.counts]
         if not self.explanations:
@@ -163,13 +162,13 @@ class Explained(Answer):
             )
             sentences.append(f"How little is enough: {limits}.")
         if self.analysed and len(self.distinct):
-            common = self.distinct.iloc[0]
+            cause, _, share = next(self.distinct.itertuples(index=False))
             rows = self.necessity[self.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
             necessary = ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows)
             sentences += [
                 f"In every cause of a failure most often ({self.sample}): {necessary or 'no change is common to all'}.",
                 f"{number_of(len(self.distinct), 'distinct minimal cause')}; the most frequent: "
-                f"{', '.join(common['cause']) or 'none'} ({100 * common['share']:.0f} % of the failures).",
+                f"{', '.join(cause) or 'none'} ({100 * share:.0f} % of the failures).",
             ]
         return sentences
 
@@ -227,8 +226,8 @@ class Explained(Answer):
         causes = WholeTable(
             "minimal cause", right=("failures", "share"), title=f"Distinct minimal causes: {len(self.distinct)}"
         )
-        for _, names, failures, share in self.distinct.head(MAX_DISTINCT_CAUSES).itertuples():
-            causes.add_row(", ".join(names) or "none: the original vehicle", str(failures), f"{100 * share:.0f} %")
+        for cause, failures, share in self.distinct.head(MAX_DISTINCT_CAUSES).itertuples(index=False):
+            causes.add_row(", ".join(cause) or "none: the original vehicle", str(failures), f"{100 * share:.0f} %")
         yield causes
 
     def to_dict(self) -> list[JsonObject]:
@@ -267,7 +266,8 @@ class Explained(Answer):
 
     def figure(self) -> Figure:
         """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
-        frame, size = self.necessity.iloc[::-1], (6.4, 1.4 + 0.3 * max(len(self.necessity), 4))
+        frame = self.necessity.iloc[::-1]  # bars are drawn from the bottom up
+        size = (6.4, 1.4 + 0.3 * max(len(self.necessity), 4))
         figure, ((axis,),) = new_figure(f"{self.study.name}: changed vs. necessary", 1, 1, size)
         names = [escape_dollars(name) for name in frame["characteristic"]]
         for column, label, colour, height in (
@@ -293,17 +293,19 @@ def _necessary_share(row: Mapping[Any, Any]) -> str:
 def situation_in_words(
     system: System, original: Evaluations, nearest: Evaluations | None = None, number: int = 0
 ) -> str:
-    """The conditions and how the original vehicle's run ends; first that nothing collides, if so of `number` vehicles.
+    """A sentence on the conditions and on how the original vehicle's run ends.
 
-    `nearest` is the evaluation of the least safe of these vehicles.
+    If none of `number` vehicles collides, the sentence begins with that; `nearest` is the evaluation of the least safe
+    of them.
     """
-    where, own_ending = _place_in_words(system), _ending_in_words(system, original)
+    place, ending = _place_in_words(system), _ending_in_words(system, original)
     if not nearest or nearest.collided[0] or original.collided[0] or RATING_POINTS.name in original.metrics:
-        return f"{where}, the original vehicle {own_ending}."
-    other = f"{original.f_safe[0]:.2f} m" if nearest.outcome[0] == original.outcome[0] else own_ending
+        return f"{place}, the original vehicle {ending}."
+    if nearest.outcome[0] == original.outcome[0]:
+        ending = f"{original.f_safe[0]:.2f} m"  # the verb is that of the worst vehicle
     return (
         f"No collision in {number_of(number, 'vehicle')}; the worst {_ending_in_words(system, nearest)}, "
-        f"the original {other}, {where[0].lower()}{where[1:]}."
+        f"the original {ending}, {place[0].lower()}{place[1:]}."
     )
 
 
@@ -316,7 +318,7 @@ def _place_in_words(system: System) -> str:
 
 
 def _ending_in_words(system: System, run: Evaluations) -> str:
-    """How the only run of an evaluation ends."""
+    """How a run ends; `run` is the evaluation of a single setting."""
     degree, outcome = float(run.f_safe[0]), Outcome(str(run.outcome[0]))
     if RATING_POINTS.name in run.metrics:
         return f"earns {run.metrics[RATING_POINTS.name][0]:.2f} points"

@@ -42,8 +42,8 @@ PART_PHRASES = {
     "slowing": ("speed_lost", "m/s", "it loses {} speed while the pedal moves", "less", "more"),
     "deceleration": ("deceleration", "m/s^2", "it decelerates {} with the pedal down", "less", "more"),
 }
-"""For each part the attribute of `Braking` that explains it, its unit, and a phrase with a word each for a part that
-costs distance and for one that gains it.
+"""For each part of the lost margin: the attribute of `Braking` that explains it, its unit, and a phrase with a word if
+distance is lost and another one if it is gained.
 """
 
 
@@ -99,9 +99,17 @@ class Braking(NamedTuple):
 class BrakingComparison(NamedTuple):
     """How the original and the changed vehicle brake, and the parts of the margin that the changed vehicle lost [m].
 
-    A braking is None if the vehicle did not brake for the obstacle; `parts` is empty if one did not. One of the parts
-    is the remainder, which no difference explains. `endings` say how both runs end; `point` is the name of a test
-    point.
+    Attributes
+    ----------
+    original, changed
+        How each vehicle brakes; None if it does not brake for the obstacle.
+    parts
+        The parts by name; one is the remainder, which no difference explains. Empty if one of the vehicles does not
+        brake.
+    endings
+        How the runs of the original and of the changed vehicle end, in words.
+    point
+        Name of the test point; empty without a test matrix.
     """
 
     original: Braking | None
@@ -119,10 +127,10 @@ class BrakingComparison(NamedTuple):
         phrases = []
         for name, part in sorted(self.parts.items(), key=lambda item: -item[1]):
             if name in PART_PHRASES and abs(part) >= MIN_PART:
-                attribute, unit, phrase, costs, gains = PART_PHRASES[name]
-                here, there = (getattr(braking, attribute) for braking in (self.changed, self.original))
-                reason = phrase.format(costs if part > 0 else gains)
-                phrases.append(f"{part:.2f} m because {reason} ({here:.2f} instead of {there:.2f} {unit})")
+                attribute, unit, phrase, word_if_lost, word_if_gained = PART_PHRASES[name]
+                value, original_value = (getattr(braking, attribute) for braking in (self.changed, self.original))
+                reason = phrase.format(word_if_lost if part > 0 else word_if_gained)
+                phrases.append(f"{part:.2f} m because {reason} ({value:.2f} instead of {original_value:.2f} {unit})")
         if abs(self.parts["remainder"]) > MAX_OMITTED_REMAINDER:
             phrases.append(f"{self.parts['remainder']:.2f} m unexplained")
         return (
@@ -156,36 +164,40 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     sample = later_samples[0] if later_samples.size else braking_samples[-1]  # a sample of the manoeuvre that counts
     regulation = np.flatnonzero(((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0)) & ~is_braking[:sample])
     onset = int(braking_samples[braking_samples >= (regulation[-1] if regulation.size else 0)][0])
-    while onset > 0 and brake[onset - 1] > (brake[onset - 2] if onset > 1 else 0):
+    while onset > 0 and brake[onset - 1] > (brake[onset - 2] if onset > 1 else 0):  # the command already rises
         onset -= 1
     return onset
 
 
 def measure_braking(runs: SimulationRuns, column: int) -> Braking | None:
     """The braking of vehicle `column`; None if it does not brake, or only coasts after the pedal has followed."""
-    first, nearest, trace = brake_onset(runs, column), runs.nearest(column), runs.trace
-    if first is None:
+    onset, nearest, trace = brake_onset(runs, column), runs.nearest(column), runs.trace
+    if onset is None:
         return None
     last = int(np.flatnonzero(trace.active[:, column])[-1]) if nearest is None else nearest
-    speed, position = trace.speed[: last + 1, column], trace.position[: last + 1, column]
-    elapsed = trace.time[last] - trace.time[first]
-    shift = position[last] + trace.gap[last, column] - position[first] - trace.gap[first, column]  # of the obstacle
-    obstacle_speed = round(float(shift / elapsed), OBSTACLE_DECIMALS) if last > first and np.isfinite(shift) else 0.0
-    speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[: last + 1]  # relative to it
-    has_followed = trace.pedal[first : last + 1, column] >= PEDAL_SHARE * trace.brake[first : last + 1, column]
-    followed = first + int(np.argmax(has_followed))
-    distance = position[last] - position[followed]
-    specific_energy = (speed[followed] ** 2 - speed[last] ** 2) / 2  # energy that the brake takes, per mass
+    position = trace.position[: last + 1, column]
+    elapsed = trace.time[last] - trace.time[onset]
+    obstacle_shift = position[last] + trace.gap[last, column] - position[onset] - trace.gap[onset, column]
+    obstacle_speed = 0.0
+    if last > onset and np.isfinite(obstacle_shift):
+        obstacle_speed = round(float(obstacle_shift / elapsed), OBSTACLE_DECIMALS)
+    relative_speed = trace.speed[: last + 1, column] - obstacle_speed
+    relative_position = position - obstacle_speed * trace.time[: last + 1]
+    has_followed = trace.pedal[onset : last + 1, column] >= PEDAL_SHARE * trace.brake[onset : last + 1, column]
+    followed = onset + int(np.argmax(has_followed))
+    distance = relative_position[last] - relative_position[followed]
+    specific_energy = (relative_speed[followed] ** 2 - relative_speed[last] ** 2) / 2  # which the brake takes, per mass
     if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
-    initial_speed, delay = float(speed[first]), (followed - first) * trace.step
+    initial_speed, delay = float(relative_speed[onset]), (followed - onset) * trace.step
     has_collided = nearest is None or np.isfinite(runs.collision_speed[column])
+    delay_distance = float(relative_position[followed] - relative_position[onset])
     return Braking(
-        gap=float(trace.gap[first, column]),
+        gap=float(trace.gap[onset, column]),
         speed=initial_speed + obstacle_speed,
         delay=delay,
-        speed_deficit=initial_speed - float(position[followed] - position[first]) / delay if delay else 0.0,
-        speed_lost=initial_speed - float(speed[followed]),
+        speed_deficit=initial_speed - delay_distance / delay if delay else 0.0,
+        speed_lost=initial_speed - float(relative_speed[followed]),
         deceleration=specific_energy / distance,
         obstacle_speed=obstacle_speed,
         nearest_gap=None if has_collided else float(trace.gap[last, column]),
@@ -205,7 +217,7 @@ def compare_braking(runs: SimulationRuns, column: int, degrees: FloatArray, poin
     _, speed, delay, deficit, lost, softness = quantities.mean(axis=0)
     more_gap, more_speed, more_delay, more_deficit, more_lost, more_softness = np.diff(quantities, axis=0)[0]
     per_speed_after_delay = (speed - lost) * softness
-    speeds_after_delay = quantities[:, 1] - quantities[:, 4]
+    speeds_after_delay = quantities[:, 1] - quantities[:, 4]  # closing speed - speed lost
     parts = {
         "gap": -more_gap,
         "speed": more_speed * (delay + per_speed_after_delay),

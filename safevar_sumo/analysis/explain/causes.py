@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import combinations, islice
+from itertools import combinations, islice, pairwise
 from math import comb
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
 STEP_FACTORS = (1.0, 0.5, 2.0)
-"""Factors by which the study's time step is multiplied."""
+"""Factors by which the study's time step is multiplied; the step itself comes first."""
 MIN_ROBUST_SHARE = 0.8
 """Share of unsafe neighbours from which on a failure is called robust; below, it is borderline."""
 FAILURES_PER_BATCH = 8
@@ -58,8 +58,9 @@ class Robustness(NamedTuple):
 
 
 def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, seed: int) -> FloatArray:
-    """The neighbours of M settings, shape (M, n), one setting after the other; they differ from it by at most the
-    filter's threshold.
+    """The neighbours of M settings, shape (M, n), those of one setting after those of another.
+
+    A neighbour differs from its setting by at most the filter's threshold.
     """
     n = len(characteristics)
     offsets = np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, n)) * characteristics.threshold
@@ -94,39 +95,39 @@ def find_smallest_robust_failure(
     Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no
     tried failure is robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
-    order, neighbour_sets = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff]), 0
-    own, others = STEP_FACTORS[:1], STEP_FACTORS[1:]
-    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(others)  # just robust if all other shares are 1
+    order, evaluation_count = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff]), 0
+    study_step, other_steps = STEP_FACTORS[:1], STEP_FACTORS[1:]
+    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(other_steps)  # just robust if all other shares are 1
     for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start : start + FAILURES_PER_BATCH]
-        neighbour_sets += len(rows)
-        estimates = estimate_robustness(evaluator, failures.settings[rows], step, unsafe, own)
-        candidates = [pair for pair in zip(rows.tolist(), estimates, strict=True) if pair[1].share >= least_share]
+        evaluation_count += NEIGHBOUR_COUNT * len(rows)
+        estimates = estimate_robustness(evaluator, failures.settings[rows], step, unsafe, study_step)
+        candidates = [pair for pair in zip(rows, estimates, strict=True) if pair[1].share >= least_share]
         if candidates:
-            neighbour_sets += len(others) * len(candidates)
+            evaluation_count += NEIGHBOUR_COUNT * len(other_steps) * len(candidates)
             settings = failures.settings[[row for row, _ in candidates]]
-            further = estimate_robustness(evaluator, settings, step, unsafe, others)
-            for (row, estimate), other in zip(candidates, further, strict=True):
+            with_other_steps = estimate_robustness(evaluator, settings, step, unsafe, other_steps)
+            for (row, estimate), other in zip(candidates, with_other_steps, strict=True):
                 if not Robustness(estimate.shares_by_step | other.shares_by_step).borderline:
                     return int(row)
-        if neighbour_sets * NEIGHBOUR_COUNT >= max_evaluations:
+        if evaluation_count >= max_evaluations:
             break
     return None
 
 
 MAX_SUBSETS = 20_000
-"""Maximum number of subsets simulated in one call; further subsets are made only after it, which bounds the memory."""
+"""Maximum number of subsets simulated in one call, which bounds the memory."""
 
 
 class BoundaryState(StrEnum):
-    """What lies on a line just below its smallest unsafe share."""
+    """What lies on a line from the original just below the smallest share of the line that is unsafe."""
 
     SAFE = "safe"
     FILTER = "filter threshold"
     NOT_SIMULATED = "not simulated"
 
 
-BELOW = {
+STATE_PHRASES = {
     BoundaryState.SAFE: "slightly less is safe",
     BoundaryState.FILTER: "with less, a change falls below the filter's threshold and counts as none",
     BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
@@ -137,7 +138,7 @@ BELOW = {
 class Cause:
     """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
 
-    `find_minimal_causes` finds its first three values, `describe_causes` the limits.
+    `find_minimal_causes` finds `changes`, `outcome` and `safety_degree`, `describe_causes` the limits.
 
     Attributes
     ----------
@@ -146,19 +147,19 @@ class Cause:
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
     boundary
-        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays
-        unsafe.
+        The limits if all changes are scaled: the values after every change is multiplied by `fraction`, the smallest
+        factor at which the vehicle stays unsafe.
     alone
-        For each characteristic, the value to which it can return towards the original while the others stay as in
-        `changes`.
+        The limits if one change is scaled: for each characteristic, the value to which it can return towards the
+        original while the others stay as in `changes`.
     end
-        The end of the shrinking: the state just below `fraction`.
+        What lies just below `fraction`, where the shrinking ends.
     neighbours
-        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
-        the simulations would take too long.
+        Robustness of these changes by themselves, estimated from their neighbours; None in a rated study, where the
+        simulations would take too long.
     sets, holds
-        Number of fitted vehicle models (`ExplainOptions.fits`), and with how many of them the cause is one; 0 and 0 of
-        a study with a single model.
+        Number of fitted vehicle models (`ExplainOptions.fits`), and number of those in which these changes are a cause
+        too; both are 0 in a study with a single model.
     """
 
     changes: dict[str, float]
@@ -180,12 +181,12 @@ class Cause:
     @property
     def limit(self) -> str:
         """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
-        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {BELOW[self.end]}."
+        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {STATE_PHRASES[self.end]}."
 
     @property
     def notes(self) -> str:
-        """How robust the cause is and with how many fitted vehicle models it is one, in brackets; empty if neither is
-        known.
+        """A suffix in brackets: how robust the cause is, and in how many fitted vehicle models it is a cause; empty if
+        neither is known.
         """
         notes = [] if self.neighbours is None else [str(self.neighbours)]
         notes += [f"in {self.holds} of {self.sets} fitted vehicle models"] if self.sets else []
@@ -196,7 +197,7 @@ class Cause:
         return np.array([self.changes.get(item.name, item.original) for item in characteristics])
 
     def to_dict(self) -> JsonObject:
-        """An entry of `minimal_causes` in `explain --json`."""
+        """An entry for a cause in `minimal_causes` of `explain --json`."""
         names = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
         across_fits = {"sets": self.sets, "holds": self.holds} if self.sets else None
         return {name: getattr(self, name) for name in names} | {"across_fits": across_fits}
@@ -214,9 +215,9 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     for size in range(max(map(len, changed), default=0) + 1):
         subsets = (
             (row, list(columns))
-            for row, found in enumerate(causes)
-            if not found  # in a smaller size: all subsets of this one are tried
-            for columns in combinations(changed[row], size)
+            for row, columns_changed in enumerate(changed)
+            if not causes[row]  # no smaller subset is one; of this size, all subsets are simulated
+            for columns in combinations(columns_changed, size)
         )
         while chunk := list(islice(subsets, MAX_SUBSETS)):
             partial_settings = np.tile(original, (len(chunk), 1))
@@ -232,8 +233,8 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
 
 
 def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
-    """Rows whose minimal causes together take at most about `max_evaluations`: all rows of `settings`, or a random
-    sample.
+    """All rows of `settings`, or a random sample of them, so that finding their minimal causes takes at most about
+    `max_evaluations`.
 
     The estimate assumes causes with half of the changes, about as in the shipped studies.
     """
@@ -273,9 +274,9 @@ def necessity_frame(
         were analysed. Ordered by necessary, involved, changed; no rows if there is no failure.
     """
     number, names = max(len(changed), 1), characteristics.names
-    sets = [[set(cause.changes) for cause in of_one] for of_one in causes if of_one]
-    necessary = Counter(name for of_one in sets for name in set.intersection(*of_one))
-    involved = Counter(name for of_one in sets for name in set.union(*of_one))
+    name_sets = [[set(cause.changes) for cause in of_failure] for of_failure in causes if of_failure]
+    necessary = Counter(name for of_failure in name_sets for name in set.intersection(*of_failure))
+    involved = Counter(name for of_failure in name_sets for name in set.union(*of_failure))
     shares = [necessary[name] / number for name in names]
     frame = pd.DataFrame({"characteristic": names, "changed": changed.sum(axis=0) / number, "necessary": shares})
     frame["involved"] = [involved[name] / number for name in names]
@@ -306,56 +307,60 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
         Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause;
         and `share`, their share of all failures.
     """
-    counts = Counter(key for of_one in causes for key in {cause_key(characteristics, cause) for cause in of_one})
+    keys = [{cause_key(characteristics, cause) for cause in of_failure} for of_failure in causes]
+    counts = Counter(key for of_failure in keys for key in of_failure)
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
 
 
 LINE_SETTINGS = 32
-"""Number of settings first simulated on each `Line`. The search finds every unsafe stretch of the line that is as long
-as their spacing.
+"""Number of settings first simulated on each line from the original to a setting. The search finds every unsafe stretch
+of the line that is as long as their spacing.
 """
 PARTS_PER_ROUND = 8
-"""Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
+"""Number of parts into which each further round divides the interval with the boundary."""
 ROUNDS = 3
+"""Number of rounds after the first."""
 RESOLUTION = 1 / (LINE_SETTINGS * PARTS_PER_ROUND**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
 
 
 def describe_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> list[Cause]:
-    """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the
-    filter's thresholds.
+    """Find the limits of causes: how far all changes shrink by a common factor, and each change by itself, while they
+    stay unsafe and above the filter's thresholds.
     """
     if not causes:
         return []
     characteristics = evaluator.characteristics
     settings, original = np.array([cause.setting(characteristics) for cause in causes]), characteristics.original
     is_changed = settings != original
+    # A cause has a line on which all its changes are scaled, then a line for each change by itself.
     groups = [np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]]) for flags in is_changed]
-    is_scaled, ends = np.concatenate(groups), np.repeat(settings, [len(group) for group in groups], axis=0)
+    line_counts = list(map(len, groups))
+    is_scaled, ends = np.concatenate(groups), np.repeat(settings, line_counts, axis=0)
     starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
         characteristics.threshold, np.abs(ends - original), out=np.zeros(ends.shape), where=is_scaled
     )
     shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1))
-    limits, rows = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0], np.cumsum([0, *map(len, groups)])
+    limits, first_lines = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0], np.cumsum([0, *line_counts])
     return [
         replace(
             cause,
-            boundary=dict(zip(cause.changes, limits[row, flags].tolist(), strict=True)),
-            alone=dict(zip(cause.changes, np.diagonal(limits[row + 1 : end, flags]).tolist(), strict=True)),
-            fraction=float(shares[row]) if cause.changes else 0.0,
-            end=states[row],
+            boundary=dict(zip(cause.changes, limits[first, flags].tolist(), strict=True)),
+            alone=dict(zip(cause.changes, np.diagonal(limits[first + 1 : stop, flags]).tolist(), strict=True)),
+            fraction=float(shares[first]) if cause.changes else 0.0,
+            end=states[first],
         )
-        for cause, flags, row, end in zip(causes, is_changed, rows[:-1], rows[1:], strict=True)
+        for cause, flags, (first, stop) in zip(causes, is_changed, pairwise(first_lines), strict=True)
     ]
 
 
 def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
-    """Settings at K shares of each of M lines, shape (M, K), from `starts` to `ends`, shape (M, n); shape (M, K, n)."""
-    factors, first, last = shares[..., np.newaxis], starts[:, np.newaxis], ends[:, np.newaxis]
-    return np.where(factors >= 1, last, first + factors * (last - first))
+    """Settings at K `shares`, shape (M, K), of M lines from `starts` to `ends`, shape (M, n); shape (M, K, n)."""
+    factors, start, end = shares[..., np.newaxis], starts[:, np.newaxis], ends[:, np.newaxis]
+    return np.where(factors >= 1, end, start + factors * (end - start))
 
 
 def find_boundary_shares(
@@ -376,17 +381,17 @@ def find_boundary_shares(
     low, high, low_is_valid = lowest, np.ones(number), np.ones(number, dtype=bool)
     for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
-        shares[:, -1] = high
+        shares[:, -1] = high  # without a rounding error; known to be unsafe
         inner = settings_on_lines(starts, ends, shares[:, :-1])
         evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), stage)
         is_unsafe, is_valid = (
             np.column_stack([flags.reshape(number, parts - 1), np.ones(number, dtype=bool)])
             for flags in (unsafe.of(evaluations), evaluations.valid)
         )
-        index = np.argmax(is_unsafe, axis=1)
-        below = rows, np.maximum(index - 1, 0)
-        low_is_valid = np.where(index > 0, is_valid[below], low_is_valid)
-        low, high = np.where(index > 0, shares[below], low), shares[rows, index]
+        first_unsafe = np.argmax(is_unsafe, axis=1)
+        below = rows, np.maximum(first_unsafe - 1, 0)
+        low_is_valid = np.where(first_unsafe > 0, is_valid[below], low_is_valid)
+        low, high = np.where(first_unsafe > 0, shares[below], low), shares[rows, first_unsafe]
     states = np.where(low_is_valid, BoundaryState.SAFE, BoundaryState.NOT_SIMULATED)
     states = np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)
     return high, [BoundaryState(state) for state in states]

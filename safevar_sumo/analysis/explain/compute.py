@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +58,8 @@ def explain_failures(
     """Explain the failures that matter among the solutions of results, or among settings drawn from a study's whole
     domain.
 
-    Without `statistics`, only the failures that matter by their size or severity, and nothing of all the others.
+    Without `statistics`, only the failures that matter by their size or severity are analysed: the answer has no
+    statistics of all failures, and leaves the other fitted vehicle models out.
 
     Raises
     ------
@@ -65,51 +67,60 @@ def explain_failures(
         If `unsafe` or a handle cannot be read, or a handle is no solution of the results.
     """
     study, characteristics = evaluator.study, evaluator.characteristics
-    found = _evaluate(source, options, evaluator)
+    population = _evaluate(source, options, evaluator)
     limit = options.limit // len(assemble(study).points)  # an evaluation simulates a setting at every point
-    settings, sample, reasons = found.evaluations.settings, list[int](), Reasons()
+    settings, sample, reasons = population.evaluations.settings, list[int](), Reasons()
     if options.solutions:
-        sample, reasons = found.rows, {row: ("requested",) for row in found.rows}
+        sample, reasons = population.rows, {row: ("requested",) for row in population.rows}
     else:
-        reasons = _choose_rows(found, limit)
+        reasons = _choose_rows(population, limit)
         if statistics:
-            sample = [found.rows[index] for index in select_affordable_rows(settings[found.rows], evaluator, limit)]
+            affordable = select_affordable_rows(settings[population.rows], evaluator, limit)
+            sample = [population.rows[index] for index in affordable]
     analysed = sorted({*sample, *reasons})
-    causes = dict(zip(analysed, find_minimal_causes(evaluator, settings[analysed], found.unsafe), strict=True))
+    causes = dict(zip(analysed, find_minimal_causes(evaluator, settings[analysed], population.unsafe), strict=True))
     sample_causes = [causes[row] for row in sample]
     distinct = count_distinct_causes(characteristics, sample_causes)
     if not options.solutions:
-        reasons = _add_distinct_causes(found, sample, reasons, causes, distinct["cause"], options.top)
-    models = evaluator.for_sets(options.fits if statistics and len(found.evaluations) else 0)
-    preventability = assess_preventability(evaluator, _collisions(study, found.evaluations))
+        reasons = _add_distinct_causes(population, sample, reasons, causes, distinct["cause"], options.top)
+    models = evaluator.for_sets(options.fits if statistics and len(population.evaluations) else 0)
+    preventability = assess_preventability(evaluator, _collisions(study, population.evaluations))
     necessity = necessity_frame(
-        characteristics, characteristics.changed(settings[sample]), sample_causes, len(found.rows)
+        characteristics, characteristics.changed(settings[sample]), sample_causes, len(population.rows)
     )
     return Explained(
         study=study,
-        unsafe=found.unsafe,
-        original=found.original,
-        nearest=found.evaluations.take(np.argsort(found.evaluations.f_safe, kind="stable")[:1]),
-        explanations=_explain_rows(found, causes, reasons, models),
+        unsafe=population.unsafe,
+        original=population.original,
+        nearest=population.evaluations.take(np.argsort(population.evaluations.f_safe, kind="stable")[:1]),
+        explanations=_explain_rows(population, causes, reasons, models),
         necessity=necessity,
         distinct=distinct,
-        looked_at=len(found.evaluations),
-        failures=len(found.rows),
+        looked_at=len(population.evaluations),
+        failures=len(population.rows),
         analysed=len(sample),
-        otherwise=found.deviations,
+        otherwise=population.otherwise,
         preventability=preventability,
         no_verdict=evaluator.no_verdict,
-        across_fits=measure_across_fits(models, found.evaluations, found.unsafe, necessity, preventability)
+        across_fits=measure_across_fits(models, population.evaluations, population.unsafe, necessity, preventability)
         if models
         else None,
     )
 
 
-class Found(NamedTuple):
-    """Evaluated settings, safe ones too, and the rows to explain: the unsafe ones, or those that the options name.
+class Population(NamedTuple):
+    """Evaluated settings, safe ones too, and the failures among them.
 
-    Equal solutions of several runs are one row. `handles` are None for settings that are no solutions; `deviations`
-    counts settings whose outcome differs from that in the results.
+    Attributes
+    ----------
+    evaluations
+        Equal solutions of several runs are one row.
+    handles
+        The handle of each row; None if the setting is no solution.
+    rows
+        The unsafe rows, or those that the options name.
+    otherwise
+        Number of rows with another outcome than in the results.
     """
 
     evaluator: Evaluator
@@ -118,14 +129,15 @@ class Found(NamedTuple):
     handles: Sequence[SolutionId | None]
     unsafe: Unsafe
     rows: list[int]
-    deviations: int
+    otherwise: int
 
 
-def _evaluate(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Found:
+def _evaluate(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Population:
     """Evaluate all solutions of results, or settings drawn from a study's whole domain."""
     unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
     named = [SolutionId.parse(text, "solutions") for text in options.solutions]
-    original, handles = evaluator.evaluate_original(), list[SolutionId | None]()
+    original = evaluator.evaluate_original()
+    handles: Sequence[SolutionId | None]
     if isinstance(source, Study):
         if named:
             raise InputError("solutions", f"{source.name!r} is a study and has no solutions", "a results directory")
@@ -142,9 +154,11 @@ def _evaluate(source: Study | Case, options: ExplainOptions, evaluator: Evaluato
         handles, recorded = [all_handles[row] for row in chosen], solutions["outcome"].to_numpy(dtype=str)[chosen]
     evaluations = evaluator.evaluate(settings, "settings to explain")
     criterion = unsafe or Unsafe.default_among(evaluations, original)
-    rows = list(range(len(set(named)))) if named else np.flatnonzero(criterion.of(evaluations)).tolist()
-    deviations = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
-    return Found(evaluator, original, evaluations, handles, criterion, rows, int(deviations))
+    rows = np.flatnonzero(criterion.of(evaluations)).tolist()
+    if named:
+        rows = list(range(len(set(named))))  # they come first
+    otherwise = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
+    return Population(evaluator, original, evaluations, handles, criterion, rows, int(otherwise))
 
 
 def _collisions(study: Study, evaluations: Evaluations) -> Evaluations:
@@ -154,78 +168,82 @@ def _collisions(study: Study, evaluations: Evaluations) -> Evaluations:
     return evaluations.take(evaluations.collided & (not is_rated(study)))
 
 
-def _choose_rows(found: Found, limit: int) -> Reasons:
-    """Choose the failures that are smallest robust, of the fewest changes, most severe, and of the smallest changes."""
-    reasons, candidates, evaluator = Reasons(), found.evaluations.take(found.rows), found.evaluator
-    if not found.rows:
+def _choose_rows(population: Population, limit: int) -> Reasons:
+    """Choose the smallest robust failure, and those with the fewest changes, most severe, and with the smallest
+    changes.
+    """
+    reasons, failures, evaluator = Reasons(), population.evaluations.take(population.rows), population.evaluator
+    if not population.rows:
         return reasons
-    if not is_rated(evaluator.study) and not found.unsafe.of(found.original)[0]:
-        index = find_smallest_robust_failure(evaluator, candidates, _time_step(evaluator.study), found.unsafe, limit)
+    if not is_rated(evaluator.study) and not population.unsafe.of(population.original)[0]:
+        index = find_smallest_robust_failure(evaluator, failures, _time_step(evaluator.study), population.unsafe, limit)
         if index is not None:
-            reasons[found.rows[index]] = (ROBUST,)
+            reasons[population.rows[index]] = (ROBUST,)
     for choice, reason in REASONS.items():
-        row = found.rows[np.lexsort([candidates.column(name) for name in reversed(CHOICES[choice])])[0]]
+        order = np.lexsort([failures.column(name) for name in reversed(CHOICES[choice])])
+        row = population.rows[order[0]]
         reasons[row] = (*reasons.get(row, ()), reason)
     return reasons
 
 
 def _add_distinct_causes(
-    found: Found,
+    population: Population,
     sample: Sequence[int],
     reasons: Reasons,
     causes: dict[int, list[Cause]],
     distinct: Iterable[tuple[str, ...]],
     top: int,
 ) -> Reasons:
-    """Add the simplest failure of every minimal cause that no chosen failure has, until `top` failures are chosen."""
-    chosen, evaluations = dict(list(reasons.items())[:top]), found.evaluations
-    keys = {row: {cause_key(found.evaluator.characteristics, cause) for cause in causes[row]} for row in causes}
+    """Add the simplest failure in `sample` of every `distinct` minimal cause that no chosen failure has, until `top`
+    failures are chosen.
+    """
+    reasons, evaluations = dict(list(reasons.items())[:top]), population.evaluations
+    keys = {row: {cause_key(population.evaluator.characteristics, cause) for cause in causes[row]} for row in causes}
     for key in distinct:
-        if len(chosen) < top and not any(key in keys[row] for row in chosen):
+        if len(reasons) < top and not any(key in keys[row] for row in reasons):
             rows = [row for row in sample if key in keys[row]]
             simplest = min(rows, key=lambda row: (evaluations.f_num_diff[row], evaluations.f_diff[row], row))
-            chosen[simplest] = (DISTINCT_CAUSE,)
-    return chosen
+            reasons[simplest] = (DISTINCT_CAUSE,)
+    return reasons
 
 
 def _explain_rows(
-    found: Found, causes: dict[int, list[Cause]], reasons: Reasons, models: Sequence[Evaluator]
+    population: Population, causes: dict[int, list[Cause]], reasons: Reasons, models: Sequence[Evaluator]
 ) -> tuple[Explanation, ...]:
     """Explanations of the chosen failures; `models` are the fitted vehicle models in which a cause may hold."""
     if not reasons:
         return ()
-    evaluator, unsafe, chosen = found.evaluator, found.unsafe, found.evaluations.take(list(reasons))
-    characteristics, study, settings = evaluator.characteristics, evaluator.study, chosen.settings
+    evaluator, unsafe, failures = population.evaluator, population.unsafe, population.evaluations.take(list(reasons))
+    characteristics, study, settings = evaluator.characteristics, evaluator.study, failures.settings
     described = describe_causes(evaluator, [cause for row in reasons for cause in causes[row]], unsafe)
-    neighbours: Sequence[Robustness | None] = [None] * len(described)
+    of_causes: Sequence[Robustness | None] = [None] * len(described)
     if is_rated(study):  # each neighbour is simulated in all cells, which takes too long for all causes
-        comparisons = compare_at_cells(evaluator, found.original.settings, settings)
+        comparisons = compare_at_cells(evaluator, population.original.settings, settings)
         robustnesses = estimate_robustness(evaluator, settings, _time_step(study), unsafe, STEP_FACTORS[:1])
     else:
-        comparisons = compare_at_points(assemble(study), found.original.settings, settings, unsafe)
-        alone = (cause.setting(characteristics) for cause in described)
-        robustnesses = estimate_robustness(evaluator, np.array([*settings, *alone]), _time_step(study), unsafe)
-        neighbours = robustnesses[len(settings) :]
-    holds = count_holding(models, described, unsafe)
-    complete = iter(
-        replace(cause, neighbours=robustness, sets=len(models), holds=number)
-        for cause, robustness, number in zip(described, neighbours, holds, strict=True)
+        comparisons = compare_at_points(assemble(study), population.original.settings, settings, unsafe)
+        cause_settings = (cause.setting(characteristics) for cause in described)
+        robustnesses = estimate_robustness(evaluator, np.array([*settings, *cause_settings]), _time_step(study), unsafe)
+        of_causes = robustnesses[len(settings) :]
+    complete_causes = (
+        replace(cause, neighbours=robustness, sets=len(models), holds=holds)
+        for cause, robustness, holds in zip(described, of_causes, count_holding(models, described, unsafe), strict=True)
     )
-    collisions = _collisions(study, chosen)
+    collisions = _collisions(study, failures)
     avoidances = dict(zip(map(bytes, collisions.settings), classify_collisions(evaluator, collisions), strict=True))
     explanations = []
-    for number, (row, (comparison, points)) in enumerate(zip(reasons, comparisons, strict=True)):
-        avoidance = avoidances.get(bytes(settings[number]))
+    for index, (row, (comparison, points)) in enumerate(zip(reasons, comparisons, strict=True)):
+        avoidance = avoidances.get(bytes(settings[index]))
         explanations.append(
             Explanation(
                 characteristics=characteristics,
-                handle=found.handles[row],
+                handle=population.handles[row],
                 reasons=reasons[row],
-                setting=dict(zip(characteristics.names, settings[number].tolist(), strict=True)),
-                outcome=str(chosen.outcome[number]),
-                safety_degree=finite_or_none(chosen.f_safe[number]),
-                causes=tuple(next(complete) for _ in causes[row]),
-                robustness=robustnesses[number],
+                setting=dict(zip(characteristics.names, settings[index].tolist(), strict=True)),
+                outcome=str(failures.outcome[index]),
+                safety_degree=finite_or_none(failures.f_safe[index]),
+                causes=tuple(islice(complete_causes, len(causes[row]))),
+                robustness=robustnesses[index],
                 because=comparison,
                 points=points,
                 preventable=str(avoidance[0]) if avoidance else "",
@@ -241,9 +259,9 @@ def _time_step(study: Study) -> float:
 
 
 PointComparison = tuple[BrakingComparison, tuple[str, ...]]
-"""One failure at the test points of a study: the comparison with the original vehicle at the failure's worst point, and
-the names of the points of a test matrix at which it is unsafe; in a rated study, of the cells whose colour is worse
-than the original's. In the study's order.
+"""A failure's comparison with the original vehicle at the failure's worst point, and the names of the points of a test
+matrix at which it is unsafe (in a rated study, of the cells whose colour is worse than the original's), in the study's
+order.
 """
 
 
@@ -255,15 +273,17 @@ def compare_at_points(
     at_points = [result.evaluations for result in results]
     is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)
     comparisons = []
-    for row, index in enumerate(worst[1:].tolist(), 1):
-        point, evaluations, runs = results[index]
-        failing = tuple(point.name for point, fails in zip(system.matrix, is_unsafe[:, row], strict=False) if fails)
-        comparisons.append((compare_braking(runs, row, evaluations.f_safe, point.name), failing))
+    for vehicle in range(1, len(worst)):  # vehicle 0 is the original
+        point, evaluations, runs = results[worst[vehicle]]
+        indices = np.flatnonzero(is_unsafe[:, vehicle]).tolist() if system.matrix else []
+        unsafe_points = tuple(system.matrix[index].name for index in indices)
+        comparisons.append((compare_braking(runs, vehicle, evaluations.f_safe, point.name), unsafe_points))
     return comparisons
 
 
 def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> list[PointComparison]:
-    """As `compare_at_points`, for a rated study: finds the cells whose colour is worse; compares in the worst cell.
+    """Compare settings with the original as `compare_at_points` does, for a rated study: at the cell whose colour
+    worsens most.
 
     An unknown colour is neither better nor worse.
     """
@@ -282,9 +302,10 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
 
 
 def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, directory: str) -> list[str]:
-    """Summarise results in lines: the verdict first, the command for the next step last; no line without a solution.
+    """Summarise results in lines: the verdict first, the command for the next step last.
 
-    Of a matrix, the failures are those at the worst point of the failure with the fewest changes.
+    In a study with a test matrix, the failures are those at one point: the worst point of the failure with the fewest
+    changes.
 
     Parameters
     ----------
@@ -300,7 +321,7 @@ def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, 
     if original.collided[0] and not is_rated(study):
         return ["The original vehicle itself collides: no change is needed."]
 
-    def chosen(choice: str) -> tuple[SolutionId, pd.DataFrame]:
+    def choose(choice: str) -> tuple[SolutionId, pd.DataFrame]:
         """The handle of the solution that a choice selects, and the solution, a frame of one row."""
         handle = choose_handle(solutions, unsafe, choice, study.name)
         return handle, solutions.iloc[[row_of_handle(solutions, handle)]]
@@ -310,7 +331,8 @@ def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, 
         distinct = solutions.drop_duplicates(names)
         nearest = None
         if not is_rated(study):
-            nearest = evaluator.evaluate(chosen("most_severe")[1][names].to_numpy(float), "worst points")
+            _, solution = choose("most_severe")
+            nearest = evaluator.evaluate(solution[names].to_numpy(float), "worst points")
         lines = [
             situation_in_words(system, original, nearest, len(distinct)),
             f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: "
@@ -318,14 +340,15 @@ def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, 
         ]
         if any_unsafe and is_rated(study):
             for choice, title in RATED_CHOICES.items():
-                handle, solution = chosen(choice)
-                ((kept, *values),) = solution[[RATING_POINTS.name, *names]].to_numpy(float)
+                handle, solution = choose(choice)
+                ((points, *values),) = solution[[RATING_POINTS.name, *names]].to_numpy(float)
                 changes = list_of_changes(case.characteristics, dict(zip(names, values, strict=True)))
-                lines.append(f"{title}: {handle} keeps {kept:.2f} points with {changes}.")
+                lines.append(f"{title}: {handle} keeps {points:.2f} points with {changes}.")
         elif any_unsafe:
-            points = evaluator.evaluate(chosen("fewest")[1][names].to_numpy(float), "worst points").worst_points
-            assert points is not None
-            point = system.points[points[0]].name
+            _, solution = choose("fewest")
+            worst = evaluator.evaluate(solution[names].to_numpy(float), "worst points").worst_points
+            assert worst is not None
+            point = system.points[worst[0]].name
             case = at_point(case, point)
     if point or not system.matrix:
         explained = explain_failures(case, ExplainOptions(), evaluator.for_study(case.study), statistics=False)
@@ -333,5 +356,5 @@ def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, 
         lines += explained.choices_in_words()
     if not any_unsafe:
         return [*lines, f"How far each characteristic may go: {question_command('tolerance', directory)}"]
-    at_worst = f", at the worst point of the first (without --point: at all {len(system.points)}, which takes long)"
-    return [*lines, f"Causes and limits{at_worst if point else ''}: {question_command('explain', directory, point)}"]
+    where = f", at that point (without --point: at all {len(system.points)}, which takes long)" if point else ""
+    return [*lines, f"Causes and limits{where}: {question_command('explain', directory, point)}"]

@@ -32,12 +32,31 @@ MAX_CAUSES = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """The explanation of one failure; `handle` is None if the setting is no solution.
+    """The explanation of one failure.
 
-    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `because` states why it is less safe:
-    the comparison of its braking with the original vehicle's. `preventable` is the `PreventableBy` of a collision, as
-    text. `points` are the names of the test points at which the setting is unsafe; in a rated study, of the cells whose
-    colour is worse than the original's.
+    Attributes
+    ----------
+    characteristics
+        All characteristics of the vehicle.
+    handle
+        The handle of the solution; None if the setting was drawn from the study's domain.
+    reasons
+        Why this failure was chosen to be explained, such as `most severe`.
+    setting
+        The value of each characteristic, in its unit.
+    outcome, safety_degree
+        Outcome, and safety degree [m, or -m/s].
+    causes
+        All minimal causes; none if the setting is not unsafe.
+    robustness
+        Whether the neighbours of the setting are unsafe too.
+    because
+        Why the setting is less safe than the original: the comparison of how both vehicles brake.
+    preventable
+        The `PreventableBy` of a collision, as text; empty without a collision and in a rated study.
+    points
+        Names of the test points at which the setting is unsafe; in a rated study, of the cells whose colour is worse
+        than the original's.
     """
 
     characteristics: CharacteristicSet = field(repr=False)
@@ -58,7 +77,7 @@ class Explanation:
 
     @property
     def title(self) -> str:
-        """Why it was chosen, as a title."""
+        """The reasons for choosing this failure, as a title."""
         return "; ".join(self.reasons)
 
     @property
@@ -67,8 +86,8 @@ class Explanation:
 
     @property
     def cause(self) -> Cause | None:
-        """The cause that is named: the most robust, the first of several or in a rated study; None if the setting is
-        not unsafe.
+        """The cause that a sentence names: the most robust one; the first one if the robustness is unknown, as in a
+        rated study; None if the setting is not unsafe.
         """
         return max(self.causes, key=lambda cause: cause.robustness or 0.0, default=None)
 
@@ -87,22 +106,22 @@ class Explanation:
         them are enough`.
         """
         number, cause = len(self.changed), self.cause
-        shares = {
+        relative_changes = {
             item.short_name: (self.setting[item.name] - item.original) / abs(item.original)
             for item in self.characteristics
             if item.name in self.changed
         }
-        largest = sorted(shares.items(), key=lambda share: -abs(share[1]))[:MAX_CHANGES_LISTED]
-        changes = ", ".join(f"{name} {100 * share:+.0f} %" for name, share in largest)
+        largest = sorted(relative_changes, key=lambda name: -abs(relative_changes[name]))[:MAX_CHANGES_LISTED]
+        changes = ", ".join(f"{name} {100 * relative_changes[name]:+.0f} %" for name in largest)
         changes += f" and {number - MAX_CHANGES_LISTED} more" if number > MAX_CHANGES_LISTED else ""
         finding = f"{self.effect} ({self.name}, {self.robustness})"
         if cause is None or len(cause.changes) == number:
             return f"{finding} needs {number_of(number, 'change')}: {changes}."
-        enough = f"{len(cause.changes)} of them {'are' if len(cause.changes) > 1 else 'is'} enough{cause.notes}"
-        return f"{finding} was found with {number} changes: {changes}; {enough}."
+        enough = f"{len(cause.changes)} of them {'are' if len(cause.changes) > 1 else 'is'} enough"
+        return f"{finding} was found with {number} changes: {changes}; {enough}{cause.notes}."
 
     def to_dict(self) -> JsonObject:
-        """An entry of `explain --json`."""
+        """An entry for a failure in `explain --json`."""
         algorithm, run, index = self.handle or (None, None, None)
         return {
             "algorithm": algorithm,
@@ -131,9 +150,10 @@ class Explanation:
             table = WholeTable(
                 "characteristic", right=("original", "here", "limit (all scaled)", "limit (this one only)")
             )
+            columns = cause.changes, cause.boundary, cause.alone
             for item in changed:
-                values = (item.text(limits[item.name]) for limits in (cause.changes, cause.boundary, cause.alone))
-                table.add_row(item.name + unit_text(item.unit, " [{}]"), f"{item.original:g}", *values)
+                texts = (item.text(values[item.name]) for values in columns)
+                table.add_row(item.name + unit_text(item.unit, " [{}]"), f"{item.original:g}", *texts)
             yield table
             yield meanings(changed)
             if changed:
@@ -141,11 +161,11 @@ class Explanation:
         if len(self.causes) > MAX_CAUSES:
             yield f"... and {len(self.causes) - MAX_CAUSES} more of the same number of changes (--json has all)."
         if len(self.causes) > 1:
-            names = set.intersection(*(set(cause.changes) for cause in self.causes))
-            necessary = ", ".join(name for name in self.changed if name in names)
+            in_all_causes = set.intersection(*(set(cause.changes) for cause in self.causes))
+            necessary = ", ".join(name for name in self.changed if name in in_all_causes)
             yield f"Necessary, as all of them need it: {necessary or 'nothing'}."
         yield f"Because: {self.because}"
-        if self.because.point:
+        if self.because.point:  # the study has a test matrix
             yield f"Fails at {number_of(len(self.points), 'point')}: {'; '.join(self.points) or 'none'}."
         if self.preventable:
             yield f"In the same vehicle: {self.preventable}."
@@ -154,6 +174,6 @@ class Explanation:
 
 
 def speed_in_words(degree: float) -> str:
-    """The collision speed of a safety degree in m/s, and in whole km/h or, below 3 km/h, with a decimal."""
+    """The collision speed that a safety degree states, in m/s and in km/h; below 3 km/h with a decimal."""
     speed = -degree * KMH_PER_MS
-    return f"{-degree:.1f} m/s, {speed:.{int(speed < 3)}f} km/h"
+    return f"{-degree:.1f} m/s, {speed:.{1 if speed < 3 else 0}f} km/h"
