@@ -65,17 +65,16 @@ def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_figure_a_gate_and_original_values_that_differ(in_tmp: Path) -> None:
-    run("compare", "smoke", "smoke", "--samples", "9", "--fail-if", "settings > 8", "--plot", "it.png", expect=3)
-    assert Path("it.png").stat().st_size > 10_000
+def test_original_values_that_differ(in_tmp: Path) -> None:
     Path("heavy.toml").write_text(
         'extends = "smoke"\nname = "heavy"\n[vehicle.characteristics]\nmass = { original = 2500.0, lower = 2450.0 }\n'
     )
     heavy = json.loads(run("compare", "smoke", "heavy.toml", "--samples", "50", "--json").stdout)
     assert heavy["originals"]["b"]["values"]["mass"] == 2500
-    frame = sv.compare("smoke", "heavy.toml", samples=50, pool=POOL).to_frame()
-    assert frame["mass"].min() >= 2450
-    assert "mass 2404 in A, 2500 kg in B" in run("compare", "smoke", "heavy.toml", "--samples", "50").stdout
+    answer = sv.compare("smoke", "heavy.toml", samples=50, pool=POOL)
+    assert answer.to_frame()["mass"].min() >= 2450
+    assert "mass 2404 in A, 2500 kg in B" in str([*answer.sentences()])
+    assert answer.figure().axes
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,6 @@ import inspect
 import json
 import re
 import shlex
-import subprocess
-import sys
 from dataclasses import fields, replace
 from html import escape
 from pathlib import Path
@@ -35,33 +33,6 @@ from safevar_sumo.terminal import WholeTable, answer_as_html
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, box, made_up_study
 from tests.in_process import InlinePool, refused, run
-
-OTHER_DEFAULT = """
-import inspect, pathlib, sys, types
-from importlib.util import find_spec
-source = pathlib.Path(find_spec("safevar_sumo.analysis.explain").origin).read_text()
-assert source.count("top: int = option(8,") == 1
-package = find_spec("safevar_sumo.analysis.explain")
-module = sys.modules[package.name] = types.ModuleType(package.name)
-module.__path__ = package.submodule_search_locations
-exec(source.replace("top: int = option(8,", "top: int = option(5,"), module.__dict__)
-
-import safevar_sumo as sv
-from safevar_sumo.cli.questions import explain
-from safevar_sumo.report.input import page_options
-
-flag = next(one.default for one in explain.params if one.name == "top")
-signature = inspect.signature(sv.explain).parameters["top"].default
-asked = page_options()["explain"]
-top_8 = module.ExplainOptions(top=8).command_line("it")
-print(flag, signature, asked.top, "--top" in asked.command_line("it"), "--top 8" in top_8)
-"""
-
-
-@pytest.mark.slow
-def test_a_default_that_changes_changes_everywhere() -> None:
-    done = subprocess.run([sys.executable, "-c", OTHER_DEFAULT], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["5"] * 3 + ["False", "True"]
 
 
 @pytest.mark.parametrize(

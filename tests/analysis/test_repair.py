@@ -270,17 +270,6 @@ def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, c
         sv.repair(planted, change=[change], pool=InlinePool())
 
 
-@pytest.mark.slow
-def test_ctrl_c_leaves_no_file(planted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compute, "_without_unread", interrupted)
-    out = tmp_path / "repaired.toml"
-    run("repair", str(planted), "--change", "gap", "--out", str(out), "--jobs", "1", expect=130)
-    assert not out.exists()
-
-
 def test_every_changeable_parameter_is_a_number_of_its_driving_system() -> None:
     assert {"aeb", "world_on_rails", "apollo", "idm", "acc", "rss", "fuzzy_safety"} <= CHANGEABLE.keys() <= ADS.keys()
     for ads, table in CHANGEABLE.items():

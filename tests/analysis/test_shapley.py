@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from safevar_sumo import risk
-from safevar_sumo.analysis.risk import variation
 from safevar_sumo.analysis.risk.answer import Risk
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
 from tests.analysis.known_regions import Plant, made_up_study, nowhere
-from tests.in_process import run
 
 NAMES = "abcdefghijkl"
 
@@ -126,13 +121,3 @@ def test_one_characteristic_or_none_that_varies(varying: int) -> None:
 def test_independent_characteristics_have_sobol_indices_and_no_key_of_their_own() -> None:
     result = linear([1.0, 1.0], [0.5, 1.0], {})
     assert "shapley" not in result.to_dict()
-
-
-@pytest.mark.slow
-def test_the_command_draws_them(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variation, "PERMUTATIONS", 128)
-    answer = json.loads(run("risk", "rain_realistic", "--samples", "200", "--json", "--plot", "it.png").stdout)
-    assert Path("it.png").stat().st_size > 10_000
-    effects = pd.DataFrame(answer["shapley"])
-    assert effects["share"].sum() == pytest.approx(1)
-    assert math.isfinite(effects["effect"].sum())

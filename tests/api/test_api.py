@@ -61,7 +61,7 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.original.original is result.original
     assert result.original.metrics != result.metrics
     assert "<p>&lt;Simulation of rain" in result._repr_html_()
-    assert "<th>simulated</th>" in result._repr_html_()
+    assert result.to_dict()["vcs"] == result.setting
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
 
 

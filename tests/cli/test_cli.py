@@ -21,16 +21,15 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from safevar_sumo import cli
-from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.api.running import CampaignProgress
 from safevar_sumo.campaign import RunKey, RunProgress, all_runs
 from safevar_sumo.cli.arguments import Condition, read_changes
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.terminal import WholeTable, open_progress
+from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool, refused
+from tests.in_process import refused
 
 ROOT = Path(__file__).parents[2]
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
@@ -88,19 +87,6 @@ def test_errors_of_the_library_speak_of_arguments_and_not_of_flags() -> None:
             for node in ast.walk(ast.parse(file.read_text())):
                 if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id.endswith("Error"):
                     assert not re.search(r"--[a-z]", re.sub(r"`[^`]*`", "", ast.unparse(node))), f"{file}:{node.lineno}"
-
-
-def test_80_columns_break_no_word_of_a_heading() -> None:
-    algorithms = ["nsga2", "rs", "safe_fuzzer", "map_elites", "mocell", "spea2"]
-    title = "Euro NCAP pedestrian, day and night: CARLA's LincolnMkz2017 with an AEB"
-    table = WholeTable("", right=["original vehicle", *algorithms], title=title)
-    table.add_row("solutions that collide", *["12.34"] * 7)
-    console = Console(file=StringIO(), width=80)
-    console.print(table)
-    heading, _, head, *_ = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
-    assert heading == title
-    assert [name.strip() for name in head.split("┃")[3:-1]] == algorithms
-    assert len(head) <= 80
 
 
 SUN = CharacteristicSet.of(load_study("sun"))
@@ -262,14 +248,3 @@ def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
         observer.progressed([state("nsga2", 1, asked, replayed=500)._replace(collisions=min(asked, 600))])
     assert shows[0] == ("rain: runs 0/6", 0, 6000)
     assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
-
-
-@pytest.mark.slow
-def test_most_of_a_largest_batch_is_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that the time left is known before the end."""
-    shows: list[tuple[str, int, int]] = []
-    study = load_study("euro_ncap_pedestrian")
-    evaluator = Evaluator(study, InlinePool(), lambda *values: shows.append(values), verified=0)
-    evaluator.evaluate(evaluator.feasible_settings(192), "settings")
-    assert len(shows) == 5
-    assert shows[-1][1:] == (192, 192)

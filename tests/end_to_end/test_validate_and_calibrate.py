@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from safevar_sumo.analysis.model_spread import with_values
 from safevar_sumo.cli import calibrate
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference.calibration import FitSubject
+from safevar_sumo.reference.rows import package_filter
 from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -31,50 +33,26 @@ COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty settings of the study sun in the published format, with the metrics that this package finds."""
+    """Forty settings of the study sun in the published format, with the metrics that this package finds; some changes
+    are below the threshold.
+    """
     system = assemble(load_study("sun"))
     characteristics = system.characteristics
     settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (40, 12))
-    filtered = np.where(
-        np.abs(settings - characteristics.original) > 1.2 * characteristics.threshold,
-        settings,
-        characteristics.original,
-    )
-    result = evaluate(system, filtered)
-    frame = pd.DataFrame(filtered, columns=list(characteristics.names))
-    for name, column in COLUMNS.items():
-        frame[column] = np.nan_to_num(result.metrics[name])
+    settings[::2, :6] = characteristics.original[:6] + 0.001
+    result = evaluate(system, package_filter(characteristics, settings))
+    columns = {column: np.nan_to_num(result.metrics[name]) for name, column in COLUMNS.items()}
     path = tmp_path_factory.mktemp("data") / "mine.csv"
-    frame.to_csv(path, index=False)
+    pd.DataFrame(settings, columns=list(characteristics.names)).assign(**columns).to_csv(path, index=False)
     return path
 
 
 @pytest.mark.slow
-def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None:
-    output = json.loads(
-        run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout
-    )
-    assert list(output) == [
-        "rows",
-        "spearman",
-        "mean_absolute_error",
-        "bias",
-        "collisions",
-        "original",
-        "precision",
-        "recall",
-        "collision_speed",
-        "in_repeats",
-        "undecided",
-        "by_predicted",
-    ]
+def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
+    output = json.loads(run("validate", "sun", str(data), "--json").stdout)
     assert output["rows"] == 40
-    for name in COLUMNS:
-        assert output["spearman"][name] == pytest.approx(1.0)
-        assert output["mean_absolute_error"][name] == pytest.approx(0.0, abs=1e-12)
-        assert set(output["original"][name]) == {"reference", "here"}
-    assert output["collisions"]["reference"] == output["collisions"]["here"] == output["collisions"]["both"]
-    assert (in_tmp / "plot.png").stat().st_size > 50_000
+    assert output["spearman"] == pytest.approx(dict.fromkeys(COLUMNS, 1.0))
+    assert output["mean_absolute_error"] == pytest.approx(dict.fromkeys(COLUMNS, 0.0), abs=1e-12)
 
 
 @pytest.mark.slow
@@ -89,15 +67,10 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     result = tomllib.loads(Path("found.toml").read_text())
     assert abs(result["ads"]["parameters"]["brake_gap"] - truth) < 0.5 * abs(8.0 - truth)
     assert "held back" in done.stdout
-    head = Path("found.toml").read_text().split("\n\n")[0]
-    for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Loss"):
-        assert word in head
+    assert re.search("(?s)CMA-ES.*seed 3.*mine.csv, SHA-256", Path("found.toml").read_text())
     assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
-    contents = set()
-    for _ in range(2):
-        run("calibrate", "mine.toml", str(data), "--trials", "7", "--seed", "3", "--out", "again.toml")
-        contents.add(Path("again.toml").read_bytes())
-    assert len(contents) == 1
+    again = ("calibrate", "mine.toml", str(data), "--trials", "7", "--seed", "3", "--out", "again.toml")
+    assert len({run(*again) and Path("again.toml").read_bytes() for _ in range(2)}) == 1
 
 
 @pytest.mark.parametrize(
@@ -129,7 +102,6 @@ def test_the_published_landscape_is_searched_without_a_simulation(data: Path) ->
     rows, published = {line[:25].strip(): line[25:].split() for line in lines}, pd.read_csv(data)["SaftyDegree"]
     assert rows["safety degree, mean [m]"][0] == f"{published.mean():.2f}"
     assert rows["collisions [%]"][0] == f"{100 * (published <= 0).mean():.1f}0"
-    assert all(1 <= float(number) <= 12 for number in rows["characteristics changed"])
 
 
 @pytest.fixture(scope="module")
@@ -138,43 +110,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("study") / "small"
     run("study", "smoke", "--evaluations", "100", "--out", str(place), "--quiet")
     return place
-
-
-def package_csv(path: Path, rows: int, seed: int, **constant: float) -> Path:
-    """Made-up solutions of the study sun in the published package's columns: rounded, unfiltered, radius in cm."""
-    rng = np.random.default_rng(seed)
-    characteristics = CharacteristicSet.of(load_study("sun"))
-    settings = np.round(rng.uniform(characteristics.lower, characteristics.upper, (rows, len(characteristics))), 3)
-    settings[::2, :6] = characteristics.original[:6] + 0.001
-    sd = np.round(rng.uniform(-1, 3, rows), 3)
-    names = [name.replace("ZeroT", "Zero") for name in characteristics.names]
-    frame = pd.DataFrame(settings, columns=names).assign(
-        MaxPercentage=0.5,
-        SaftyDegree=sd,
-        numbers=12.0,
-        TIT=np.where(sd > 0, 0.5, 0),
-        TET=np.where(sd > 0, 1.5, 0),
-        Dece=5.0,
-    )
-    frame.assign(**constant).to_csv(path, index=False)
-    return path
-
-
-@pytest.fixture
-def imported(in_tmp: Path) -> Path:
-    package_csv(in_tmp / "nsga2.csv", 40, 1)
-    package_csv(in_tmp / "rs.csv", 30, 2, SaftyDegree=2.5)
-    run("import", "sun", "--out", "imported", "--nsga2", "nsga2.csv", "--rs", "rs.csv")
-    return in_tmp / "imported"
-
-
-def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
-    solutions = pd.read_csv(results / "solutions.csv")
-    records = json.loads(run("tables", str(results), "--rq", "collisions", "--format", "json").stdout)
-    for one in records:
-        group = solutions[solutions["algorithm"] == one["algorithm"]]
-        assert one["solutions"] == len(group)
-        assert one["collisions"] == (group["outcome"] == "collision").sum()
 
 
 @pytest.mark.slow
@@ -186,18 +121,17 @@ def test_figures_are_files_of_the_kind_asked_for(results: Path, in_tmp: Path) ->
     assert all(path.read_bytes().startswith(b"<?xml") for path in files)
 
 
-def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> None:
-    assert sorted(path.name for path in imported.iterdir()) == ["manifest.json", "solutions.csv"]
-    frame = pd.read_csv(imported / "solutions.csv")
+def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Path) -> None:
+    run("import", "sun", "--out", "imported", "--nsga2", str(data), "--rs", str(data))
+    assert sorted(path.name for path in Path("imported").iterdir()) == ["manifest.json", "solutions.csv"]
+    frame = pd.read_csv("imported/solutions.csv")
+    assert frame["algorithm"].value_counts().to_dict() == {"nsga2": 40, "rs": 40}
     assert "run" not in frame
-    assert len(frame) == 70
-    characteristics = CharacteristicSet.of(load_study("sun"))
-    settings = frame[list(characteristics.names)].to_numpy()
-    assert (settings[:, :6] == characteristics.original[:6]).any(axis=0).all(), (
-        "changes below the threshold are put back"
-    )
-    assert frame["f_num_diff"].tolist() == (settings != characteristics.original).sum(axis=1).tolist()
-    assert np.allclose(frame["f_diff"], np.max(np.abs(settings / characteristics.original - 1), axis=1))
+    original = CharacteristicSet.of(load_study("sun")).original
+    changed = frame.iloc[:, 1:13].to_numpy() != original
+    assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, "changes below the threshold are put back"
+    assert frame["f_num_diff"].tolist() == changed.sum(axis=1).tolist()
+    assert np.allclose(frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1))
 
 
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
@@ -213,8 +147,6 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
     refused("tables", "part", message=("no finished run",))
-    refused("figures", "part", "--out", "pictures", message=("no finished run",))
-    assert "no finished run" in run("simulate", "part", "--fewest", expect=2).stderr
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
     answer = run("explain", "part", "--jobs", "1")

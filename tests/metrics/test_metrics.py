@@ -21,8 +21,7 @@ from safevar_sumo.metrics import (
     time_to_collision,
 )
 from safevar_sumo.records import Encounter, Evaluations, SimulationRuns
-from safevar_sumo.study import MetricsTable, load_study
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
 STEP = 0.01
@@ -235,14 +234,3 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: 
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
     assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()))
     assert np.isnan(comfort(name, speed, collision_speed=3.0)).all()
-
-
-def test_studies_that_name_no_comfort_have_none() -> None:
-    assert [one.name for one in assemble(load_study("sun")).measuring.scoring.metrics] == [
-        "safety_degree",
-        "tet",
-        "tit",
-        "ave_dece",
-    ]
-    with pytest.raises(InputError, match="did you mean 'max_jerk'"):
-        assemble(load_study("sun", metrics={"also": ["max_jark"]}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -112,28 +111,6 @@ def test_a_module_that_fails_is_reported_with_its_line_and_can_be_corrected(
     assert expected.format(folder / "mine.py") in str(caught.value)
     mine(CONSTANT.format(0.3))
     assert "mine" in sys.modules
-
-
-@pytest.mark.slow
-def test_a_numpy_py_in_the_working_directory_is_not_numpy(tmp_path: Path) -> None:
-    for name in ("numpy", "random"):
-        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
-    command = [
-        sys.executable,
-        "-m",
-        "safevar_sumo",
-        "study",
-        "smoke",
-        "--runs",
-        "1",
-        "--evaluations",
-        "10",
-        "--jobs",
-        "1",
-        "--quiet",
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 VEHICLE = '[vehicle]\nmodel = "mine:Mine"\n[vehicle.characteristics]\n{}\n[ads]\nmodel = "krauss"\n'
@@ -329,16 +306,3 @@ def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: M
     message = failing(mine(scenario(method, body), SCENARIO))
     assert expected in message
     assert "scenario.model = 'mine:Mine'" in message
-
-
-def test_an_ads_that_closes_standard_output_ends_in_one_line(in_tmp: Path) -> None:
-    Path("my_ads.py").write_text(
-        "import sys\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
-        "    def drive(self, seen):\n        sys.stdout.close()\n        return 0.5, 0.0\n"
-    )
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
-    command = [sys.executable, "-m", "safevar_sumo", "simulate", "mine.toml"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.splitlines()[-1] == "safevar-sumo: user code has closed standard output"
-    assert "Traceback" not in done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 import shutil
 import subprocess
@@ -17,10 +18,10 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.analysis.tolerance import scans
-from safevar_sumo.errors import InputError
 from safevar_sumo.report.dossier import FIRST, MEASURES, _Dossier, value_at
 from safevar_sumo.report.measurements import count_constants, measure_validation
 from safevar_sumo.report.pack import read_pack
+from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
 from tests.in_process import run
 
@@ -78,8 +79,6 @@ def test_undefined_measures_are_none() -> None:
 def test_thresholds_have_the_names_of_measures() -> None:
     study = load_study("smoke", evidence={"threshold": dict.fromkeys(MEASURES, 0.5)})
     assert set(study.evidence.threshold) == set(MEASURES)
-    with pytest.raises(InputError, match="rms"):
-        load_study("smoke", evidence={"threshold": {"rms": 0.5}})
 
 
 def test_constants_are_counted_by_origin() -> None:
@@ -114,6 +113,9 @@ def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
     assert stated[1] == [*stated[0], text]
 
 
+Packed = tuple[dict[str, Any], Path, str]
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _coarse_scans() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
@@ -122,7 +124,7 @@ def _coarse_scans() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path, str]:
+def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Packed:
     """A dossier with all sections, the working directory of its commands, and its page."""
     folder = tmp_path_factory.mktemp("dossier")
     shutil.copytree(slippery, folder / "results" / "slippery")
@@ -141,9 +143,7 @@ def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[di
 
 
 @pytest.mark.slow
-def test_every_number_is_made_by_its_command(
-    packed: tuple[dict[str, Any], Path, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_number_is_made_by_its_command(packed: Packed, monkeypatch: pytest.MonkeyPatch) -> None:
     dossier, folder, _ = packed
     monkeypatch.chdir(folder)
     assert dossier["first"] == FIRST
@@ -165,29 +165,26 @@ def test_every_number_is_made_by_its_command(
 
 
 @pytest.mark.slow
-def test_the_dossier_has_its_sections_and_never_a_verdict(packed: tuple[dict[str, Any], Path, str]) -> None:
+def test_the_dossier_has_its_sections_and_never_a_verdict(packed: Packed) -> None:
     dossier, _, page = packed
     assert [section["title"].split(". ")[0] for section in dossier["sections"]] == [
         str(number) for number in range(1, 9)
     ]
     assert all(section["statements"] for section in dossier["sections"])
-    texts = [statement["text"] for section in dossier["sections"] for statement in section["statements"]]
-    assert any("at most 0.5, which it" in text for text in texts)
-    assert any("at least 1.1, which it does not keep" in text for text in texts)
+    text = json.dumps(dossier)
+    assert "at most 0.5, which it" in text
+    assert "at least 1.1, which it does not keep" in text
     assert page.index(FIRST) < page.index("<h2>")
-    assert "compliant" not in page
-    for outside in ("http://", "https://", "<script", "src="):
-        assert outside not in page
+    assert not re.search("compliant|https?://|<script|src=", page)
 
 
 @pytest.mark.slow
-def test_the_pack_with_all_sections_verifies(packed: tuple[dict[str, Any], Path, str], in_tmp: Path) -> None:
+def test_the_pack_with_all_sections_verifies(packed: Packed, in_tmp: Path) -> None:
     _, folder, _ = packed
     result = json.loads(run("verify", str(folder / "pack.zip"), "--json").stdout)
     assert result["same"] == result["claims"]
-    names = [claim["claim"] for claim in result["table"]]
-    assert sum(name.startswith("solution ") for name in names) == len(
-        pd.read_csv(folder / "results/slippery/solutions.csv")
-    )
-    assert {"checks", "dossier", "validation rows", "answer explain", "answer tolerance", "answer risk"} <= set(names)
+    names = {claim["claim"] for claim in result["table"]}
+    solutions = {f"solution {handle}" for handle in handles_of(pd.read_csv(folder / "results/slippery/solutions.csv"))}
+    answers = {"answer explain", "answer tolerance", "answer risk"}
+    assert {"checks", "dossier", "validation rows", *answers, *solutions} <= names
     assert any(name.startswith("setting explain.") for name in names)
