@@ -1,5 +1,7 @@
-"""Automatic emergency braking by braking distance on top of a cruise control, as in production systems; and a stand-
-in for Autoware's, with its published formula, parameters and stop operator.
+"""Automatic emergency braking by braking distance on top of a cruise control.
+
+`Aeb` brakes like production systems; `AutowareAeb` replaces Autoware's module, with its published formula, parameters
+and stop operator.
 """
 
 from __future__ import annotations
@@ -24,11 +26,25 @@ from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, 
 
 LEAST_DECELERATION = 0.5
 """Smallest deceleration of an obstacle that counts as braking [m/s^2]."""
+NO_BRAKING, PARTIAL_BRAKING, FULL_BRAKING = 0.0, 1.0, 2.0
+"""The braking stages of `Aeb`."""
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; braking stage 0 to 2;
-    whether it has ever braked; the obstacle's speed at the last call [m/s]; whether it warns now.
+    """What `Aeb` remembers of N vehicles; arrays have shape (N,).
+
+    Attributes
+    ----------
+    nominal, step
+        The original vehicle, and the time between two calls of `drive` [s].
+    cruise
+        Speed to hold [m/s] and the trim at the first call; None before that call.
+    stage, intervened
+        Braking stage, and whether it has ever braked.
+    obstacle_speed
+        The obstacle's speed at the last call [m/s].
+    warns
+        Whether it warns its driver now.
     """
 
     nominal: Nominal
@@ -97,15 +113,12 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         cruise_speed, cruise_trim = memory.cruise or cruise_at(nominal, seen, self.cruise_speed)
         is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, is_threatened)
-        has_intervened = memory.intervened | (stage > 0)
-        cruising = pedals_for(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
-        command = Command(
-            np.where(has_intervened, 0.0, cruising.throttle),
-            np.where(
-                stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(has_intervened, 0.0, cruising.brake))
-            ),
-        )
-        warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > 0)
+        has_intervened = memory.intervened | (stage > NO_BRAKING)
+        pedals = pedals_for(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
+        throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
+        stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
+        command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
+        warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > NO_BRAKING)
         return command, _Memory(
             nominal, memory.step, (cruise_speed, cruise_trim), stage, has_intervened, _obstacle_speed(seen), warns
         )
@@ -115,13 +128,12 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return memory.warns
 
     def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
-        """The braking stage; it does not fall before the obstacle has left the way of the vehicle."""
+        """The braking stage; it does not fall while the obstacle blocks the way, nor at standstill."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
         obstacle_deceleration = (memory.obstacle_speed - obstacle_speed) / memory.step
-        stop_difference = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (
-            2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION)
-        )
+        obstacle_stop = obstacle_speed * obstacle_speed / (2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
+        stop_difference = speed * speed / (2 * deceleration) - obstacle_stop
         closing_speed = np.maximum(seen.closing_speed, 0.0)
         braking_distance = np.maximum(
             closing_speed * closing_speed / (2 * deceleration),
@@ -129,14 +141,14 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         )
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
-        stage = np.where(
-            is_threatened & (seen.gap < full_gap), 2.0, np.where(is_threatened & (seen.gap < partial_gap), 1.0, 0.0)
+        stage_at_gap = np.where(
+            seen.gap < full_gap, FULL_BRAKING, np.where(seen.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING)
         )
-        stays_in_way = (
-            np.isfinite(seen.gap) & (seen.gap > 0) & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
-        )
+        stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
+        is_ahead = np.isfinite(seen.gap) & (seen.gap > 0)
+        still_blocks = is_ahead & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
         is_standing = speed <= 0
-        return np.where(stays_in_way | is_standing, np.maximum(stage, memory.stage), stage)
+        return np.where(still_blocks | is_standing, np.maximum(stage, memory.stage), stage)
 
 
 def _obstacle_speed(seen: Observation) -> FloatArray:
@@ -144,14 +156,22 @@ def _obstacle_speed(seen: Observation) -> FloatArray:
 
 
 class _AutowareMemory(NamedTuple):
-    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; time since the decision
-    to brake, negative before it [s].
+    """What `AutowareAeb` remembers of N vehicles.
+
+    Attributes
+    ----------
+    nominal, step
+        The original vehicle, and the time between two calls of `drive` [s].
+    cruise
+        Speed to hold [m/s] and the trim at the first call; None before that call.
+    decision_time
+        Time since the decision to brake, negative before it [s]; shape (N,).
     """
 
     nominal: Nominal
     step: float
     cruise: tuple[FloatArray, Trim] | None
-    since: FloatArray
+    decision_time: FloatArray
 
 
 class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -194,24 +214,25 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     corridor: PositiveParameter = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> _AutowareMemory:
-        return _AutowareMemory(nominal, step, cruise=None, since=np.full(n, -1.0))
+        return _AutowareMemory(nominal, step, cruise=None, decision_time=np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _AutowareMemory) -> tuple[Command, _AutowareMemory]:
-        nominal, step, cruise, since = memory
+        nominal, step, cruise, decision_time = memory
         cruise = cruise or cruise_at(nominal, seen, self.cruise_speed)
+        cruise_speed, cruise_trim = cruise
         is_near = is_in_the_way(seen, self.corridor) & (seen.gap < self.distance(seen.speed, seen.obstacle_speed))
-        since = np.where(since >= 0, since + step, np.where(is_near, 0.0, -1.0))
-        ramp = self.target_jerk * np.maximum(since + step / 2 - self.command_delay, 0.0)
-        is_braking = since + TIME_ROUNDING >= self.command_delay
-        wanted = np.where(
-            is_braking & (since >= 0),
-            -np.minimum(ramp, self.target_acceleration),
-            self.cruise_gain * (cruise[0] - seen.speed),
+        decision_time = np.where(decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0))
+        # The mean over the coming step:
+        ramp = self.target_jerk * np.maximum(decision_time + step / 2 - self.command_delay, 0.0)
+        is_braking = (decision_time >= 0) & (decision_time + TIME_ROUNDING >= self.command_delay)
+        acceleration = np.where(
+            is_braking, -np.minimum(ramp, self.target_acceleration), self.cruise_gain * (cruise_speed - seen.speed)
         )
-        return pedals_for(nominal, seen.speed, wanted, cruise[1]), _AutowareMemory(nominal, step, cruise, since)
+        pedals = pedals_for(nominal, seen.speed, acceleration, cruise_trim)
+        return pedals, _AutowareMemory(nominal, step, cruise, decision_time)
 
     def distance(self, speed: FloatArray, obstacle_speed: FloatArray) -> FloatArray:
         """The gap below which it brakes [m], at speeds [m/s] of shape (N,)."""
-        own = speed * self.t_response + speed * speed / (2 * self.a_ego_min)
-        other = obstacle_speed * obstacle_speed / (2 * self.a_obj_min)
-        return np.asarray(own - other + self.longitudinal_offset_margin)
+        stop = speed * self.t_response + speed * speed / (2 * self.a_ego_min)
+        obstacle_stop = obstacle_speed * obstacle_speed / (2 * self.a_obj_min)
+        return np.asarray(stop - obstacle_stop + self.longitudinal_offset_margin)

@@ -1,5 +1,6 @@
-"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, checks of an ADS that is
-user code, and functions that drivers share: delays, pedals for an acceleration, perception of an obstacle in the way.
+"""The contract of an automated driving system (ADS), and functions that driving systems share.
+
+An ADS may drive N vehicles at once, or one vehicle (`ScalarAds`). Checks guard an ADS that is user code.
 """
 
 from __future__ import annotations
@@ -19,8 +20,6 @@ PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
 NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
-
-
 REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
@@ -99,9 +98,10 @@ class GuardedAds(Ads):
     def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
         result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
         command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
-        throttle, brake = self._guard.elements("drive", command, "(Command(throttle, brake), memory)")
-        pedals = {"throttle": throttle, "brake": brake}.items()
-        return Command(*(self._guard.numbers("drive", *pedal, seen.speed.shape, SHARE) for pedal in pedals)), memory
+        pedals = Command(*self._guard.elements("drive", command, "(Command(throttle, brake), memory)"))._asdict()
+        shape = seen.speed.shape
+        checked = (self._guard.numbers("drive", name, pedal, shape, SHARE) for name, pedal in pedals.items())
+        return Command(*checked), memory
 
 
 class PerVehicleAds(Ads):
@@ -118,7 +118,7 @@ class PerVehicleAds(Ads):
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
         observations, pedals = list(_scalar_observations(seen)), [(0.0, 0.0)] * len(memory)
-        for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():
+        for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():  # vehicles whose run has not ended
             pedals[i] = self._checked_pedals(self._guard.call("drive", memory[i].drive, observations[i]))
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
@@ -147,7 +147,8 @@ def _scalar_observations(seen: Observation) -> Iterator[Observation]:
 
 def interpolate_tables(table_speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
     """Tables over equally spaced speeds, interpolated linearly at `speed`."""
-    position = np.minimum(speed / table_speeds[1], len(table_speeds) - 1.001)
+    spacing = table_speeds[1]
+    position = np.minimum(speed / spacing, len(table_speeds) - 1.001)  # just before the last row: there is a next one
     row = position.astype(np.intp)
     share, next_row = position - row, row + 1
     values = ((table[row], table[next_row]) for table in tables)
@@ -172,39 +173,35 @@ class DelayLine(NamedTuple):
         return cls(int(steps), fraction)
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
-        """The values one delay ago, linear between two steps, and the next delay line; before the first step the first
-        values hold.
+        """The values one delay ago, linear between two steps, and the next delay line.
+
+        Before the first step the first values hold. A value that appears or vanishes between the two steps, infinite
+        in one of them, is that of the earlier step.
         """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older, newer = past[0], past[1]
         if self.fraction:
-            with np.errstate(
-                invalid="ignore"
-            ):  # a value that appears or vanishes between two steps keeps its old value
+            with np.errstate(invalid="ignore"):  # the difference of two infinities
                 mixture = newer + (older - newer) * self.fraction
-            newer = (
-                mixture
-                if np.count_nonzero(finite := np.isfinite(mixture)) == finite.size
-                else np.where(finite, mixture, older)
-            )
+            newer = np.where(np.isfinite(mixture), mixture, older)
         return newer, DelayLine(self.steps, self.fraction, past)
 
 
 class Trim(NamedTuple):
-    """Pedal positions of a rolling vehicle minus the positions that hold the original vehicle's speed on a level road
-    [-].
-    """
+    """The pedals of a rolling vehicle beyond those that hold the speed of the original vehicle on a level road [-]."""
 
     throttle: FloatArray
     brake: FloatArray
 
 
 def trim_at(nominal: Nominal, seen: Observation) -> Trim:
-    """The trim of a driver who already holds the speed of a rolling vehicle."""
+    """The trim of a driver who already holds the speed of a rolling vehicle; 0 at standstill."""
     is_rolling = seen.speed > 0
     coasting, full_throttle = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
-    throttle = np.where(is_rolling, seen.throttle - coasting / (full_throttle + coasting), 0.0)
-    return Trim(throttle, np.where(is_rolling & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
+    holding_throttle = coasting / (full_throttle + coasting)
+    holding_brake = -coasting / nominal.braking  # negative: it would have to push the vehicle
+    throttle = np.where(is_rolling, seen.throttle - holding_throttle, 0.0)
+    return Trim(throttle, np.where(is_rolling & (seen.brake > 0), seen.brake - holding_brake, 0.0))
 
 
 def cruise_at(nominal: Nominal, seen: Observation, speed: float | None) -> tuple[FloatArray, Trim]:
@@ -246,5 +243,6 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
-    """Whether an obstacle is within `corridor` of the lane's middle [m], or comes nearer to it."""
-    return np.asarray((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
+    """Whether an obstacle is within `corridor` of the lane's middle [m], or moves towards the middle."""
+    moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
+    return np.asarray((np.abs(seen.lateral) <= corridor) | moves_inwards)

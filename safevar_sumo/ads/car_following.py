@@ -1,6 +1,4 @@
-"""Car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise control, as SUMO computes
-them.
-"""
+"""SUMO's car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise control."""
 
 from __future__ import annotations
 
@@ -22,7 +20,8 @@ from safevar_sumo.ads.base import (
 )
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
-# Gains of the modes of MSCFModel_ACC [1/s for speeds, 1/s^2 for gaps] and its thresholds: defaults.
+# Defaults of MSCFModel_ACC: the gain of the speed error [1/s]; for each other mode the gains of speed [1/s] and gap
+# [1/s^2]; and thresholds.
 SPEED_GAIN = -0.4
 CLOSING_GAINS = 0.8, 0.04
 KEEPING_GAINS = 0.07, 0.23
@@ -33,9 +32,7 @@ LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 
 class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of models that compute an acceleration from gap and speeds, which becomes pedals; they ignore obstacles
-    beside the way.
-    """
+    """Base of models that compute an acceleration from gap and speeds; obstacles beside the way are ignored."""
 
     cruise_speed: PositiveParameter = 13.89
     headway: PositiveParameter = 1.0

@@ -43,8 +43,20 @@ OUTPUT_UNITS: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration"
 
 
 class _Memory(NamedTuple):
-    """Instances and their history; constant inputs; the original vehicle; trim at the initial speed; whether drivers
-    are warned.
+    """What `FmuAds` remembers of N vehicles.
+
+    Attributes
+    ----------
+    fleet, history
+        Instances of the FMU, and what they were given so far; None before the first call.
+    constants
+        Constant inputs by name.
+    nominal
+        The original vehicle.
+    trim
+        The trim at the first call; None before that call, and for an FMU that outputs pedals.
+    warns
+        Which drivers are warned, shape (N,); None if the FMU never warns.
     """
 
     fleet: Fleet
@@ -56,7 +68,7 @@ class _Memory(NamedTuple):
 
 
 class FmuAds(Ads):
-    """N vehicles driven by an instance of an FMU each; see `Ads`.
+    """Drives each of N vehicles with an instance of an FMU; see `Ads`.
 
     Parameters
     ----------

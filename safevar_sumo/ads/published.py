@@ -17,12 +17,25 @@ HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
 CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
 LEAST_DISTANCE = 0.05  # m, smallest distance over which a deceleration is planned
+LEAST_RISE = 1e-9  # m/s^2, lower bound of a rise of the needed deceleration, which is a divisor
 FIRST_COMMAND_ROUNDING = 1e-9  # s
 
 
 class _ApolloMemory(NamedTuple):
-    """SI; `nominal` is the original vehicle, `step` the time between calls, `has_begun_to_stop` true from the onset of
-    braking on, and `needed_after_lag` the deceleration that decides on the onset.
+    """What `Apollo` remembers of N vehicles; arrays have shape (N,).
+
+    Attributes
+    ----------
+    nominal, step
+        The original vehicle, and the time between two calls of `drive` [s].
+    has_begun_to_stop
+        Whether it has begun to brake for its stop; it then stops for good.
+    needed_after_lag
+        Deceleration needed to stop once the pedals have followed, which decides on the onset of braking [m/s^2].
+    commanded_acceleration
+        Acceleration of the last command [m/s^2].
+    creeping_time
+        Time that it has crept [s].
     """
 
     nominal: Nominal
@@ -78,7 +91,7 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return _ApolloMemory(
             nominal,
             step,
-            has_begun_to_stop=zeros > 0,
+            has_begun_to_stop=np.zeros(n, dtype=bool),
             needed_after_lag=zeros,
             commanded_acceleration=zeros,
             creeping_time=zeros,
@@ -90,11 +103,11 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, plan
         is_waiting = seen.speed == 0
-        # all fields after `nominal` and `step`
-        array_fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
-        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _ApolloMemory(
-            memory.nominal, memory.step, *array_fields
-        )
+        nominal, step, *old_arrays = memory
+        _, _, *new_arrays = plan
+        arrays = (np.where(is_waiting, old, new) for old, new in zip(old_arrays, new_arrays, strict=True))
+        pedals = (np.where(is_waiting, 0.0, pedal) for pedal in command)
+        return Command(*pedals), _ApolloMemory(nominal, step, *arrays)
 
     def _plan(self, seen: Observation, memory: _ApolloMemory) -> _ApolloMemory:
         """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and
@@ -114,16 +127,14 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         largest_change = np.array(self.jerk * memory.step)
         if np.count_nonzero(begins_braking):
             # Planning is continuous in time: braking began within the last step, when `needed_after_lag` passed
-            # `comfortable_deceleration`.
-            rise = np.maximum(needed_after_lag - memory.needed_after_lag, 1e-9)
-            share = np.where(
-                begins_braking, np.minimum((needed_after_lag - self.comfortable_deceleration) / rise, 1.0), 1.0
-            )
+            # `comfortable_deceleration`. The acceleration has changed since then only.
+            rise = np.maximum(needed_after_lag - memory.needed_after_lag, LEAST_RISE)
+            share_since_onset = np.minimum((needed_after_lag - self.comfortable_deceleration) / rise, 1.0)
             last_acceleration = np.where(begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration)
-            largest_change = largest_change * share
+            largest_change = largest_change * np.where(begins_braking, share_since_onset, 1.0)
 
-        braking = np.minimum(needed_deceleration, self.largest_deceleration)
-        braking = np.minimum(braking, np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME)
+        taper = np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME
+        braking = np.minimum(np.minimum(needed_deceleration, self.largest_deceleration), taper)
         cruising = np.minimum(self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration)
         change = np.where(has_begun_to_stop, -braking, cruising) - last_acceleration
         acceleration = last_acceleration + np.minimum(np.maximum(change, -largest_change), largest_change)
@@ -158,18 +169,25 @@ Throttle = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
 """Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
-SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
-"""The first three of the four speed levels in the policy's source code, 0 to 8 m/s; between them the throttle is linear
-in speed.
+SPEED_LEVEL = 8 / 3
+"""Distance between the policy's speed levels [m/s]: four, from 0 to 8 m/s, in its source code. The throttle is linear
+between the first three, and constant above.
 """
 PASSED_GAP = -0.5
 """Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin to brake for it."""
 
 
 class _RailsMemory(NamedTuple):
-    """Whether the policy brakes; commands not yet carried out, newest last; delay lines.
+    """What `WorldOnRails` remembers of N vehicles.
 
-    `recognition_line` delays gap and lateral position, `hesitation_line` the brake command.
+    Attributes
+    ----------
+    is_braking
+        Whether the policy brakes; shape (N,).
+    pending_commands
+        Commands not yet carried out, newest last.
+    recognition_line, hesitation_line
+        Delay lines of gap and lateral position, and of the brake command.
     """
 
     is_braking: BoolArray
@@ -181,7 +199,7 @@ class _RailsMemory(NamedTuple):
 class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """World On Rails (Chen, Koltun, Kraehenbuehl 2021): a vision policy at 20 Hz.
 
-    Full brake for a near obstacle in its corridor, else throttle up to its speed limit.
+    It brakes fully for a near obstacle in its corridor; otherwise it opens the throttle up to its speed limit.
 
     Parameters
     ----------
@@ -249,9 +267,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def _decide_to_brake(
         self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
     ) -> BoolArray:
-        """Whether the recognised obstacle is near and in the corridor."""
-        offset = lateral - self.brake_place
-        reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
+        """Whether the policy brakes for the recognised obstacle, which is in the corridor and was near."""
+        past = lateral - self.brake_place  # negative before that place
+        reduction = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
         is_seen = (np.abs(lateral) <= self.corridor) & (gap > self.release_gap)
         starts_braking = (gap <= braking_gap) & (gap > PASSED_GAP)
@@ -260,6 +278,6 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     def _throttle(self, speed: FloatArray) -> FloatArray:
         low, middle, high = self.throttle
-        level = speed / SPEED_LEVELS[1]
-        upper = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
-        return np.asarray(np.where(level < 1, low + (middle - low) * level, upper))
+        level = speed / SPEED_LEVEL
+        above_first_level = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
+        return np.asarray(np.where(level < 1, low + (middle - low) * level, above_first_level))

@@ -35,16 +35,26 @@ UNLIMITED_BRAKING = 1e6
 CRUISE_GAIN = 1.0
 """Acceleration per speed error [1/s]."""
 LEAST_DIVISOR = 1e-9
-"""Lower bound of accelerations and widths by which numbers are divided [m/s^2, m]."""
+"""Lower bound of an acceleration [m/s^2] or of a ramp's width [m] that is a divisor."""
 StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 """Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
 
 
 class Reaction(NamedTuple):
-    """The original vehicle; time between calls [s]; speed to hold [m/s], trim and brake pedal [-], as first observed.
+    """What a reference driver remembers of N vehicles; arrays have shape (N,).
 
-    `speed` is that of the last call [m/s], `danger_time` the time since the danger was first seen [s], negative before;
-    `coasting` is the deceleration that the driver felt before braking, `braking` the intended one [m/s^2]. Shape (N,).
+    Attributes
+    ----------
+    nominal, step
+        The original vehicle, and the time between two calls of `drive` [s].
+    cruise
+        Speed to hold [m/s], and the trim and the brake pedal at the first call [-]; None before that call.
+    speed
+        Speed at the last call [m/s].
+    danger_time
+        Time since the driver first saw the danger [s]; negative without a danger.
+    felt_deceleration, intended_deceleration
+        The vehicle's deceleration while the driver did not brake yet, and the one that the driver aims at [m/s^2].
     """
 
     nominal: Nominal
@@ -52,13 +62,19 @@ class Reaction(NamedTuple):
     cruise: tuple[FloatArray, Trim, FloatArray] | None
     speed: FloatArray
     danger_time: FloatArray
-    coasting: FloatArray
-    braking: FloatArray
+    felt_deceleration: FloatArray
+    intended_deceleration: FloatArray
+
+    def acceleration(self, seen: Observation) -> FloatArray:
+        """Mean acceleration since the last call [m/s^2]; 0 at the first call."""
+        return np.zeros_like(seen.speed) if self.cruise is None else (seen.speed - self.speed) / self.step
 
 
 class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the drivers; the original vehicle's tables were written in other gears, so they brake by the deceleration
-    that they feel.
+    """Base of the drivers: a driver feels how the vehicle coasts, and brakes by what its deceleration lacks.
+
+    The original vehicle's table of coasting would mislead the driver: the calibration drive that made it was in other
+    gears.
     """
 
     cruise_speed: PositiveParameter | None = None
@@ -80,7 +96,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     ) -> tuple[Command, Reaction]:
         """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
 
-        The danger is over when no obstacle ahead approaches or blocks the way.
+        A danger lasts while an obstacle ahead approaches, or keeps its distance and blocks the way.
 
         Parameters
         ----------
@@ -95,31 +111,28 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         following
             Upper limit of the acceleration when following a leader [m/s^2].
         """
-        nominal, step, cruise, last_speed = memory[:4]
+        nominal, step, cruise = memory.nominal, memory.step, memory.cruise
         if cruise is None:
-            last_speed = seen.speed
             cruise = *cruise_at(nominal, seen, self.cruise_speed), seen.brake
         speed_to_hold, initial_trim, initial_brake = cruise
-        danger_lasts = (
-            np.isfinite(seen.gap)
-            & (seen.gap > 0)
-            & ((seen.closing_speed > 0) | ((seen.closing_speed >= 0) & blocks_the_way(seen, self.corridor)))
-        )
-        is_aware, was_braking = memory.danger_time >= 0, memory.danger_time >= reaction_time - TIME_ROUNDING
+        is_ahead = np.isfinite(seen.gap) & (seen.gap > 0)
+        still_blocks = (seen.closing_speed == 0) & blocks_the_way(seen, self.corridor)
+        danger_lasts = is_ahead & ((seen.closing_speed > 0) | still_blocks)
+        is_aware = memory.danger_time >= 0
         is_reacting = np.where(is_aware, danger_lasts, danger)
         danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, 0.0), -1.0)
-        is_braking = danger_time >= reaction_time - TIME_ROUNDING
-        coasting = np.where(was_braking, memory.coasting, np.maximum((last_speed - seen.speed) / step, 0.0))
-        rising = np.minimum(np.maximum(memory.braking, coasting) + jerk * step, deceleration)
-        braking = np.where(is_braking, rising, 0.0)
-        brake = np.minimum(initial_brake + np.maximum(braking - coasting, 0.0) / nominal.braking, 1.0)
+        was_braking, is_braking = (time >= reaction_time - TIME_ROUNDING for time in (memory.danger_time, danger_time))
+        felt = np.where(was_braking, memory.felt_deceleration, np.maximum(-memory.acceleration(seen), 0.0))
+        rising = np.minimum(np.maximum(memory.intended_deceleration, felt) + jerk * step, deceleration)
+        intended = np.where(is_braking, rising, 0.0)
+        brake = np.minimum(initial_brake + np.maximum(intended - felt, 0.0) / nominal.braking, 1.0)
         if (step_index := round(seen.time / step)) < len(start):
             calm = Command(np.full_like(brake, start[step_index]), np.zeros_like(brake))
         else:
             acceleration = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
             calm = pedals_for(nominal, seen.speed, acceleration, initial_trim)
         command = Command(np.where(is_reacting, 0.0, calm.throttle), np.where(is_reacting, brake, calm.brake))
-        return command, Reaction(nominal, step, cruise, seen.speed, danger_time, coasting, braking)
+        return command, Reaction(nominal, step, cruise, seen.speed, danger_time, felt, intended)
 
 
 class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
@@ -139,8 +152,10 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
     start_throttle: StartThrottle = ()
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        danger, jerk = is_in_the_way(seen, self.corridor), UNLIMITED_BRAKING / memory.step
-        return self.react(seen, memory, danger, UNLIMITED_BRAKING, 0.0, jerk, self.start_throttle)
+        danger = is_in_the_way(seen, self.corridor)
+        return self.react(
+            seen, memory, danger, UNLIMITED_BRAKING, reaction_time=0.0, jerk=np.inf, start=self.start_throttle
+        )
 
 
 class R157(ReferenceDriver, frozen=True, kw_only=True):
@@ -166,15 +181,16 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
         danger = is_in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
-        jerk = self.deceleration / memory.step
+        jerk = self.deceleration / memory.step  # reaches the deceleration within a step
         return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk)
 
 
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
 
-    A gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g. safe distance = v rt +
-    a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
+    A gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
+    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and
+    leader.
 
     Parameters
     ----------
@@ -194,17 +210,16 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        is_near = seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed)
-        danger = is_in_the_way(seen, self.corridor) & is_near
+        is_too_near = seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed)
+        danger = is_in_the_way(seen, self.corridor) & is_too_near
         return self.react(seen, memory, danger, self.deceleration, self.reaction_time)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
         rt, reaction_speed = self.reaction_time, speed + self.reaction_time * self.acceleration
-        distance = (
-            speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
-        )
-        return np.asarray(np.maximum(distance - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))
+        stop = speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
+        leader_stop = leader_speed * leader_speed / (2 * self.leader_deceleration)
+        return np.asarray(np.maximum(stop - leader_stop, 0.0))
 
 
 class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
@@ -233,17 +248,16 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     margin: NonNegativeParameter = 2.0
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        acceleration = (seen.speed - (seen.speed if memory.cruise is None else memory.speed)) / memory.step
         gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, np.inf)
         pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
-        cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, acceleration)
-        near = cfs * (self.hardest - self.comfortable) + self.comfortable
-        deceleration = np.minimum(np.where(cfs > 0, near, pfs * self.comfortable), HARDEST_BRAKING)
+        cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, memory.acceleration(seen))
+        critical_deceleration = cfs * (self.hardest - self.comfortable) + self.comfortable
+        deceleration = np.minimum(np.where(cfs > 0, critical_deceleration, pfs * self.comfortable), HARDEST_BRAKING)
         return self.react(seen, memory, (pfs > 0) | (cfs > 0), deceleration, self.reaction_time)
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
-        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below
-        the unsafe one.
+        """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe
+        distance.
         """
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
@@ -255,30 +269,41 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         (N,).
         """
         acceleration = np.maximum(a, -self.comfortable)
-        next_speed = v + self.reaction_time * acceleration
-        approach = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
-        square = (next_speed - u) * (next_speed - u)
-        fuzzy_value = _falling_ramp(
-            gap, approach + square / (2 * self.hardest), approach + square / (2 * self.comfortable)
-        )
-        stop = (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
-        return np.where(v <= u, 0.0, np.where(next_speed < u, np.where(gap < stop, 1.0, 0.0), fuzzy_value))
+        speed_after_reaction = v + self.reaction_time * acceleration
+        # How much the gap shrinks within the reaction time and, if the vehicle is slower then, until speeds are equal:
+        loss_in_reaction = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
+        loss_to_leader_speed = (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
+        square = (speed_after_reaction - u) * (speed_after_reaction - u)
+        unsafe_distance, safe_distance = (loss_in_reaction + square / (2 * b) for b in (self.hardest, self.comfortable))
+        cfs_still_faster = _falling_ramp(gap, unsafe_distance, safe_distance)
+        cfs = np.where(speed_after_reaction < u, gap < loss_to_leader_speed, cfs_still_faster)
+        return np.where(v <= u, 0.0, cfs)
 
 
-def _falling_ramp(value: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """1 below `low`, 0 above `high`, linear between them."""
+def _falling_ramp(gap: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """1 below `low`, 0 above `high`, linear between them; the gap [m] may be infinite."""
     width = np.maximum(high - low, LEAST_DIVISOR)
-    return np.minimum(np.maximum((high - np.minimum(value, high + width)) / width, 0.0), 1.0)
+    finite_gap = np.minimum(gap, high + width)
+    return np.minimum(np.maximum((high - finite_gap) / width, 0.0), 1.0)
 
 
 class _Perceiving(NamedTuple):
-    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it
-    was in the way there; the time since it strayed from there [s], negative until it does.
+    """What the competent driver remembers of N vehicles; arrays have shape (N,).
+
+    Attributes
+    ----------
+    reaction
+        What every reference driver remembers.
+    first_lateral, appeared_in_way
+        Lateral position at which the driver first saw the obstacle [m], infinite before; whether this position is in
+        the way.
+    stray_time
+        Time since the obstacle strayed from this position [s], negative before.
     """
 
     reaction: Reaction
     first_lateral: FloatArray
-    first_in_way: BoolArray
+    appeared_in_way: BoolArray
     stray_time: FloatArray
 
 
@@ -290,8 +315,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
 
     While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
     Behind a moving leader it keeps its headway by the accelerator only:
-    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`;
-    u and v are the speeds of leader and vehicle.
+    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`,
+    with the speeds u and v of leader and vehicle.
 
     Parameters
     ----------
@@ -303,7 +328,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
         position [m, s].
     lets_go
-        Largest deceleration while it increases its gap [m/s^2].
+        Largest deceleration by which it lets its gap to a leader grow to the headway [m/s^2].
     headway
         Time headway at which it follows [s].
     corridor
@@ -327,7 +352,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         is_perceived, memory = self._perceive(seen, memory)
         is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
-        danger, following = is_in_way & (time_to_reach(seen) < self.critical_ttc), self._following(seen, is_in_way)
+        danger = is_in_way & (time_to_reach(seen) < self.critical_ttc)
+        following = self._following(seen, is_in_way)
         command, reaction = self.react(
             seen, memory.reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following
         )
@@ -341,16 +367,17 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Perceiving) -> tuple[BoolArray, _Perceiving]:
-        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position
-        `perception_time` ago.
+        """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
+        `perception_time` ago or earlier.
         """
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
-        appears = is_sighted & ~np.isfinite(memory.first_lateral)
-        first_lateral = np.where(appears, lateral, memory.first_lateral)
-        first_in_way = memory.first_in_way | (appears & (np.abs(lateral) <= self.corridor))
+        is_first_sight = is_sighted & ~np.isfinite(memory.first_lateral)
+        first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
+        appeared_in_way = memory.appeared_in_way | (is_first_sight & (np.abs(lateral) <= self.corridor))
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
-        starts = np.where(is_sighted & (deviation >= self.stray), 0.0, -1.0)
-        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, starts)
-        is_perceived = first_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
-        return is_perceived, _Perceiving(memory.reaction, first_lateral, first_in_way, stray_time)
+        strays_now = is_sighted & (deviation >= self.stray)
+        new_stray_time = np.where(strays_now, 0.0, -1.0)
+        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
+        is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
+        return is_perceived, _Perceiving(memory.reaction, first_lateral, appeared_in_way, stray_time)

@@ -23,9 +23,16 @@ CHANGEABLE = msgspec.convert(
 
 
 class VariedAds(Ads):
-    """An ADS with own values of some `names` for each vehicle: `values` has shape (m, number of names).
+    """An ADS that has other values of some parameters in each vehicle.
 
-    With K points, vehicle i of each group of m has row i.
+    Parameters
+    ----------
+    ads
+        The ADS with the study's parameters.
+    names
+        Names of the parameters that vary.
+    values
+        Their values, shape (m, number of names). N vehicles are N / m groups, and vehicle i of each group has row i.
     """
 
     def __init__(self, ads: Ads, names: tuple[str, ...], values: FloatArray) -> None:
@@ -33,26 +40,27 @@ class VariedAds(Ads):
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         columns = [np.tile(column, n // len(column)) for column in self._values.T]
-        own: Any = copy.copy(self._ads)
-        if isinstance(own, PerVehicleAds):
-            drivers = own.start(n, nominal, step)
+        varied: Any = copy.copy(self._ads)
+        if isinstance(varied, PerVehicleAds):
+            drivers = varied.start(n, nominal, step)
             for name, column in zip(self._names, columns, strict=True):
                 for driver, value in zip(drivers, column.tolist(), strict=True):
                     setattr(driver, name, value)
-            return own, drivers
-        model = own
-        if isinstance(own, GuardedAds):
-            model = own._ads = copy.copy(own._ads)
+            return varied, drivers
+        model = varied
+        if isinstance(varied, GuardedAds):
+            model = varied._ads = copy.copy(varied._ads)
+        set_field = force_setattr if isinstance(model, msgspec.Struct) else object.__setattr__  # frozen ones, too
         for name, column in zip(self._names, columns, strict=True):
-            (force_setattr if isinstance(model, msgspec.Struct) else object.__setattr__)(model, name, column)
-        return own, own.start(n, nominal, step)
+            set_field(model, name, column)
+        return varied, varied.start(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
-        own, inner = memory
-        command, inner = own.drive(seen, inner)
-        return command, (own, inner)
+        varied, memory_of_varied = memory
+        command, memory_of_varied = varied.drive(seen, memory_of_varied)
+        return command, (varied, memory_of_varied)
 
     def warns(self, memory: Memory) -> BoolArray | None:
-        own, inner = memory
-        warned: BoolArray | None = own.warns(inner)
+        varied, memory_of_varied = memory
+        warned: BoolArray | None = varied.warns(memory_of_varied)
         return warned

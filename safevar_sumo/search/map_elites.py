@@ -1,4 +1,6 @@
-"""MAP-Elites (Mouret and Clune 2015) on pyribs: an atlas whose cells hold the failures with the smallest changes."""
+"""MAP-Elites (Mouret and Clune 2015) on pyribs: an atlas of failures, the one with the smallest changes
+in each cell.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     reach
         Standard deviation of the mutation of changed values [share of the domain].
     speeds
-        Number of intervals of the collision speed that have a cell; one more cell holds settings without a collision.
+        Number of intervals of the collision speed, each a cell; one more cell holds settings without a collision.
     tournament_size
         Number of elites in the tournament for a parent.
     """
@@ -54,7 +56,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     tournament_size: TournamentSize = 6
 
     def count_cells(self, characteristic_count: int, source: str = "search.map_elites") -> int:
-        """The number of cells of an atlas.
+        """The number of cells of an atlas; also checks that pyribs, which makes it, is installed.
 
         Raises
         ------
@@ -82,26 +84,29 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         cell_count = self.count_cells(len(problem.characteristics))
         from ribs.archives import GridArchive  # takes a second to load
 
+        # What the archive stores of a setting is the number of its evaluation.
         archive = GridArchive(solution_dim=1, dims=[cell_count], ranges=[(-0.5, cell_count - 0.5)])
         batches, settings, used = list[Evaluations](), np.zeros((problem.evaluations, len(problem.characteristics))), 0
         quality = np.full(problem.evaluations, -np.inf)
         while used < problem.evaluations:
-            number, generation_size = min(problem.population, problem.evaluations - used), problem.population
             elites = _elites_in(archive)
-            parents = settings[self._draw_parents(elites, quality, generation_size, rng)] if len(elites) else None
-            # A whole generation, so that a run does not depend on its budget:
-            children = self._draw_children(parents, generation_size, problem, rng)
-            evaluated = yield problem.characteristics.filter(children[:number])
+            parents = settings[self._draw_parents(elites, quality, problem.population, rng)] if len(elites) else None
+            # A whole generation is drawn, so that a run does not depend on its budget:
+            children = self._draw_children(parents, problem.population, problem, rng)
+            evaluated = yield problem.characteristics.filter(children[: problem.evaluations - used])
             batches.append(evaluated)
-            settings[used : used + number] = evaluated.settings
-            valid = np.flatnonzero(problem.scoring.valid(evaluated))
-            if len(valid):
+            numbers = used + np.arange(len(evaluated))
+            settings[numbers] = evaluated.settings
+            valid = problem.scoring.valid(evaluated)
+            if valid.any():
                 # Collisions by their largest change; other settings, all worse, by the first objective:
                 severity = -problem.scoring.values(evaluated)[:, 0]
-                quality[used + valid] = np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, severity)[valid]
+                quality[numbers[valid]] = np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, severity)[
+                    valid
+                ]
                 cells = self._cell_numbers(evaluated, problem)[valid, np.newaxis]
-                archive.add((used + valid)[:, np.newaxis].astype(float), quality[used + valid], cells)
-            used += number
+                archive.add(numbers[valid, np.newaxis].astype(float), quality[numbers[valid]], cells)
+            used += len(evaluated)
         evaluations = Evaluations.concatenate(batches)
         atlas = evaluations.take(_elites_in(archive))
         is_more_severe = problem.scoring.values(atlas)[:, 0] < problem.scoring.values(problem.original)[0, 0]
@@ -115,7 +120,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def _draw_children(
         self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator
     ) -> FloatArray:
-        """Unfiltered settings, feasible after the filter; without parents, each setting has random changes."""
+        """`number` children, not yet filtered, but feasible once they are; without parents, each has random changes."""
         characteristics = problem.characteristics
         size, width = len(characteristics), characteristics.upper - characteristics.lower
         if parents is None:
@@ -125,33 +130,26 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         mutated_values = parents + rng.normal(0, self.reach, parents.shape) * width
         children = np.where(changed, np.clip(mutated_values, characteristics.lower, characteristics.upper), parents)
         new_values = rng.uniform(characteristics.lower, characteristics.upper, parents.shape)
-        for probability, values in (
-            (self.added, new_values),
-            (self.removed, np.broadcast_to(characteristics.original, parents.shape)),
-        ):
-            columns = (
-                rng.integers(0, size, number)
-                if values is new_values
-                else np.argmax(np.where(changed, rng.random(parents.shape), -1.0), axis=1)
-            )
-            rows = np.flatnonzero(rng.random(number) < probability)
-            children[rows, columns[rows]] = values[rows, columns[rows]]
+        added_columns = rng.integers(0, size, number)
+        rows = np.flatnonzero(rng.random(number) < self.added)
+        children[rows, added_columns[rows]] = new_values[rows, added_columns[rows]]
+        # One of the parent's changes, each as likely as the others:
+        removed_columns = np.argmax(np.where(changed, rng.random(parents.shape), -1.0), axis=1)
+        rows = np.flatnonzero(rng.random(number) < self.removed)
+        children[rows, removed_columns[rows]] = characteristics.original[removed_columns[rows]]
         return problem.repaired(children)
 
     def _cell_numbers(self, evaluated: Evaluations, problem: Problem) -> IntArray:
         changed = problem.characteristics.changed(evaluated.settings)
         if self.behaviour == "changes":
-            return np.asarray(changed @ (1 << np.arange(changed.shape[1])))
-        speed = np.nan_to_num(evaluated.collision_speed, nan=-1.0)
-        interval = np.where(
-            speed < 0,
-            0,
-            1 + np.minimum(np.floor(np.maximum(speed, 0) / FASTEST_COLLISION * self.speeds), self.speeds - 1),
-        )
-        further_changes = np.maximum(changed.sum(axis=1) - 1, 0)
-        return np.asarray(further_changes * (self.speeds + 1) + interval.astype(int))
+            return np.asarray(changed @ (1 << np.arange(changed.shape[1])))  # a bit for each characteristic
+        speed = evaluated.collision_speed
+        interval = np.minimum(np.floor(np.maximum(speed, 0) / FASTEST_COLLISION * self.speeds), self.speeds - 1)
+        column = np.where(np.isnan(speed), 0, 1 + interval).astype(int)
+        row = np.maximum(changed.sum(axis=1) - 1, 0)
+        return np.asarray(row * (self.speeds + 1) + column)
 
 
 def _elites_in(archive: GridArchive) -> IntArray:
-    """The numbers of the evaluations that an archive holds, in order."""
+    """The numbers of the evaluations that an archive stores, in order."""
     return np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
