@@ -1,4 +1,4 @@
-"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of users' algorithms."""
+"""The contract of a search algorithm, and checks of users' algorithms; independent of SUMO, processes and files."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 Search = Generator[FloatArray, Evaluations, Evaluations]
-"""A generator: yields k filtered settings of n characteristics, shape (k, n), receives their evaluations, and returns
-the run's result.
+"""A generator that yields k filtered settings of n characteristics, shape (k, n), receives their evaluations, and so
+on; at its end it returns the run's result.
 """
 
 
@@ -65,8 +65,9 @@ class Algorithm:
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         """One run, which requests at most `problem.evaluations` evaluations.
 
-        All randomness comes from `rng`, because a resumed run is repeated from its journal. Yielded settings are in the
-        domains and filtered. The result consists of valid evaluations (`problem.scoring.valid`) that the run received.
+        All randomness comes from `rng`, so that a run which is resumed, with the evaluations of its journal, yields the
+        same settings again. Yielded settings are in the domains and filtered. The result consists of valid evaluations
+        (`problem.scoring.valid`) that the run received.
         """
 
 

@@ -36,16 +36,16 @@ PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Changes a few characteristics of the original vehicle, in ranges that narrow towards less safe settings.
 
-    A setting gets its score (`_scores`) within its generation, and keeps it.
+    A setting's score (`_scores`) compares it with the others of its generation, and does not change later.
 
     Parameters
     ----------
     generation
         Number of settings in a generation.
     kept
-        Number of settings with the best scores in the result.
+        Number of settings in the result: those with the best scores.
     warm_up
-        Evaluations before ranges are narrowed or a generation must improve.
+        Number of evaluations before ranges are narrowed or a generation must improve.
     generations_between_updates, generations_without_improvement
         Number of generations between two updates of the ranges, and number without a new lowest score after which the
         search ends.
@@ -114,8 +114,10 @@ class _Ranges:
         return setting
 
     def _draw_value(self, i: int, rng: np.random.Generator) -> float:
-        """A value drawn uniformly from the range without the filter's band; the original value if the band covers the
-        whole range.
+        """A value of characteristic `i`, drawn uniformly from the values in its range that the filter keeps.
+
+        The filter replaces values within a threshold of the original by the original, which is drawn if no others are
+        in the range.
         """
         original, threshold = self._characteristics.original[i], self._characteristics.threshold[i]
         width_below = max(original - threshold - self.lower[i], 0.0)
@@ -126,12 +128,11 @@ class _Ranges:
         return float(self.lower[i] + position if position < width_below else self.upper[i] - (position - width_below))
 
     def narrow(self, window: Evaluations) -> None:
-        """Narrow each range to the mean increase and mean decrease in the settings of `window` that are less safe than
-        the original.
+        """End each range at the mean of the increased values and the mean of the decreased values, over the settings of
+        `window` that are less safe than the original.
         """
-        less_safe = window.take(
-            self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original_objective)
-        )
+        is_less_safe = self._scoring.values(window)[:, 0] < self._original_objective
+        less_safe = window.take(self._scoring.valid(window) & is_less_safe)
         if not len(less_safe):
             return
         for i, original in enumerate(self._characteristics.original):
@@ -140,12 +141,11 @@ class _Ranges:
                 self.upper[i] = np.mean(values[values > original])
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
-        self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
+        self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))  # rounded, halves upwards
 
 
 def _scores(evaluations: Evaluations, scoring: Scoring, safety_weight: float) -> FloatArray:
-    """The scores (6 SD_norm + f_diff + num_norm) / 8 of a generation, of which the search prefers low values; NaN where
-    invalid.
+    """The scores of a generation, less being better, by default (6 SD_norm + f_diff + num_norm) / 8; NaN if invalid.
 
     SD_norm is the safety degree scaled to [0, 1] over the generation ("after each generation, the value of each
     objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n characteristics. In a study with other

@@ -21,11 +21,13 @@ DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
 Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 MAX_REDRAWS = 10
-"""Maximum number of draws for each child, on average over a generation; beyond it, a child that equals an existing
+"""Maximum number of draws for each child, on average over a generation; after them, a child that equals an existing
 individual is accepted.
 """
 MAX_MISSES = 50
-"""Maximum number of consecutive draws without a feasible child; the children of the next such draw are repaired."""
+"""Maximum number of consecutive draws without a feasible child; if the next draw has none either, its children are
+repaired.
+"""
 
 
 @cache
@@ -40,11 +42,16 @@ def fitness_class(objective_count: int) -> type:
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and
-    a row in it.
+    """Unfiltered values of a setting.
 
-    `has_failed` is true if the evaluation is not valid. `standing` is the value by which an algorithm compares
-    survivors: less is better.
+    Attributes
+    ----------
+    fitness, evaluation
+        Once evaluated: the values of the objectives, and the batch of evaluations with the row in it.
+    standing
+        What an algorithm compares survivors by: less is better.
+    has_failed
+        Whether the evaluation is not valid.
     """
 
     fitness: base.Fitness
@@ -67,7 +74,7 @@ class Operators(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Reproduction:
-    """Draws offspring. DEAP draws from the global `random`: see `randomness`."""
+    """Draws offspring of one run. DEAP draws from the global `random`: see `randomness`."""
 
     def __init__(self, operators: Operators, problem: Problem, rng: np.random.Generator) -> None:
         characteristics, self._problem = problem.characteristics, problem
@@ -96,10 +103,10 @@ class Reproduction:
 
         With `distinct` all parents enter equally many tournaments, and copies of existing individuals are drawn again.
         """
-        existing, children, draws = set(map(tuple, population)), list[Individual](), 0
+        existing, offspring, draws = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
-            while population and len(children) < number:
+            while population and len(offspring) < number:
                 if distinct:
                     parents = self._parents(population)
                 else:
@@ -108,30 +115,29 @@ class Reproduction:
                     draws += 1
                     if not distinct or tuple(child) not in existing or draws > MAX_REDRAWS * number:
                         existing.add(tuple(child))
-                        children.append(child)
-        return children[:number]
+                        offspring.append(child)
+        return offspring[:number]
 
     def draw_child(self, first: list[Individual], second: list[Individual]) -> Individual:
-        """Draw an individual that is in neither group, from a parent of each group. Call this method within
-        `randomness`.
+        """Draw a child of a parent from each group; a child that equals an individual of a group is drawn again, up to
+        `MAX_REDRAWS` times. Call this method within `randomness`.
         """
-        feasible: list[Individual] = []
         for _ in range(MAX_REDRAWS):
+            feasible: list[Individual] = []
             while not feasible:
                 parents = self.select_parent(first), self.select_parent(second)
                 feasible = self._feasible_children([self._mutate(self._crossover(*parents)[0])])
-            child = feasible.pop()
+            child = feasible[0]
             if child not in first and child not in second:
                 break
         return child
 
     def _feasible_children(self, children: list[Individual]) -> list[Individual]:
-        """The children that satisfy the study's constraints.
+        """The children that satisfy the study's constraints; the caller draws again for those that do not.
 
         Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first
-        population is feasible, so an infeasible child would not survive: it is not simulated; other children are drawn
-        in its place. After `MAX_MISSES` draws in a row without a feasible child, the next children are moved towards
-        the original until they are feasible.
+        population is feasible, so an infeasible child would not survive, and is not simulated. After `MAX_MISSES` draws
+        in a row without a feasible child, the next children are moved towards the original until they are feasible.
         """
         if not self._problem.region:
             return children
@@ -143,7 +149,9 @@ class Reproduction:
         return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
 
     def _parents(self, population: list[Individual]) -> tuple[Individual, Individual]:
-        """The winners of two tournaments; candidates are drawn without replacement until the population is used up."""
+        """The winners of two tournaments. Candidates are drawn without replacement until too few are left; then the
+        whole population are candidates again.
+        """
         size, winners = min(self._operators.tournament_size, len(population)), list[Individual]()
         for _ in range(2):
             if len(self._candidates) < size:
@@ -191,6 +199,7 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]
     """Group individuals by non-domination rank; each front keeps the given order."""
     if not individuals:
         return []
+    # DEAP's weighted values are the negative objectives.
     ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
     fronts: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
     for individual, rank in zip(individuals, ranks, strict=True):
@@ -199,7 +208,7 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]
 
 
 def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """Set the `standing` of individuals to rank, from 0, and negative crowding distance; return the fronts."""
+    """Set the `standing` of individuals, front by front; returns the fronts."""
     fronts = sort_into_fronts(individuals)
     for rank, front in enumerate(fronts):
         set_front_standings(front, rank)
@@ -207,9 +216,7 @@ def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
 
 
 def set_front_standings(front: Sequence[Individual], rank: int) -> None:
-    """Set the `standing` of a front's individuals to the front's rank, from 0, and the individual's negative crowding
-    distance.
-    """
+    """Set the `standing` of a front's individuals: the front's rank, from 0, then the negative crowding distance."""
     tools.emo.assignCrowdingDist(front)
     for individual in front:
         individual.standing = rank, -individual.fitness.crowding_dist
@@ -218,7 +225,7 @@ def set_front_standings(front: Sequence[Individual], rank: int) -> None:
 def run_tournament(population: list[Individual], size: int = 2) -> Individual:
     """The best, by standing, of `size` individuals drawn without replacement; chance decides ties."""
     if len(population) == 1:
-        return population[0]
+        return population[0]  # draws nothing from `random`
     best, *rivals = random.sample(population, min(size, len(population)))
     for rival in rivals:
         if rival.standing < best.standing or (rival.standing == best.standing and random.random() >= 0.5):

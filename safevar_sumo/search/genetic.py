@@ -1,5 +1,7 @@
-"""Genetic algorithms: NSGA-II (Deb et al. 2002) on DEAP, as published (method section 6); SPEA2 (Zitzler et al. 2001);
-MOCell (Nebro et al. 2009), here synchronous, so that a generation is one batch.
+"""Genetic algorithms: NSGA-II, SPEA2 and MOCell.
+
+NSGA-II (Deb et al. 2002) is on DEAP, as published (method section 6); SPEA2 is by Zitzler et al. (2001). MOCell (Nebro
+et al. 2009) is synchronous here, so that a generation is one batch.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from safevar_sumo.search.evolution import (
 
 
 class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Elitist search by rank and crowding distance; as many offspring as individuals; SBX, polynomial mutation.
+    """Elitist search by rank and crowding distance, with as many offspring as individuals.
 
     The variables are the characteristics' unfiltered values; simulation and results use filtered ones.
     The default mutation probability is 1/n per variable. The result is the non-dominated part of the last population.
@@ -50,8 +52,9 @@ def _search_elitist(
     *,
     distinct: bool = False,
 ) -> Search:
-    """Search with survivors, which `select` chooses from survivors and offspring and whose `standing` begins with less
-    than 1 if they are non-dominated.
+    """Search with survivors, which `select` chooses from the previous survivors and their offspring.
+
+    `select` also sets their `standing`. Its first number is below 1 for non-dominated survivors, who are the result.
     """
     reproduction = Reproduction(operators, problem, rng)
     offspring, survivors, used = initial_population(problem, rng), list[Individual](), 0
@@ -64,9 +67,7 @@ def _search_elitist(
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
-    """Select the best `number` by rank, then by crowding distance, as DEAP's `selNSGA2` does; compiled code sorts
-    faster.
-    """
+    """Select the best `number` by rank, then by crowding distance, as DEAP's slower `selNSGA2` does."""
     sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
     for rank, front in enumerate(sort_into_fronts(sorted_individuals)):
@@ -110,15 +111,15 @@ def select_archive(individuals: list[Individual], size: int, *, normalised: bool
     """The publication's environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated
     individuals.
 
-    The fitness is the sum of the strengths of the individuals that dominate, plus the density 1 / (distance to the k-th
-    nearest individual + 2). An individual's strength is the number of individuals that it dominates; k is the root of
-    the number of individuals, and counts from 0 as in pymoo.
+    An individual's fitness is the sum of the strengths of all that dominate it, plus the density 1 / (distance to its
+    k-th nearest individual + 2). The strength is the number of individuals that one dominates; k is the root of the
+    number of individuals, and counts from 0 as in pymoo.
     """
     if not individuals:
         return []
     objectives = np.array([individual.fitness.values for individual in individuals])
-    first, second = objectives[:, np.newaxis], objectives[np.newaxis]
-    dominates = (first <= second).all(axis=2) & (first < second).any(axis=2)
+    rows, columns = objectives[:, np.newaxis], objectives[np.newaxis]
+    dominates = (rows <= columns).all(axis=2) & (rows < columns).any(axis=2)
     if normalised:
         width = np.ptp(objectives, axis=0)
         objectives = (objectives - objectives.min(axis=0)) / np.where(width > 0, width, 1.0)
@@ -128,7 +129,8 @@ def select_archive(individuals: list[Individual], size: int, *, normalised: bool
     distances = np.sqrt(squares)
     np.fill_diagonal(distances, np.inf)
     k = min(int(np.sqrt(len(distances))), len(distances) - 1)
-    fitness = np.count_nonzero(dominates, axis=1) @ dominates + 1 / (np.sort(distances, axis=1)[:, k] + 2)
+    strengths = np.count_nonzero(dominates, axis=1)
+    fitness = strengths @ dominates + 1 / (np.sort(distances, axis=1)[:, k] + 2)
     for individual, value in zip(individuals, fitness.tolist(), strict=True):
         individual.standing = (value,)
     is_dominated = dominates.any(axis=0)
@@ -139,16 +141,17 @@ def select_archive(individuals: list[Individual], size: int, *, normalised: bool
 
 
 def _truncate(indices: np.ndarray, distances: FloatArray, number: int) -> list[int]:
-    """Remove the individual with the nearest neighbour, one by one, until `number` are left; the second nearest decides
-    ties, and so on.
+    """Remove the individual with the nearest neighbour, one by one, until `number` are left; the second nearest
+    neighbour decides ties, and so on.
     """
-    kept: list[int] = indices.tolist()
-    while len(kept) > number:
-        pair_distances = distances[np.ix_(kept, kept)]
+    remaining: list[int] = indices.tolist()
+    while len(remaining) > number:
+        pair_distances = distances[np.ix_(remaining, remaining)]
         nearest = pair_distances.min(axis=1)
         tied = np.flatnonzero(nearest == nearest.min())
-        del kept[tied[np.lexsort(np.sort(pair_distances[tied], axis=1).T[::-1])[0]]]
-    return kept
+        neighbours = np.sort(pair_distances[tied], axis=1)  # nearest first
+        del remaining[tied[np.lexsort(neighbours.T[::-1])[0]]]  # `lexsort` sorts by its last key first
+    return remaining
 
 
 GridSide = Annotated[int, Meta(ge=1, le=100_000)]
@@ -160,9 +163,9 @@ NEIGHBOURHOODS = {"von_neumann": CROSS, "moore": (*CROSS, (-1, 1), (-1, -1), (1,
 class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Cells on a toroidal grid that mate with their neighbours and with an archive of non-dominated individuals.
 
-    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if the child dominates
-    that individual, or if neither dominates and the child is not the worst of the neighbourhood. The variables are the
-    characteristics' unfiltered values; simulation and results use filtered ones. The result is the archive.
+    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if the child dominates,
+    or if neither dominates and the child is not the worst of the neighbourhood. The variables are the characteristics'
+    unfiltered values; simulation and results use filtered ones. The result is the archive.
 
     Parameters
     ----------
@@ -214,7 +217,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             neighbourhoods = [[cells[i] for i in indices if not cells[i].has_failed] for indices in neighbours]
             with reproduction.randomness():
                 offspring = [
-                    reproduction.draw_child(mates or archive, archive)
+                    reproduction.draw_child(mates or archive, archive)  # without mates if they all failed
                     for mates in neighbourhoods[: problem.evaluations - used]
                 ]
             used += yield from request_evaluations(offspring, problem)
@@ -235,8 +238,8 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def choose_survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
-    """Choose between a cell and its evaluated child; `mates` are the cell and its neighbours, whose `standing` may
-    change.
+    """Choose between a cell and its evaluated child. `mates` are the cell and its neighbours; sets their `standing` if
+    neither dominates.
     """
     if child.has_failed or (not cell.has_failed and cell.fitness.dominates(child.fitness)):
         return cell
@@ -247,8 +250,8 @@ def choose_survivor(cell: Individual, child: Individual, mates: list[Individual]
 
 
 def update_archive(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
-    """Select the at most `size` least crowded non-dominated individuals of archive and offspring, without duplicates;
-    sets `standing`.
+    """Select the non-dominated individuals of archive and offspring, without duplicates, at most the `size` least
+    crowded of them; sets their `standing`.
 
     Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
     """
@@ -256,8 +259,9 @@ def update_archive(archive: list[Individual], offspring: list[Individual], size:
     for child in offspring:
         if not child.has_failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
-    new_archive = next(iter(set_standings(list(distinct.values()))), [])
+    fronts = set_standings(list(distinct.values()))
+    new_archive = fronts[0] if fronts else []
     while len(new_archive) > size:
-        del new_archive[max(range(len(new_archive)), key=lambda i: new_archive[i].standing)]
+        del new_archive[max(range(len(new_archive)), key=lambda i: new_archive[i].standing)]  # the most crowded
         set_standings(new_archive)
     return new_archive
