@@ -38,7 +38,6 @@ from safevar_sumo.cli.arguments import (
     load_results_or_study,
     point_option,
     read_changes,
-    split_names,
 )
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
@@ -123,29 +122,13 @@ def explain(
     return answer
 
 
-@add_question(
-    OpinionOptions,
-    "DIR",
-    click.option("--solutions", "lists", multiple=True, hidden=True, help="Another name of --solution."),
-    click.argument("handles", nargs=-1, metavar=""),
-)
-def opinion(
-    source: str,
-    solutions: tuple[str, ...],
-    lists: tuple[str, ...],
-    handles: tuple[str, ...],
-    point: str | None,
-    jobs: int | None,
-    as_json: bool,
-    unsafe: str | None,
-) -> JsonAnswer:
+@add_question(OpinionOptions, "DIR")
+def opinion(source: str, point: str | None, jobs: int | None, as_json: bool, **values: OptionValue) -> JsonAnswer:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    names = tuple(name for text in (*solutions, *lists, *handles) for name in split_names(text))
-    options = OpinionOptions(solutions=names, unsafe=unsafe)
     subject = load_results_or_study(source, point, results_only=True)
-    result = answer_question(ask_for_opinions, subject, options, jobs=jobs)
+    result = answer_question(ask_for_opinions, subject, OpinionOptions(**values), jobs=jobs)
     if as_json:
         for note in (*result.notes, result.counts):
             print_note(note)

@@ -1,4 +1,4 @@
-"""Files that results depend on: finds the files that user code reads, and names them alike on every machine.
+"""Finds the files that user code reads, on which results depend, and names them alike on every machine.
 
 The interpreter raises an audit event for every file that Python code opens and for every module that it loads. Compiled
 code raises no event, so all files that a study's parameters name count as read.
@@ -83,12 +83,15 @@ class _AuditHook:
             return
         if event == "import":
             self.modules.add(arguments[0])
-        path = arguments[event == "import"]
-        if isinstance(path, str | bytes | os.PathLike):
-            path = os.path.abspath(os.fsdecode(path))
-            writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS
-            for paths in [self.written] if writes else [recording.paths for recording in self.recordings]:
-                paths.add(path)
+        path = arguments[1] if event == "import" else arguments[0]
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        path = os.path.abspath(os.fsdecode(path))
+        if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS:
+            self.written.add(path)
+            return
+        for recording in self.recordings:
+            recording.paths.add(path)
 
 
 audit_hook = _AuditHook()
@@ -174,8 +177,8 @@ def digests(paths: Iterable[str], folders: Sequence[str]) -> Files:
 
 
 def _name_of(path: str, folders: Sequence[str], extra_parts: int) -> str:
-    """A file's path relative to the first of `folders` that contains the file; if none does, the path's last 2 +
-    `extra_parts` parts.
+    """A file's path relative to the first of `folders` that contains the file; if none does, or with `extra_parts`, the
+    path's last 2 + `extra_parts` parts.
     """
     for folder in (*folders, *_import_folders()):
         if not extra_parts and Path(path).is_relative_to(folder):
@@ -196,7 +199,8 @@ def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str
 def files_named_in(value: Any, folders: Sequence[str]) -> Iterator[str]:
     """Files in `folders` whose names occur as texts anywhere in a value."""
     if isinstance(value, dict | list | tuple):
-        for item in value.values() if isinstance(value, dict) else value:
+        items = value.values() if isinstance(value, dict) else value
+        for item in items:
             yield from files_named_in(item, folders)
     elif isinstance(value, str) and (path := file_beside(value, folders or (os.getcwd(),))):
         yield path

@@ -229,18 +229,14 @@ class SimulationRuns:
         )
 
     def nearest(self, vehicle: int) -> int | None:
-        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in
-        conflict.
-        """
+        """The sample of a vehicle's impact or, without a collision, of its smallest separation in conflict, if any."""
         active = self.trace.active[:, vehicle]
         if np.isfinite(self.collision_speed[vehicle]):
             return int(np.flatnonzero(active)[-1])
         in_conflict = active & self.encounter.in_conflict[:, vehicle]
-        return (
-            int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
-            if in_conflict.any()
-            else None
-        )
+        if not in_conflict.any():
+            return None
+        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
 
     @property
     def relative_speed(self) -> FloatArray:
@@ -252,16 +248,16 @@ class SimulationRuns:
         obstacle's speed.
         """
         trace, vehicles = self.trace, np.arange(len(self.collision_speed))
-        last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
+        last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)  # the last active one
+        sample_before = np.maximum(last_sample - 1, 0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
-        (first_speed, end_speed), (gap, gap_after) = (
-            ([values[np.maximum(last_sample - 1, 0), vehicles], values[last_sample, vehicles]])
-            for values in (trace.speed - obstacle_speed, trace.gap)
-        )
-        gap_closes = (gap > -TOUCH_OVERLAP) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
-        distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
-        squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance
-        min_speed, max_speed = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)
+        speed = trace.speed - obstacle_speed
+        speed_before, speed_after = speed[sample_before, vehicles], speed[last_sample, vehicles]
+        gap_before, gap_after = trace.gap[sample_before, vehicles], trace.gap[last_sample, vehicles]
+        gap_closes = (gap_before > -TOUCH_OVERLAP) & np.isfinite(gap_before) & (gap_after <= 0) & (speed_before > 0)
+        distance = np.where(gap_closes, np.maximum(gap_before, 0.0), 0.0)
+        squared_speed = speed_before * speed_before + 2 * (speed_after - speed_before) / trace.step * distance
+        min_speed, max_speed = np.minimum(speed_before, speed_after), np.maximum(speed_before, speed_after)
         at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))

@@ -149,14 +149,14 @@ class Evaluations:
             reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
             files={name: digest for batch in batches for name, digest in batch.files.items()},
             worst_points=None if all(batch.worst_points is None for batch in batches) else np.concatenate(points),
-            cells=CellResults._make(map(np.concatenate, zip(*cells, strict=True)))
-            if len(cells) == len(batches)
-            else None,
+            cells=None
+            if len(cells) < len(batches)
+            else CellResults._make(map(np.concatenate, zip(*cells, strict=True))),
         )
 
 
 def differences(outputs: Results, others: Results, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:
-    """For each result that differs, the first row that does, and both values."""
+    """Yield, for each result that differs, the first row where it does, and both values in words."""
     for name, values in outputs.items():
         is_same = values == others[name]
         if values.dtype.kind == "f":

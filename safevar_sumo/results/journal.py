@@ -27,22 +27,36 @@ from safevar_sumo.results.manifest import FORMAT, RUNS, disk_errors
 
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
+SECONDS_BETWEEN_ATTEMPTS = 0.05
+"""Time between two attempts to lock a journal [s]."""
 POSITION, OUTCOME, REASON, FILES_READ = "evaluation", "outcome", "reason", "files"
+FIRST_BYTES = b'{"format"'
+"""What every journal begins with."""
 UNDAMAGED = "the file as it was, or no file: the run is then simulated again"
 ANOTHER_OWNER = "belongs to another study, version or run"
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
 def journal_head(study: str, run: str, characteristics: Iterable[str]) -> JsonObject:
-    """The first line of a journal, what it belongs to: the digest of a study's identity, a run's name; and the names of
-    the characteristics.
+    """The first line of a journal: what it belongs to, the digest of a study's identity and the name of a run; and the
+    characteristics.
     """
     return {"format": FORMAT, "study": study, "run": run, "characteristics": list(characteristics)}
 
 
 class JournalContent(NamedTuple):
-    """The contents of a journal: evaluations and their positions; by budget, the positions of the run's solutions and
-    the number of evaluations that it requested; and the size of a torn tail [bytes].
+    """The contents of a journal.
+
+    Attributes
+    ----------
+    positions
+        The number of each evaluation in its run, from 0.
+    evaluations
+        The evaluations, in the order in which they were written.
+    results
+        By budget, the positions of the run's solutions, and the number of evaluations that the run requested.
+    tail_size
+        Size of a torn last line [bytes].
     """
 
     positions: list[int]
@@ -71,11 +85,11 @@ class Journal:
     Parameters
     ----------
     path
-        The file, made if it does not exist. A journal without evaluations passes to this owner.
+        The file, made if it does not exist. A journal without evaluations passes to the owner in `head`.
     head
         The owner of the journal, as `journal_head` names it.
     deadline
-        Time of `time.monotonic` until which another process may end that holds the lock.
+        Time of `time.monotonic` until which to wait for another process that holds the lock.
 
     Attributes
     ----------
@@ -186,7 +200,8 @@ def files_read_later(directory: Path) -> dict[str, str]:
     """Digests, by name, of the files that user code read for the first time after the study began, from all journals of
     a directory.
     """
-    start, files = msgspec.json.encode({FILES_READ: {}})[:-2], dict[str, str]()
+    files = dict[str, str]()
+    start = msgspec.json.encode({FILES_READ: {}}).removesuffix(b"}}")  # most lines are long and need not be decoded
     for path in sorted((directory / RUNS).glob("*.jsonl")):
         with path.open("rb") as file:
             for line in file:
@@ -206,7 +221,7 @@ def _open_and_lock(path: Path, deadline: float) -> IO[bytes]:
             if time.monotonic() > deadline:
                 file.close()
                 raise JournalBusyError(f"{path}: another process works on this run") from None
-            time.sleep(0.05)
+            time.sleep(SECONDS_BETWEEN_ATTEMPTS)
         except portalocker.LockException as error:
             file.close()
             raise SafevarError(
@@ -232,14 +247,15 @@ def _parse(data: bytes, path: Path) -> tuple[list[JsonObject], int]:
             line = msgspec.json.decode(text, type=JsonObject)
         except msgspec.DecodeError as error:
             if end + len(text) == len(data):
-                break
+                break  # the last line is torn
             problem = f"is damaged in line {len(lines) + 1}: {error}"
             raise InputError(path, problem, UNDAMAGED) from None
         if not text.endswith(b"\n"):
             break
         lines.append(line)
         end += len(text)
-    is_journal = "format" in lines[0] if lines else data.strip(b"\0")[:9] in b'{"format"'
+    # A crash of the machine may leave zeros at the end of a file.
+    is_journal = "format" in lines[0] if lines else FIRST_BYTES.startswith(data.strip(b"\0")[: len(FIRST_BYTES)])
     if not is_journal:
         raise InputError(path, "is no journal", "a file that the command `study` has written, or another directory")
     return lines, end
@@ -268,9 +284,7 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         name: np.array(values, dtype=float) for name, values in line.items() if name not in (POSITION, OUTCOME, REASON)
     }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
-    reasons = {
-        setting.tobytes(): reason for setting, reason in zip(settings, line.get(REASON, ()), strict=False) if reason
-    }
+    reasons = line.get(REASON, [None] * len(settings))
     speed, f_diff, f_num_diff = (columns.pop(name) for name in OBJECTIVE_COLUMNS)
     return Evaluations(
         settings=settings,
@@ -279,7 +293,7 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         f_diff=f_diff,
         f_num_diff=f_num_diff,
         metrics=columns,
-        reasons=reasons,
+        reasons={setting.tobytes(): reason for setting, reason in zip(settings, reasons, strict=True) if reason},
     )
 
 
@@ -297,8 +311,8 @@ def _content_of(lines: Sequence[JsonObject], path: Path, head: JsonObject) -> Jo
                 results[line["budget"]] = (line["solutions"], line["asked"])
             elif "retry" in line:
                 evaluations = Evaluations.concatenate(batches)
-                kept = int(np.argmax(evaluations.failed))
-                positions, batches, results = positions[:kept], [evaluations.take(range(kept))], {}
+                first_failed = int(np.argmax(evaluations.failed))
+                positions, batches, results = positions[:first_failed], [evaluations.take(range(first_failed))], {}
         return JournalContent(positions, Evaluations.concatenate(batches) if positions else empty, results)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(path, f"was edited: {error!r}", UNDAMAGED) from None

@@ -1,5 +1,5 @@
-"""Reads results without SUMO: as tidy frames, as the progress of a study, and single solutions by their handles or by
-choice.
+"""Reads results without SUMO: as tidy frames, and as the progress of a study; and finds single solutions, by their
+handles or by a choice such as the most severe one.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: its algorithm, run, number of the evaluation in the run (from 0), and the
-    reason.
-    """
+    """A setting that could not be simulated: its algorithm, run, position in the run from 0, and why."""
 
     algorithm: str
     run: int
@@ -75,11 +73,11 @@ class StoredResults(NamedTuple):
 
 
 class RunStatus(NamedTuple):
-    """Progress of one run: how many distinct settings were simulated, collided, and failed; and the `best`, the lowest
-    safety degree.
+    """Progress of one run.
 
-    `state` is waiting, begun or finished; `best` is a distance [m] or minus a collision speed [m/s], None before the
-    first simulation.
+    `state` is waiting, begun or finished. `simulated`, `collisions` and `simulator_errors` are numbers of distinct
+    settings: all, those that collided, and those that failed. `best` is the lowest safety degree: a distance [m] or
+    minus a collision speed [m/s], None before the first simulation.
     """
 
     algorithm: str
@@ -132,7 +130,7 @@ class Status(NamedTuple):
 
 
 def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, int, JournalContent | None]], int]:
-    """Algorithm, number and journal's content of every run, None without a journal; and the runs' budget
+    """Every run's algorithm, number, and journal's content (None without a journal); and the runs' budget
     [evaluations].
     """
     search, digest = manifest["study"]["search"], identity_digest(manifest)
@@ -179,7 +177,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         if budget in content.results:
             solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget][0])))
     frame = evaluations_frame(characteristics, evaluations_of_runs)
-    frame.insert(2, "evaluation", all_positions)
+    frame.insert(2, "evaluation", all_positions)  # behind algorithm and run
     solutions = solutions_frame(characteristics, solutions_of_runs)
     return StoredResults(
         manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures)
@@ -229,6 +227,8 @@ def status(directory: str | Path) -> Status:
 
 
 HANDLE_FORMAT = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
+MAX_EXAMPLES = 6
+"""Largest number of handles that an error names."""
 
 
 class SolutionId(NamedTuple):
@@ -283,7 +283,7 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = 
     if handle in all_handles:
         return all_handles.index(handle)
     last_handles = {(other.algorithm, other.run): str(other) for other in all_handles}
-    expected = f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:6])}"
+    expected = f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:MAX_EXAMPLES])}"
     raise InputError(source, f"there is no solution {handle}", expected)
 
 
@@ -315,6 +315,10 @@ def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: 
     table = solutions.reset_index(drop=True)
     candidates = table if choice == "most_severe" else table[unsafe.rows(table)]
     if candidates.empty:
-        problem = f"these results hold no {'unsafe ' * (len(table) > 0)}solution"
-        raise InputError(source, problem, "other results, the most severe solution, or a solution by its handle")
+        missing = "solution" if table.empty else "unsafe solution"
+        raise InputError(
+            source,
+            f"these results hold no {missing}",
+            "other results, the most severe solution, or a solution by its handle",
+        )
     return handles_of(table)[int(candidates.sort_values(CHOICES[choice], kind="stable").index[0])]

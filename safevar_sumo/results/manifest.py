@@ -23,6 +23,7 @@ from safevar_sumo.study import DESCRIPTION_KEYS, Study, convert_table, tables_of
 from safevar_sumo.study.schema import Tables
 
 FORMAT = 4
+"""Version number of the files' format."""
 RESULTS = 7
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
@@ -58,8 +59,6 @@ REMEDY".
 """
 LAYERS_OF_FILES = ("network", "sources")
 """Inputs that are a digest for each file; all workers must have the same files."""
-
-
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 ORIGINAL = "original"
 """Name of the original vehicle's journal."""
@@ -178,14 +177,14 @@ def identity_digest(manifest: JsonObject) -> str:
 def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
     """The differences between the inputs of stored results and other inputs.
 
-    Each is its layer of `IDENTITY`, a text, and whether it may change simulations: other search libraries and machines,
-    other versions of this package with the same `RESULTS`, and new keys of a study do not.
+    Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other search libraries,
+    other machines, other versions of this package with the same `RESULTS`, and new keys of a study do not.
     """
     for layer in IDENTITY:
         for key, before, after in _changed_values(stored.get(layer, {}), now.get(layer, {})):
             if layer in LAYERS_OF_FILES:
-                change = "no longer exists" if after is None else "is new" if before is None else "has changed since"
-                text = f"{key} {change}"
+                change = "is new" if before is None else "has changed since"
+                text = f"{key} no longer exists" if after is None else f"{key} {change}"
             else:
                 name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
                 text = f"{name} was {before!r} and is {after!r} now"
@@ -198,7 +197,7 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
 
 
 def search_extent_of(manifest: JsonObject) -> tuple[list[str], int, int]:
-    """The study keys that decide which runs, of which length, the table of solutions covers."""
+    """Algorithms, runs and evaluations of a study: they decide which solutions the table of solutions has."""
     search = manifest["study"]["search"]
     return search["algorithms"], search["runs"], search["evaluations"]
 
@@ -229,7 +228,7 @@ def read_manifest(directory: Path) -> JsonObject:
     file = directory / MANIFEST
     try:
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
-        written_by, number = manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
+        written_by, format_number = manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
     except (FileNotFoundError, NotADirectoryError):
         likely_path = Path("results") / directory.name
         hint = f"; did you mean {likely_path}?" if likely_path != directory and likely_path.is_dir() else ""
@@ -240,10 +239,10 @@ def read_manifest(directory: Path) -> JsonObject:
         raise InputError(
             file, problem, "the file as it was, or no file: the same command then writes it again"
         ) from None
-    if number != FORMAT:
+    if format_number != FORMAT:
         raise InputError(
             directory,
-            f"holds results in format {number}; this version reads format {FORMAT}",
+            f"holds results in format {format_number}; this version reads format {FORMAT}",
             f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
         )
     convert_table(file, manifest, _Manifest)
@@ -251,8 +250,8 @@ def read_manifest(directory: Path) -> JsonObject:
 
 
 def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
-    """Folders of the user code and files of a directory's study: those of the manifest that exist, then the directory's
-    two parents.
+    """Folders of the user code and files of a directory's study: those of the manifest that exist, then the nearest two
+    folders that contain the directory.
     """
     folders = [os.path.abspath(directory.resolve() / folder) for folder in manifest.get("folders", ())]
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))

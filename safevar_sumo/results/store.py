@@ -1,5 +1,5 @@
-"""The results directory of a study (same study and seed, same bytes) or of imported solutions; tables of evaluations
-and solutions.
+"""Writes results directories, of a study or of imported solutions, and makes tables of evaluations and solutions. The
+same study and seed give the same bytes.
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ class ResultsDirectory:
 def input_differences(
     directory: Path, stored: JsonObject, now: JsonObject, study: Study
 ) -> list[tuple[str, str, bool]]:
-    """The `differences` between the stored inputs of a directory's results, with files that were first read later, and
-    present inputs.
+    """The `differences` between the stored inputs of a directory's results and present inputs; with the files that user
+    code read for the first time after the study began.
     """
     later = _later_files(directory, study)
     later_now = {name: digest for name in later if (digest := digest_of(file_by_name(name, study.origin.places)))}

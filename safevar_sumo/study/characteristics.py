@@ -1,6 +1,6 @@
-"""The characteristics of a study, how they vary in the world, the constraints that they satisfy together, and the
-limits that a user sets for them: `NAME >= X` and `NAME <= X` on the command line, [limits] in a study; and the checks
-of all.
+"""The tables of a study about its characteristics, and their checks: values and domains; how characteristics vary in
+the world; constraints that they satisfy together; and limits that a user sets, under [limits] or on the command line as
+`NAME >= X` and `NAME <= X`.
 """
 
 from __future__ import annotations
@@ -140,13 +140,14 @@ def _correlation_mistakes(
     source: object, names: Sequence[str], correlations: Sequence[Correlation]
 ) -> Iterator[InputError]:
     pairs = set[frozenset[str]]()
-    for between in (correlation.between for correlation in correlations):
+    for correlation in correlations:
+        between, pair = correlation.between, frozenset(correlation.between)
         for name in between:
             if name not in names:
                 yield unknown_name(source, f"correlations.between: there is no characteristic {name!r}", name, names)
-        if between[0] == between[1] or frozenset(between) in pairs:
+        if len(pair) < len(between) or pair in pairs:
             yield InputError(source, f"correlations.between = {list(between)}", "two characteristics, each pair once")
-        pairs.add(frozenset(between))
+        pairs.add(pair)
 
 
 class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -175,7 +176,7 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
             for name, weight in self.sum.items()
         ]
-        return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))
+        return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))  # the first term has its sign without a space
 
     def unit_of(self, rows: Mapping[str, CharacteristicTable]) -> str:
         """The unit of the quantity; `rows` are the characteristics of the vehicle."""
@@ -259,8 +260,8 @@ def limits_of(
     Raises
     ------
     InputError
-        If a text is no limit or its characteristic is unknown, limits of one characteristic are double or cross, or a
-        limit is outside the domain or broken by the original.
+        If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of one characteristic
+        cross, or a limit is outside the domain or excludes the original.
     """
     typed: dict[str, Limit] = {}
     for text in texts:
@@ -274,15 +275,15 @@ def limits_of(
         typed[name] = msgspec.structs.replace(limit, **{side: float(match[3])})
     for mistake in limit_mistakes(source, rows, typed):
         raise mistake
-    both = {**(stated or {}), **typed}
-    return {name: both[name] for name in rows if name in both}
+    limits = {**(stated or {}), **typed}
+    return {name: limits[name] for name in rows if name in limits}
 
 
 def limit_mistakes(
     source: object, rows: Mapping[str, CharacteristicTable], limits: Mapping[str, Limit], table: str = ""
 ) -> Iterator[InputError]:
-    """Errors for limits of unknown characteristics, without a number, that cross, or that the domain or the original
-    breaks.
+    """Errors for limits that are of unknown characteristics, have no number, cross, are outside the domain, or exclude
+    the original.
     """
     for name, limit in limits.items():
         key = f"{table}{name}"
@@ -300,8 +301,7 @@ def limit_mistakes(
             value = getattr(limit, side)
             if value is not None and not lower <= value <= upper:
                 text = f"{key}.{side} = {value:g}" if table else f"{key} {sign} {value:g}"
-                inside = row.lower <= value <= row.upper
-                why = (
-                    f": the original, {row.original:g}{unit}, does not keep it" if inside else " is outside its domain"
-                )
+                why = " is outside its domain"
+                if row.lower <= value <= row.upper:
+                    why = f": the original, {row.original:g}{unit}, does not keep it"
                 yield InputError(source, f"{text}{why}", f"a number in [{lower:g}, {upper:g}]{unit}")

@@ -1,5 +1,5 @@
-"""Strict reading of study files, with the studies that they extend, and the user code and FMUs that they name; and
-writing of study files.
+"""Strict reading of study files, with the studies that they extend; writing of study files; and the names of the user
+code and FMUs of a study.
 """
 
 from __future__ import annotations
@@ -40,11 +40,9 @@ from safevar_sumo.study.validation import (
 WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
 SYSTEM_KEYS = ("title", "published", "repeatability")
-"""Keys for one combination of vehicle, ADS, scenario, network, weather and matrix; a study with another one does not
-inherit them.
+"""Keys that describe one combination of vehicle, ADS, scenario, network, weather and matrix: a study does not inherit
+them from a study of another combination.
 """
-
-
 SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 """First line of a written study file, by which editors find the schema on this machine."""
 
@@ -152,9 +150,7 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
 
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
-    """The tables of the study that `raw` extends, overridden by the tables of `raw`, with the folders of both
-    studies.
-    """
+    """The tables of `raw`, over those of the study that it extends, if any; with the folders of both."""
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
@@ -201,10 +197,9 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
             "title": tables.get("name", ""),
             **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides},
         }
-        if "vehicle" in changed_keys or "ads" in changed_keys:  # spread and model_error concern their parameters
-            tables = {
-                key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")
-            }
+        if "vehicle" in changed_keys or "ads" in changed_keys:
+            for key in {"spread", "model_error"} - overrides.keys():  # they concern the parameters of both
+                tables.pop(key, None)
         if omitted_keys:
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
             remarks = (
@@ -217,7 +212,7 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
 
 
 def _model_and_network(table: object) -> object:
-    """The model and network that a table names; a weather or matrix as it is."""
+    """The model and network that a table names; instead of a model, a weather or matrix itself."""
     if not isinstance(table, dict):
         return table
     parameters = table.get("parameters")
@@ -298,9 +293,8 @@ def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
         "scenario.model": [study.scenario.model, *tests],
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
+        "constraints.function": [constraint.function for constraint in study.constraints],
     }
-    functions = [constraint.function for constraint in study.constraints]
-    names_by_key["constraints.function"] = [name for name in functions if name]
     fmus = fmus_of(study)
     return [
         (key, name)

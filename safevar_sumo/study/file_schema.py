@@ -31,28 +31,27 @@ def file_schema() -> Parameters:
     del tables["Origin"], tables["Study"]["properties"]["origin"]
     tables = _for_editors(tables)
     study = tables.pop("Study")
-    complete = _requirements(study, tables)
-    vehicle = complete["properties"]["vehicle"]
-    rows = vehicle.pop("properties")
-    complete["properties"]["vehicle"] = {**vehicle, "if": FMU, "else": {"properties": rows}}
-    complete["properties"]["vehicle"]["required"].remove("characteristics")
-    complete["properties"]["vehicle"]["else"]["required"] = ["characteristics"]
-    # What a file states as a whole: elements of lists, and tables that no study refines.
-    wholes = [part for name, part in study["properties"].items() if name in WHOLE_TABLES or part.get("type") == "array"]
-    lasting = {"MatrixTest", *re.findall(r'"#/\$defs/(\w+)"', json.dumps(wholes))}
+    requirements = _requirements(study, tables)  # of a file that extends no study
+    vehicle = requirements["properties"]["vehicle"]
+    vehicle["required"].remove("characteristics")
+    vehicle["if"] = FMU
+    vehicle["else"] = {"properties": vehicle.pop("properties"), "required": ["characteristics"]}
+    # Any file states these as a whole: elements of lists, and tables that no study refines.
+    whole_parts = [
+        part for name, part in study["properties"].items() if name in WHOLE_TABLES or part.get("type") == "array"
+    ]
+    whole_tables = {"MatrixTest", *re.findall(r'"#/\$defs/(\w+)"', json.dumps(whole_parts))}
     for name, table in tables.items():
         _describe_keys(table, tables)
-        if name not in lasting:
+        if name not in whole_tables:
             table.pop("required", None)
-    # A file has the parameters of an algorithm in a table such as [search.nsga2].
+    # A file has the parameters of an algorithm in a table such as [search.nsga2], those of an ADS under [repair].
     tables["SearchTable"]["additionalProperties"] = {"type": "object", "description": "The algorithm's parameters."}
-    tables["RepairTable"]["additionalProperties"] = {
-        "$ref": "#/$defs/FreeParameter"
-    }  # and those of an ADS under [repair]
+    tables["RepairTable"]["additionalProperties"] = {"$ref": "#/$defs/FreeParameter"}
     del study["required"]
     _describe_keys(study, tables)
     study["properties"] = {"extends": EXTENDS, **study["properties"]}
-    return {"$schema": DRAFT, **study, "if": {"required": ["extends"]}, "else": complete, "$defs": tables}
+    return {"$schema": DRAFT, **study, "if": {"required": ["extends"]}, "else": requirements, "$defs": tables}
 
 
 def _for_editors(schema: Any) -> Any:
@@ -76,34 +75,32 @@ def _for_editors(schema: Any) -> Any:
 
 
 def _requirements(schema: Parameters, tables: Parameters) -> Parameters:
-    """The required keys of a table, and of the tables that must stand in it."""
+    """The required keys of a table, of the tables that must stand in it, and of its rows."""
     if "$ref" in schema:
         schema = tables[schema["$ref"].rpartition("/")[2]]
-    required = schema.get("required", [])
-    inner = {
-        name: _requirements(part, tables) for name, part in schema.get("properties", {}).items() if name in required
-    }
-    found: Parameters = {"required": list(required)} if required else {}
-    if inner := {name: part for name, part in inner.items() if part}:
-        found["properties"] = inner
+    required_keys = schema.get("required", [])
+    requirements: Parameters = {"required": list(required_keys)} if required_keys else {}
+    inner_tables = {name: _requirements(schema["properties"][name], tables) for name in required_keys}
+    if any(inner_tables.values()):
+        requirements["properties"] = {name: inner for name, inner in inner_tables.items() if inner}
     rows = schema.get("additionalProperties")
-    if isinstance(rows, dict) and (of_rows := _requirements(rows, tables)):
-        found["additionalProperties"] = of_rows
-    return found
+    if isinstance(rows, dict) and (row_requirements := _requirements(rows, tables)):
+        requirements["additionalProperties"] = row_requirements
+    return requirements
 
 
 def _describe_keys(table: Parameters, tables: Parameters) -> None:
-    """Describe each key by the parts of the record's docstring that name it, else by the docstring of its own table or
-    the record's first sentence.
+    """Describe each key: by the docstring of its own table; else by the sentences of the record's docstring that name
+    it; else by what its type says; else by the record's first sentence.
     """
     text = " ".join(table["description"].split())
-    parts = re.split(r"(?<=[.;])\s+", text)
-    for name, part in table["properties"].items():
-        about = [sentence.rstrip(";") for sentence in parts if f"`{name}`" in sentence]
-        inner = tables.get(part.get("$ref", "").rpartition("/")[2], {}).get("description")
-        part["description"] = " ".join((inner or " ".join(about) or part.get("description") or parts[0]).split())
-        if "$ref" in part:  # in draft 7 nothing counts beside a reference
-            table["properties"][name] = {"allOf": [{"$ref": part.pop("$ref")}], **part}
+    sentences = re.split(r"(?<=[.;])\s+", text)
+    for name, key in table["properties"].items():
+        of_table = tables.get(key.get("$ref", "").rpartition("/")[2], {}).get("description")
+        of_record = " ".join(sentence.rstrip(";") for sentence in sentences if f"`{name}`" in sentence)
+        key["description"] = " ".join((of_table or of_record or key.get("description") or sentences[0]).split())
+        if "$ref" in key:  # in draft 7 nothing counts beside a reference
+            table["properties"][name] = {"allOf": [{"$ref": key.pop("$ref")}], **key}
     table["description"] = text
 
 

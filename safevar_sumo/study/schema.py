@@ -33,11 +33,11 @@ Name = Annotated[
     str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")
 ]
 SAFETY_DEGREE: Final = "safety_degree"
-"""Column and key of the metric."""
+"""Column and key of the safety degree."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
 FMU_KEYS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
-"""Keys of a model's table that only FMUs use; an ADS that is no FMU has only `kind`."""
+"""Keys of a model's table that only FMUs use, except the first one: an ADS that is no FMU may have a `kind`."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
 """Keys that describe a characteristic to people; no result depends on them."""
 

@@ -28,6 +28,8 @@ MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic."""
 FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may be fitted."""
+MAX_QUOTE = 100
+"""Largest number of characters of a value that an error quotes."""
 
 
 def convert_table(source: object, raw: object, table: type[T], prefix: str = "") -> T:
@@ -51,13 +53,10 @@ def raise_mistakes(errors: Iterable[InputError]) -> None:
     if len(mistakes) == 1:
         raise mistakes[0]
     if mistakes:
-        expected = [mistake.legal for mistake in mistakes]
-        texts = [
-            f"{mistake.problem} (expected: {mistake.legal})"
-            if mistake.legal and mistake.legal not in expected[:i]
-            else mistake.problem
-            for i, mistake in enumerate(mistakes)
-        ]
+        texts, said = [], {""}
+        for mistake in mistakes:  # what several mistakes expect is said once
+            texts.append(mistake.problem + (f" (expected: {mistake.legal})" if mistake.legal not in said else ""))
+            said.add(mistake.legal)
         count = f"more than {MAX_MISTAKES}" if len(mistakes) > MAX_MISTAKES else len(mistakes)
         raise InputError(mistakes[0].source, f"{count} mistakes: {'; '.join(texts[:MAX_MISTAKES])}")
 
@@ -108,32 +107,38 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str) -> Itera
 
 
 def _leaves(error: ValidationError) -> list[ValidationError]:
-    """The errors of the alternative that a value of several alternatives belongs to, or the error itself."""
+    """The errors that say most: if one of several alternatives is meant, those within this alternative; else the error
+    itself.
+
+    The type of a value, or the tag of a table, tells which alternatives are not meant.
+    """
     tag = error.schema.get("discriminator", {}).get("propertyName")
-    unlike = ("type", "enum") if isinstance(error.instance, dict) else ("type",)
-    others = {
-        inner.schema_path[0]
+    validators_of_type = ("type", "enum") if isinstance(error.instance, dict) else ("type",)
+    excluded = {
+        inner.schema_path[0]  # the number of the alternative
         for inner in error.context
-        if (not inner.path and inner.validator in unlike) or list(inner.path) == [tag]
+        if (not inner.path and inner.validator in validators_of_type) or list(inner.path) == [tag]
     }
-    fitting = [inner for inner in error.context if inner.schema_path[0] not in others]
-    return [leaf for inner in fitting for leaf in _leaves(inner)] or [error]
+    meant = [inner for inner in error.context if inner.schema_path[0] not in excluded]
+    return [leaf for inner in meant for leaf in _leaves(inner)] or [error]
 
 
 def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str]) -> InputError:
-    """The error for an unknown key: it suggests tables of a study that have this key; then, outside of tables, also the
-    nearest key of a table, else the nearest known key.
+    """The error for an unknown key. It suggests the tables of a study that have this key; else the nearest key of its
+    own table or, for a key outside of tables, of any table.
     """
-    known_keys = [
+    keys_of_tables = [
         (field.name, known)
         for field in msgspec.structs.fields(Study)
         for known in getattr(field.type, "__struct_fields__", ())
     ]
-    homes = [f"{table}.{known}" for table, known in known_keys if known == key]
-    hint = did_you_mean(key, [*names, *(known for _, known in known_keys if key_path == key)])
-    homes = homes or [f"{table}.{known}" for table, known in known_keys if repr(known) in hint and known not in names]
-    if homes and "[" not in key_path:
-        hint = f"; did you mean {' or '.join(homes)}?"
+    suggestions = [f"{table}.{known}" for table, known in keys_of_tables if known == key]
+    hint = did_you_mean(key, [*names, *(known for _, known in keys_of_tables if key_path == key)])
+    if not suggestions:
+        nearest = [(table, known) for table, known in keys_of_tables if repr(known) in hint and known not in names]
+        suggestions = [f"{table}.{known}" for table, known in nearest]
+    if suggestions and "[" not in key_path:
+        hint = f"; did you mean {' or '.join(suggestions)}?"
     return InputError(source, f"{key_path}: there is no such key{hint}", one_of(names))
 
 
@@ -157,7 +162,7 @@ def error_with_key(source: object, error: msgspec.ValidationError, prefix: str) 
 def short_text(value: object) -> str:
     """A value as an error quotes it."""
     text = repr(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."
+    return text if len(text) <= MAX_QUOTE else f"{text[: MAX_QUOTE - 3]}..."
 
 
 def infinite_numbers(source: object, value: object, path: Sequence[str | int] = ()) -> Iterator[InputError]:
@@ -177,7 +182,9 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     for name, row in characteristics.items():
         yield from _characteristic_mistakes(source, f"vehicle.characteristics.{name}", row)
     for name, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
-        for key in FMU_KEYS if name == "scenario" else FMU_KEYS[1:] if table.kind != "fmu" else ():
+        if table.kind == "fmu" and name != "scenario":
+            continue
+        for key in FMU_KEYS if name == "scenario" else FMU_KEYS[1:]:  # an ADS may be of another kind, `traci`
             if getattr(table, key, None):
                 yield InputError(source, f"{name}.{key}: {table.model!r} is no FMU", "no such key")
     yield from variation_mistakes(source, characteristics, study.variation, study.correlations)
@@ -247,9 +254,7 @@ def missing_parameter(source: object, table: str, name: str) -> InputError:
 
 
 def contradictions_of_file(source: object, stated: Tables, tables: Tables) -> Iterator[InputError]:
-    """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its
-    study.
-    """
+    """Errors for tables that a file states itself and that do not fit the study's `tables`, with the inherited ones."""
     for table in ("calibration", "spread"):
         values = stated.get(table)
         for name in values if isinstance(values, Mapping) else ():

@@ -277,7 +277,7 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
         assert all(name in one["because"] for name in outside & set(one["changes"]))
     first, other, *_ = dict.fromkeys(one["solution"] for one in every)
     named = [one for one in every if one["solution"] in (first, other)]
-    assert asked("--solution", first, "--solutions", other) == named
+    assert asked("--solution", first, "--solution", other) == named
 
 
 @pytest.mark.slow
