@@ -33,7 +33,7 @@ class Problem:
     characteristics: CharacteristicSet
     original: Evaluations
     evaluations: int
-    population: int = 50
+    population: int
     scoring: Scoring = PUBLISHED_SCORING
     region: FeasibleRegion | None = None
 

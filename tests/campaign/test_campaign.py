@@ -4,6 +4,7 @@ evaluations.
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from pathlib import Path
 
@@ -17,10 +18,11 @@ from safevar_sumo.campaign.campaign import deal
 from safevar_sumo.campaign.pool import WorkerLostError
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.results import ResultsDirectory, load_runs
+from safevar_sumo.records import Outcome
+from safevar_sumo.results import Journal, ResultsDirectory, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
-from tests.campaign.formulas import Death, EventLog, FormulaPool, carried_out, solutions, with_search
+from tests.campaign.formulas import SUN, Death, EventLog, FormulaPool, carried_out, evaluated, solutions, with_search
 
 
 @pytest.fixture
@@ -104,6 +106,20 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
         set(pools[0].simulated) | set(pools[1].simulated)
     )
     carried_out(first, tmp_path / "out", FormulaPool(limit=0))
+
+
+@pytest.mark.parametrize("outcome", [Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR])
+def test_what_a_longer_run_found_after_its_budget_is_not_counted(outcome: Outcome, tmp_path: Path) -> None:
+    """A journal of two settings, and a run of one evaluation."""
+    head = journal_head("study", "rs-00", SUN.names)
+    journal = Journal(tmp_path / "rs-00.jsonl", head)
+    both = evaluated(np.stack([SUN.original, SUN.upper]))
+    journal.append([0, 1], dataclasses.replace(both, outcome=np.array(["stopped", outcome.value])))
+    journal.finish([0], 1, budget=1)
+    journal.close()
+    result = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), budget=1).finish()  # type: ignore[arg-type]
+    assert (result.progress.collisions, result.invalid_tests, result.failures) == (0, 0, [])
+    assert result.progress.best == both.f_safe[0]
 
 
 @pytest.mark.parametrize("workers", [1, 4])

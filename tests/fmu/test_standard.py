@@ -164,6 +164,8 @@ def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Pat
         prepared = vehicle.prepare({"power": np.array([power]), "grip": np.array([8.0])}, 1.0, 0.1)
         state = vehicle.advance(prepared, vehicle.at_rest(prepared), Command(np.ones(1), np.zeros(1)))
         np.testing.assert_allclose(state.speed[0], 10.8 * 0.1)  # the FMU computes in its own unit
+    wet = vehicle.prepare({"power": np.array([power]), "grip": np.array([8.0])}, 1.0, 0.1, wet=np.array([True]))
+    assert (prepared.inputs["wet"], wet.inputs["wet"]) == (0, 1)
     row = "power = { unit = 'kg', original = 1, lower = 0.5, upper = 2 }"
     (cart / "cart.toml").write_text(text.format(more=f"[vehicle.characteristics]\n{row}"))
     with pytest.raises(InputError, match="its unit is 'km/h/s'"):

@@ -81,6 +81,7 @@ def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
     coarse = value("tet", RUN, COARSE)
     assert coarse == pytest.approx(fine, abs=0.2)
     assert coarse / 0.2 == pytest.approx(round(coarse / 0.2))
+    assert value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=STEP)) == fine
 
 
 def test_exposure_is_undefined_on_a_collision() -> None:
@@ -215,6 +216,8 @@ def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_sec
     speed = sampled(lambda t: 20 - t**2, 3.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(2.0)
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.5)
+    short = np.array([9.0, 9.0, 8.0, 8.0])
+    assert comfort("max_jerk", short)[0] == 0, "over all of a run that is shorter than a second"
 
 
 def test_rms_agrees_with_scipys_filters() -> None:

@@ -134,8 +134,9 @@ class Mine:
             "ended in search without yielding any setting",
         ),
         (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
+        (IDLE.format(body="return iter([problem.original.settings])"), "returned the search = <list_iterator"),
     ],
-    ids=["lower", "nothing", "empty"],
+    ids=["lower", "nothing", "empty", "iterator"],
 )
 def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(
     module: str, problem: str, mine: Mine, folder: Path, tmp_path: Path

@@ -164,6 +164,7 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 def test_only_some_sections(slippery: Path) -> None:
     page = make_report([slippery], only=["reproduce", "tested"])
     assert re.findall(r'<h2 id="(.*?)">', page) == ["tested", "reproduce"]
+    assert '<th class="span"' not in page, "its table has one level of headings"
     with pytest.raises(InputError, match="no section 'risks'"):
         make_report([slippery], only=["risks"])
 

@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
 from safevar_sumo.search.baselines import _Ranges
-from safevar_sumo.search.evolution import Individual, fitness_class, run_tournament
+from safevar_sumo.search.evolution import Individual, Operators, Reproduction, fitness_class, run_tournament
 from safevar_sumo.search.genetic import choose_survivor, select_survivors
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import POPULATION, SUN, evaluated, searched, sphere
@@ -129,10 +129,17 @@ def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
     assert all(run_tournament([better, worse]) is worse for _ in range(20))
 
 
+def test_every_individual_enters_a_tournament_before_any_enters_a_second() -> None:
+    four = individuals(*[(k, k, k) for k in range(4)])
+    reproduction = Reproduction(Operators(), problem(), np.random.default_rng(1))
+    for one in four:
+        one.standing = (one[0],)
+    assert all(four[0] in reproduction._parents(four) for _ in range(20))
+
+
 def problem() -> Problem:
-    return Problem(
-        characteristics=TWO, original=evaluated(TWO, TWO.original[np.newaxis], np.array([5.0])), evaluations=1000
-    )
+    original = evaluated(TWO, TWO.original[np.newaxis], np.array([5.0]))
+    return Problem(characteristics=TWO, original=original, evaluations=1000, population=POPULATION)
 
 
 def window(settings: list[list[float]], safety: list[float]) -> Evaluations:

@@ -8,6 +8,7 @@ import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,7 +19,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import LEVEL, VEHICLES, slope_of
+from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.base import DelayedSignal
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
@@ -200,13 +201,19 @@ def test_a_slow_sensor_reports_the_past(model: str, name: str) -> None:
     assert np.allclose(gaps[200], 130.0 - 10 * 200 * STEP + 10 * latency)
 
 
+def test_a_drive_that_reaches_two_speeds_of_the_tables_has_an_acceleration() -> None:
+    """0.3 m/s in each step of 0.1 s; the tables' second speed is 0.5 m/s."""
+    assert _accelerations([0.0, 0.3, 0.6]) == pytest.approx(3.0)
+    assert not _accelerations([0.0, 0.3]).any()
+
+
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 
 
-def moving(model: str, settings: np.ndarray, speed: float, grade: float = 0.0) -> tuple[object, object]:
+def moving(model: str, settings: np.ndarray, speed: float, grade: float = 0.0, road: float = 1.0) -> tuple[object, Any]:
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = system.vehicle.prepare(values, 1.0, STEP, slope_of(np.full(len(settings), grade)))
+    prepared = system.vehicle.prepare(values, road, STEP, slope_of(np.full(len(settings), grade)))
     return prepared, system.vehicle.at_start(prepared, np.full(len(settings), speed))
 
 
@@ -214,13 +221,19 @@ def moving(model: str, settings: np.ndarray, speed: float, grade: float = 0.0) -
 @pytest.mark.parametrize(("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)])
 def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: float) -> None:
     prepared, state = moving(model, original(model), kmh / 3.6, grade)
-    before, pedals = state, Command(state.throttle, state.brake)  # type: ignore[attr-defined]
-    assert state.speed == pytest.approx(kmh / 3.6)  # type: ignore[attr-defined]
+    before, pedals = state, Command(state.throttle, state.brake)
+    assert state.speed == pytest.approx(kmh / 3.6)
     for _ in range(200):
         state = SYSTEMS[model].vehicle.advance(prepared, state, pedals)
     for name in ("speed", "wheel_speed", "engine_speed", "engine_rpm", "gear", "traction_torque"):
         if hasattr(state, name):
             assert getattr(state, name) == pytest.approx(getattr(before, name), rel=1e-12), name
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(model: str) -> None:
+    prepared, state = moving(model, original(model), 10.0, grade=12.0, road=0.03)
+    assert SYSTEMS[model].vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1))).speed < 10
 
 
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])

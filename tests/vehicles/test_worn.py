@@ -171,6 +171,12 @@ def test_a_value_outside_the_domain_is_refused(value: float) -> None:
         SUN.setting({"tireFric": -abs(value)}, "--set")
 
 
+def test_a_plausible_value_is_up_to_1000_times_the_largest_of_the_domain_and_positive_if_that_is() -> None:
+    values = np.array([1e5, 1.001e5, 0.0, -1e5])
+    assert one(0, 50, 100).is_legal(values, beyond=True).tolist() == [True, False, True, True]
+    assert one(1, 50, 100).is_legal(values, beyond=True).tolist() == [True, False, False, False]
+
+
 def test_a_change_of_just_the_threshold_is_noise() -> None:
     """Numbers that are exact in binary: 2 % of a width of 100."""
     exact = CharacteristicSet((one(0, 50, 100),))
