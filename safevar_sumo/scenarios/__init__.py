@@ -1,4 +1,4 @@
-"""Scenarios by name; and the weathers that a study can name: weather.toml beside this module, and their words."""
+"""Scenarios and weathers by name, and their words; the weathers are in weather.toml beside this module."""
 
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -33,7 +33,7 @@ SCENARIOS: Mapping[str, type] = {
 }
 
 _TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
-_PHRASES: dict[str, str] = {name: table.pop("phrase") for name, table in _TABLES.items()}
+_PHRASES: dict[str, str] = {name: table.pop("phrase") for name, table in _TABLES.items()}  # the rest is the weather
 WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
 """Weathers by name."""
 
@@ -65,8 +65,9 @@ def equals_clear(weather: Weather) -> bool:
 
 
 def weather_in_words(weather: Weather) -> str:
-    """The beginning of a sentence: the phrase of a weather of weather.toml; any other weather, of the same name too, is
-    named.
+    """The beginning of a sentence: the phrase of a weather in weather.toml, or the name of any other weather.
+
+    A weather that has the name of one in weather.toml and other effects is another weather.
     """
     return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"
 

@@ -1,6 +1,7 @@
-"""Targets ahead in the vehicle's lane: Euro NCAP's tests with a pedestrian (CPLA) or a cyclist (CBLA) who moves along
-the lane, and its rear-end tests: a car stands (CCRs), is slower (CCRm), brakes (CCRb); a motorcyclist stands (CMRs),
-brakes (CMRb).
+"""Euro NCAP's tests with a target ahead in the vehicle's lane.
+
+A pedestrian (CPLA) or a cyclist (CBLA) moves along the lane. A car stands (CCRs), is slower (CCRm) or brakes (CCRb); a
+motorcyclist stands (CMRs) or brakes (CMRb).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ FRONT_POSITION = 0.5
 junction itself.
 """
 REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
-"""Targets without a type in the traffic file, each with the type that it replaces."""
+"""Targets that have no type in the traffic file, each with the type there that it replaces."""
 FINAL_SPEED = 2.0
 """Speed at which the braking target stops braking [km/h]."""
 STEADY_SPEED_LIMIT = 80.0
@@ -89,10 +90,11 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
         direction = self.direction
         if direction == SAME_DIRECTION:
             return {}
-        frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), direction, self._body.length
-        rear = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
+        frame, length = Frame.of(roads.lane(VUT_LANE)), self._body.length
+        rear_along, rear_left = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
         entry, exit_ = (
-            (rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION)
+            (rear_along + distance * direction.along, rear_left + distance * direction.left)
+            for distance in (-length, length - FRONT_POSITION)
         )
         return change_target_lanes(frame, entry, exit_, direction)
 
@@ -104,10 +106,10 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
                 "scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead"
             )
         if direction == SAME_DIRECTION:
-            old = REPLACED_TYPES.get(name, name)
+            replaced = REPLACED_TYPES.get(name)
             return {
                 **self._vehicle_at(START_POSITION),
-                **({f"vType[@id='{old}']": target_type(name)} if old != name else {}),
+                **({f"vType[@id='{replaced}']": target_type(name)} if replaced else {}),
                 "vehicle[@id='target']": {
                     "type": name,
                     "departPos": repr(START_POSITION + self.gap + self._body.length),
@@ -115,10 +117,10 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
                     "departSpeed": repr(self.target_speed_at(0.0)),
                 },
             }
-        along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
+        exit_along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
         rotated = {"type": name, "route": "beyond", "departPos": repr(FRONT_POSITION)}
         return {
-            **self._vehicle_at(along + FRONT_POSITION * direction.along - self._depth - self.gap),
+            **self._vehicle_at(exit_along + FRONT_POSITION * direction.along - self._depth - self.gap),
             **{f"vehicle[@id='parked_{size}']": None for size in ("small", "large")},
             "vType[@id='target']": target_type(name),
             "vehicle[@id='target']": {**rotated, "departPosLat": "0", "departSpeed": "0"},
@@ -142,8 +144,8 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
         if self.direction == SAME_DIRECTION:
             return length
         front, rear = (length * along, length * left - self.offset), (0.0, -self.offset)
-        ends = ((rear, 1), (rear, -1), (front, -1), (front, 1))
-        corners = [(x - sign * left * (width / 2), y + sign * along * (width / 2)) for (x, y), sign in ends]
+        ends_and_sides = ((rear, 1), (rear, -1), (front, -1), (front, 1))  # 1 is the left side; once around the body
+        corners = [(x - side * left * (width / 2), y + side * along * (width / 2)) for (x, y), side in ends_and_sides]
         return front[0] - _first_contact_position(corners, self.vut_width / 2)
 
     def encounter(self, trace: Trace) -> Encounter:
@@ -164,9 +166,9 @@ def _first_contact_position(corners: list[Coordinates], half_width: float) -> fl
     positions = [x for x, y in corners if abs(y) <= half_width]
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
         positions += [
-            x + (to_x - x) * (edge - y) / (to_y - y)
-            for edge in (-half_width, half_width)
-            if (y - edge) * (to_y - edge) < 0
+            x + (to_x - x) * (path_edge - y) / (to_y - y)
+            for path_edge in (-half_width, half_width)
+            if min(y, to_y) < path_edge < max(y, to_y)
         ]
     return min(positions or [x for x, _ in corners])
 
@@ -206,7 +208,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     network: str = "along"
 
     def obstacle(self) -> str:
-        """The target, which moves in the vehicle's direction."""
+        """The target, which is ahead."""
         return f"{super().obstacle()} ahead"
 
     @property
@@ -216,7 +218,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def gap(self) -> float:
-        """Gap that has closed at the time to impact [m]."""
+        """Gap to the target at the start, which closes in the time to impact [m]."""
         return self.test_speed * self.time_to_impact - self._profile.travelled(self.time_to_impact)
 
     @property
@@ -327,11 +329,12 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
                     "scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target"
                 )
             return gap / closing_speed
-        remaining_gap = gap - closing_speed * self.brakes_at
-        if remaining_gap <= 0:
+        gap_at_braking = gap - closing_speed * self.brakes_at
+        if gap_at_braking <= 0:
             return gap / closing_speed
         b, speed_lost = self.target_deceleration, self._target_speed - self.target_speed_at(math.inf)
-        gap_closed = (closing_speed + speed_lost / 2) * speed_lost / b
-        if remaining_gap > gap_closed:
-            return self.brakes_at + speed_lost / b + (remaining_gap - gap_closed) / (closing_speed + speed_lost)
-        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * remaining_gap) - closing_speed) / b
+        closed_by_braking = (closing_speed + speed_lost / 2) * speed_lost / b
+        if gap_at_braking > closed_by_braking:
+            gap_after_braking = gap_at_braking - closed_by_braking
+            return self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
+        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking) - closing_speed) / b

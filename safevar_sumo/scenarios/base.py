@@ -1,4 +1,4 @@
-"""The contract of a scenario (its actors and the geometry of the encounter), and the guard of a user's scenario."""
+"""The contract of a scenario, its actors and the geometry of the encounter; and the guard of a user's scenario."""
 
 from __future__ import annotations
 
@@ -42,6 +42,7 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     """The lane `name`, whose centre line goes through these points [m]."""
     (x, y), (to_x, to_y) = points[0], points[-1]
     length = math.hypot(to_x - x, to_y - y)
+    # The largest distance of a point from the line through the first and the last point:
     bend = max(
         abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
         for at_x, at_y in points
@@ -58,7 +59,7 @@ MAX_SKEW = 0.05
 
 
 class Frame(NamedTuple):
-    """Origin [m] and direction, a unit vector, of a straight lane."""
+    """The coordinates of a straight lane: their origin [m], and the lane's direction, a unit vector."""
 
     origin: Coordinates
     direction: Coordinates
@@ -80,8 +81,8 @@ class Frame(NamedTuple):
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
-        """A frame with the network's origin and the lane's direction; if the lane leads east, coordinates keep their
-        exact values.
+        """A frame with the lane's direction and the network's origin: a lane that leads east has exactly the network's
+        coordinates.
         """
         return cls((0.0, 0.0), cls.of(lane).direction)
 
@@ -108,7 +109,8 @@ class Frame(NamedTuple):
         InputError
             If the other lane does not cross it at right angles.
         """
-        start, end = (self.lane_coordinates(point)[0] for point in roads.lane(lane)[:2])
+        crossing = roads.lane(lane)
+        start, end = (self.lane_coordinates(point)[0] for point in (crossing.start, crossing.end))
         if abs(end - start) > MAX_SKEW:
             problem = f"lane {lane!r} leads {abs(end - start):.2f} m along the road"
             raise InputError(NETWORK_KEY, problem, "a crossing at right angles")
@@ -207,7 +209,7 @@ class Scenario:
     reactive_actors: bool = True
     grade: float = 0.0
     centre_to_centre: bool = False
-    # Type checkers see properties, so that a scenario may have a field or a property; only two of them have defaults.
+    # A scenario may have fields or properties of these names: type checkers see properties. `duration` has no default.
     if TYPE_CHECKING:
 
         @property
@@ -254,9 +256,7 @@ SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
 
 
 class Point(NamedTuple):
-    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's other
-    points.
-    """
+    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's others."""
 
     scenario: Scenario
     weather: Weather
@@ -334,7 +334,7 @@ class GuardedScenario(Scenario):
         changes = self._guard.call(method, function, roads)
         if not isinstance(changes, Mapping):
             raise self._guard.wrong_value(method, "changes", changes, "a mapping from XPaths to attributes")
-        return {
+        return {  # None, which removes an element, stays None
             path: change and {name: str(value) for name, value in change.items()} for path, change in changes.items()
         }
 
@@ -356,8 +356,8 @@ class GuardedScenario(Scenario):
         for name, values in zip(Encounter._fields, encounter, strict=True):
             if np.isnan(values[is_counted]).any():
                 raise self._guard.wrong_value("encounter", name, float("nan"), "numbers wherever in_conflict is true")
-        least = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
-        if (is_counted.any(axis=0) & (least == np.inf)).any():
+        least_separation = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
+        if (is_counted.any(axis=0) & (least_separation == np.inf)).any():
             raise self._guard.wrong_value(
                 "encounter", "separation", float("inf"), "a finite number at some time that in_conflict is true"
             )

@@ -24,7 +24,7 @@ LEADS = (1.5, 2.0)
 later.
 """
 BESIDE = (-50.0, -40.0)
-"""Places beside the vehicle's path [% of the width from its left corner]: the pedestrian walks there, or drives by."""
+"""Places beside the vehicle's path where a target moves along [% of the vehicle's width from its left corner]."""
 LANE_WIDTH = 3.5
 """Distance of the next lane [m]."""
 HEADWAYS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
@@ -70,13 +70,14 @@ def benign_points(points: Iterable[Point]) -> list[Point]:
     """Benign scenes for the shipped scenarios at these points, in the points' weathers; none for other scenarios."""
     scenes = dict[str, Point]()
     for point in points:
-        for name, scenario in _scenes_like(point.scenario):
-            scenes.setdefault(f"{name}, {point.weather.name}", point._replace(scenario=scenario, name=name))
-    return [point._replace(name=name, parameters=()) for name, point in scenes.items()]
+        for description, scenario in _scenes_like(point.scenario):
+            name = f"{description}, {point.weather.name}"
+            scenes.setdefault(name, Point(scenario, point.weather, name))
+    return list(scenes.values())
 
 
 def _scenes_like(scenario: Scenario) -> Iterable[tuple[str, Scenario]]:
-    """Benign scenes like a scenario, by name."""
+    """Benign scenes like a scenario, each with a description."""
     if isinstance(scenario, Crossing) and scenario.is_on_foot:
         base = asdict(replace(scenario, impact_location=50.0))
         row = f"{scenario.test}, {scenario.speed:g} km/h"
@@ -90,13 +91,14 @@ def _scenes_like(scenario: Scenario) -> Iterable[tuple[str, Scenario]]:
             yield name, replace(scenario, impact_location=place)
     if isinstance(scenario, Crossing | Along | CarToCar):
         length, width = scenario.vut_length, scenario.vut_width
-        for headway in HEADWAYS[::4] if isinstance(scenario, Crossing | Along) else HEADWAYS:
+        # Every fourth headway is enough where the scenes above differ more from each other.
+        for headway in HEADWAYS if isinstance(scenario, CarToCar) else HEADWAYS[::4]:
             name = f"{scenario.speed:g} km/h, a car in the next lane {headway:g} s ahead"
             yield name, NextLane(speed=scenario.speed, headway=headway, vut_length=length, vut_width=width)
     if isinstance(scenario, LeadVehicleStopped):
         for speed, headway in product(CITY_SPEEDS, HEADWAYS):
             yield f"{speed:g} km/h, a car in the next lane {headway:g} s ahead", NextLane(speed=speed, headway=headway)
     if isinstance(scenario, PedestrianCrossing):
-        walk = replace(Crossing(test="CPNA"), target_speed=WALKING_SPEED, time_to_impact=7.0)
-        for side, speed in product((walk, replace(walk, test="CPFA")), SLOW_SPEEDS):
-            yield from _scenes_like(replace(side, speed=speed))
+        from_near_side = Crossing(test="CPNA", target_speed=WALKING_SPEED, time_to_impact=7.0)
+        for walk, speed in product((from_near_side, replace(from_near_side, test="CPFA")), SLOW_SPEEDS):
+            yield from _scenes_like(replace(walk, speed=speed))

@@ -46,6 +46,8 @@ PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 PARKED_WIDTH = 1.8
 TIME_TO_IMPACT = 6.0
 """Time from the start to the impact, unless the target needs longer [s]."""
+LEAST_DISTANCE = 1e-9
+"""Lower bound of a distance that is a divisor [m]."""
 ROUNDING_STEP = 0.5
 """A time to impact above `TIME_TO_IMPACT` is rounded up to a multiple of this step [s]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
@@ -86,12 +88,9 @@ class _Start(NamedTuple):
         InputError
             If the target cannot reach the impact location in time.
         """
-        target, lateral_start, speed = (
-            test.parameter("target"),
-            test.parameter("lateral_start"),
-            test.parameter("target_speed") * KMH,
-        )
-        sign = 1.0 if test.parameter("side") == "near" else -1.0
+        target, lateral_start = test.parameter("target"), test.parameter("lateral_start")
+        speed = test.parameter("target_speed") * KMH
+        sign = 1.0 if test.parameter("side") == "near" else -1.0  # 1 for a target that moves to the left
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         direction = (FROM_RIGHT if sign > 0 else FROM_LEFT).turned(test.heading)
         if lateral_start is None:
@@ -102,10 +101,8 @@ class _Start(NamedTuple):
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
             distance, profile = speed * time, SpeedProfile(begin=0.0, speed=speed, run_up=0.0)
         else:
-            distance, run_up = (
-                (lateral_start + impact_lateral) * test.start_share,
-                test.parameter("acceleration_distance"),
-            )
+            distance = (lateral_start + impact_lateral) * test.start_share
+            run_up = test.parameter("acceleration_distance")
             shortest_time = (distance + run_up) / speed
             time = test.time_to_impact or float(
                 max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP)
@@ -120,8 +117,7 @@ class _Start(NamedTuple):
 
 
 class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A target crosses the lane ahead of the moving vehicle, timed so that it is hit at the impact location if nobody
-    brakes.
+    """A target crosses the lane ahead of the moving vehicle, and is hit at the impact location if nobody brakes.
 
     Parameters
     ----------
@@ -236,13 +232,13 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         """The parked cars beside the lane, if any."""
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
-        start, left = frame.lane_coordinates(roads.lane(KERB_LANE).start)
-        changes, across = dict[str, dict[str, str]](), self._parked_edge - PARKED_WIDTH / 2 - left
-        end = impact_position - PARKED_GAP - start
+        kerb_start, kerb_left = frame.lane_coordinates(roads.lane(KERB_LANE).start)
+        changes, offset = dict[str, dict[str, str]](), self._parked_edge - PARKED_WIDTH / 2 - kerb_left
+        front = impact_position - PARKED_GAP - kerb_start  # of the car nearer to the target's path
         for car, length in PARKED_LENGTH.items():
-            changes[f"vehicle[@id='{car}']"] = {"departPos": repr(end), "departPosLat": repr(across)}
-            changes[f"vehicle[@id='{car}']/stop"] = {"endPos": repr(end)}
-            end -= length + PARKED_GAP
+            changes[f"vehicle[@id='{car}']"] = {"departPos": repr(front), "departPosLat": repr(offset)}
+            changes[f"vehicle[@id='{car}']/stop"] = {"endPos": repr(front)}
+            front -= length + PARKED_GAP
         return changes
 
     def _motion(self, world: World) -> TargetMotion:
@@ -262,15 +258,10 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
             along, left = start.mover.middle(frame, positions)
             lateral = left if direction.left > 0 else -left
             ahead = np.zeros_like(left) if along is None else along - impact_position
-            return Target(
-                impact_position - extent.length / 2 + ahead,
-                lateral,
-                is_clear=lateral > (self.vut_width + extent.width) / 2,
-                speed=value_at(times, lambda time: direction.along * profile.speed_at(time))
-                if direction.along
-                else 0.0,
-                ahead=ahead,
-            )
+            is_clear = lateral > (self.vut_width + extent.width) / 2
+            speed = value_at(times, lambda time: direction.along * profile.speed_at(time)) if direction.along else 0.0
+            edge = impact_position - extent.length / 2 + ahead
+            return Target(edge, lateral, is_clear=is_clear, speed=speed, ahead=ahead)
 
         return TargetMotion(frame, constants, start.mover, target)
 
@@ -286,7 +277,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return Encounter(
             separation=distance,
             distance=distance,
-            closing_speed=approach / np.maximum(distance, 1e-9),
+            closing_speed=approach / np.maximum(distance, LEAST_DISTANCE),
             in_conflict=trace.gap > -extent.length - self.vut_length,
         )
 

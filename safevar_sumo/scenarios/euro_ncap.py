@@ -1,5 +1,6 @@
-"""What scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026) share: their table,
-targets, directions, and how targets move in SUMO.
+"""Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026): what their scenarios share.
+
+It is the protocol's table, targets and their directions, and how targets move in SUMO.
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -29,8 +30,6 @@ KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
 VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 """Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
-
-
 ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
 """Point on or beside the vehicle's front [% of its width]."""
 Heading = Annotated[float, Meta(ge=-30, le=30)]
@@ -60,8 +59,6 @@ SHAPES = {
     "car": "evehicle",
 }
 """Shapes that sumo-gui draws for the targets; SUMO does not cut off the corners of these shapes."""
-
-
 TARGET_TOP_SPEED = "70"
 """Highest speed of a target [m/s]."""
 
@@ -73,8 +70,9 @@ class Direction(NamedTuple):
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction turned counterclockwise by `heading` [degrees]; rounded, as sines differ between machines in
-        the last bits.
+        """The direction turned counterclockwise by `heading` [degrees].
+
+        Sine and cosine are rounded, as their last bits differ between machines.
         """
         cosine, sine = (round(function(math.radians(heading)), 12) for function in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
@@ -94,21 +92,18 @@ VUT_LANE = "approach_0"
 """The vehicle's lane before the junction."""
 ENTRY_LANE, JUNCTION_LANE, EXIT_LANE = "across_0", ":junction_0_0", "across_on_0"
 """The target's lanes: before the junction, on it, and beyond."""
-
-
 TARGET_LANE_LENGTH = 300.0
 """Length of the target's lanes before the junction and beyond it [m]."""
 
 
 def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction) -> XmlChanges:
-    """Changes for straight lanes of the target in a direction: `entry` to `exit_` on the junction, and the lanes before
-    and after it.
+    """Changes that make the target's lanes straight in a direction, from `entry` to `exit_` on the junction.
 
-    Points are given along the vehicle's lane and to its left [m].
+    These points are distances along the vehicle's lane and to its left [m].
     """
     begin, end = (
-        (x + sign * TARGET_LANE_LENGTH * direction.along, y + sign * TARGET_LANE_LENGTH * direction.left)
-        for (x, y), sign in ((entry, -1), (exit_, 1))
+        (along + distance * direction.along, left + distance * direction.left)
+        for (along, left), distance in ((entry, -TARGET_LANE_LENGTH), (exit_, TARGET_LANE_LENGTH))
     )
     return {
         f"edge/lane[@id='{lane}']": {
@@ -143,8 +138,8 @@ class TestRow(NamedTuple):
     target_speed, acceleration_distance
         Speed of the target [km/h] and distance within which it reaches that speed [m].
     side, lateral_start, hidden
-        Of a crossing target: where it starts [m], at its full speed without a `lateral_start`; and whether parked cars
-        hide it.
+        Of a crossing target: where it starts [m], and whether parked cars hide it. A target without a `lateral_start`
+        starts at its full speed.
     headway
         Of a car or motorcyclist ahead: time headway at the start [s].
     """
@@ -164,6 +159,7 @@ class TestRow(NamedTuple):
 
 _NARROW, _WIDE = (50.0, 10.0, 25.0, 75.0, 90.0), (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0)
 TESTS = {
+    # target, pre-crash type, slowest, fastest, locations, target speed, acceleration distance, side, lateral start
     "CPFA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 8.0, 1.5, "far", 6.0),
     "CPNA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 5.0, 1.0, "near", 4.0),
     "CPNCO": TestRow("child", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 5.0, 1.0, "near", 4.0, hidden=True),
@@ -194,17 +190,18 @@ class SpeedProfile(NamedTuple):
 
     @classmethod
     def with_arrival(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
-        """The profile that covers `distance` [m] by `time` [s]; past the run-up, distance = speed * (time - begin) -
-        run_up.
+        """The profile that covers `distance` [m] by `time` [s].
+
+        Past the run-up, distance = speed * (time - begin) - run_up.
         """
         if distance < run_up:
             raise InputError(
                 "scenario.parameters",
                 f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m",
             )
-        begin = time - (distance + run_up) / speed
+        shortest_time = (distance + run_up) / speed
+        begin = time - shortest_time
         if begin < 0:
-            shortest_time = (distance + run_up) / speed
             raise InputError(
                 "scenario.parameters",
                 f"the target needs {shortest_time:.2f} s to the impact and has {time:g} s",
@@ -215,7 +212,7 @@ class SpeedProfile(NamedTuple):
     def travelled(self, time: float) -> float:
         """Distance covered [m] at a time [s]."""
         elapsed = max(time - self.begin, 0.0)
-        if not self.run_up or elapsed >= 2 * self.run_up / self.speed:
+        if elapsed >= 2 * self.run_up / self.speed:  # the run-up takes twice the time that it would take at full speed
             return self.speed * elapsed - self.run_up
         return self.speed * self.speed / (4 * self.run_up) * elapsed * elapsed
 
@@ -224,29 +221,29 @@ class SpeedProfile(NamedTuple):
         elapsed = time - self.begin
         if elapsed < 0:
             return 0.0
-        if not self.run_up or elapsed >= 2 * self.run_up / self.speed:
+        if elapsed >= 2 * self.run_up / self.speed:
             return self.speed
         return self.speed * self.speed / (2 * self.run_up) * elapsed
 
 
 def lateral_offset(location: float, width: float) -> float:
-    """Distance of an impact location from the front's middle [m]; below 0 on the side from which `location` counts [%
-    of `width`].
+    """Distance of an impact location [% of `width`] from the middle of the front [m].
+
+    It is below 0 on the side from which `location` counts.
     """
     return (location / 100 - 0.5) * width
 
 
 WALK_EDGES = {1.0: ("footpath", "footpath_on"), -1.0: ("footpath_on", "footpath")}
-"""Edges that a pedestrian walks on, in this order; the key is 1.0 for a walk to the left of the vehicle, -1.0 to the
-right.
-"""
+"""Edges that a pedestrian walks on, in this order, to the left of the vehicle (key 1.0) or to its right (-1.0)."""
 STOP_DISTANCE = 5.0
 """Distance past the middle of the lane at which a pedestrian stops [m]."""
 
 
 class PersonMover(NamedTuple):
-    """A pedestrian who walks to the left (`sign` 1) or right (-1); `start` is the position in this direction from the
-    lane's middle, `stop` the position at which the pedestrian stops [m].
+    """A pedestrian who walks to the left (`sign` 1) or right (-1), from the position `start` to `stop` [m].
+
+    Positions are distances from the lane's middle in the direction of the walk.
     """
 
     target: str
@@ -269,7 +266,7 @@ class PersonMover(NamedTuple):
         """The pedestrian beside the lane, `distance` metres before the impact."""
         edges = WALK_EDGES[self.sign]
         for lane in (CROSSING_LANE, *(f"{edge}_0" for edge in edges)):
-            frame.crossing_position(roads, lane)
+            frame.crossing_position(roads, lane)  # raises if it does not cross at right angles
         path, half_length = roads.lane(f"{edges[0]}_0"), BODIES[self.target].length / 2
         ends = [self.sign * frame.lane_coordinates(point)[1] for point in (path.start, path.end)]
         front = half_length + self.start
@@ -278,7 +275,9 @@ class PersonMover(NamedTuple):
             expected = f"a number in [{half_length - max(ends):.2f}, {half_length - min(ends):.2f}] m"
             raise InputError("scenario.parameters", problem, expected)
         person = {"type": self.target, "departPos": repr(abs(front - ends[0]))}
-        walk = {"edges": " ".join(edges), "speed": repr(self.profile.speed), "arrivalPos": repr(-int(self.sign))}
+        # One metre before the end of the last edge (-1); a walk to the right goes along it backwards, to metre 1.
+        arrival_position = -int(self.sign)
+        walk = {"edges": " ".join(edges), "speed": repr(self.profile.speed), "arrivalPos": repr(arrival_position)}
         return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
 
     @property
@@ -291,8 +290,9 @@ class PersonMover(NamedTuple):
         return world.person_positions(PEDESTRIAN)
 
     def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Position of the target's middle along the lane (None: the impact position) and to the left [m], from
-        `positions` of the front.
+        """Position of the target's middle along the lane and to its left [m], from `positions` of the front.
+
+        The first is None: a pedestrian is always at the impact position along the lane.
         """
         return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
 
@@ -320,11 +320,10 @@ class VehicleMover(NamedTuple):
         if self.direction == FROM_RIGHT:
             return {}
         lane = roads.lane(JUNCTION_LANE)
-        (along, entry), (_, exit_) = frame.lane_coordinates(lane.start), frame.lane_coordinates(lane.end)
-        (forward, left), half = self.direction, (exit_ - entry) / 2
-        return change_target_lanes(
-            frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction
-        )
+        along, start_left = frame.lane_coordinates(lane.start)
+        _, end_left = frame.lane_coordinates(lane.end)
+        ahead, leftward = ((end_left - start_left) / 2 * component for component in self.direction)
+        return change_target_lanes(frame, (along - ahead, -leftward), (along + ahead, leftward), self.direction)
 
     def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
@@ -335,9 +334,10 @@ class VehicleMover(NamedTuple):
 
     def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float) -> XmlChanges:
         """The target on its lane, `distance` metres before the impact."""
-        lane, (forward, left) = roads.lane(ENTRY_LANE), self.direction
+        lane = roads.lane(ENTRY_LANE)
         lane_start = self._along(frame, lane.start)
-        impact_on_path = self.impact_position(frame, roads, impact_left) * forward + impact_left * left
+        impact_along = self.impact_position(frame, roads, impact_left)
+        impact_on_path = impact_along * self.direction.along + impact_left * self.direction.left
         front = impact_on_path - lane_start - distance + BODIES[self.target].length / 2
         length = self._along(frame, lane.end) - lane_start
         if not 0 < front <= length:
@@ -355,7 +355,7 @@ class VehicleMover(NamedTuple):
             },
         }
 
-    def _along(self, frame: Frame, point: tuple[float, float]) -> float:
+    def _along(self, frame: Frame, point: Coordinates) -> float:
         """Position of a point along the target's direction [m]."""
         along, left = frame.lane_coordinates(point)
         return along * self.direction.along + left * self.direction.left
@@ -370,11 +370,10 @@ class VehicleMover(NamedTuple):
         return world.vehicle_positions(TARGET)
 
     def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Position of the target's middle along the lane and to the left [m], from `positions` of the front."""
+        """Position of the target's middle along the lane and to its left [m], from `positions` of the front."""
         half_length = BODIES[self.target].length / 2
-        return frame.along(positions) - self.direction.along * half_length, frame.left(
-            positions
-        ) - self.direction.left * half_length
+        along = frame.along(positions) - self.direction.along * half_length
+        return along, frame.left(positions) - self.direction.left * half_length
 
     def next_speed(self, sample: int, step: float) -> float:
         """Speed at the end of the coming step [m/s]."""

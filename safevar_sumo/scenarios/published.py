@@ -1,6 +1,4 @@
-"""The scenarios of the published study: a pedestrian walks into the lane; both lanes ahead are blocked by parked
-vehicles.
-"""
+"""The two scenarios of the published study: a pedestrian walks into the lane; parked vehicles block both lanes."""
 
 from __future__ import annotations
 
@@ -28,8 +26,16 @@ Positive = Annotated[float, Meta(gt=0, le=3600)]
 
 
 class _Memory(NamedTuple):
-    """The lane's frame; positions of the vehicle's front at which the conflict begins and ends, and the pedestrian's
-    last lateral position [m]; whether the pedestrian has turned round.
+    """What the scenario remembers of a run.
+
+    Attributes
+    ----------
+    frame
+        Frame of the vehicle's lane.
+    conflict_point, clear_point
+        Positions of the vehicle's front at which the conflict begins and ends [m].
+    last_lateral, has_turned
+        The pedestrian's last lateral position [m], shape (N,), and whether the pedestrian has turned round.
     """
 
     frame: Frame
@@ -84,14 +90,15 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         vehicle_positions = world.vehicle_positions(VUT)
         lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle_positions)
         lateral_speed = (lateral - memory.last_lateral) / step
-        goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
-        if goes_past and not memory.has_turned:
+        # The pedestrian does the same in all copies, so the first stands for all.
+        turns_now = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
+        if turns_now and not memory.has_turned:
             world.turn_back(PEDESTRIAN)
             memory = memory._replace(has_turned=True)
         front = memory.frame.along(vehicle_positions)
-        has_left_lane = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
-        gap, over = memory.conflict_point - front, has_left_lane | (front > memory.clear_point)
-        return Scene(gap, lateral, lateral_speed, over), memory._replace(last_lateral=lateral)
+        moves_away = lateral * lateral_speed > 0
+        over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)
+        return Scene(memory.conflict_point - front, lateral, lateral_speed, over), memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's
@@ -147,7 +154,7 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         frame, parked_rear = memory
         gap = parked_rear - frame.along(world.vehicle_positions(VUT))
         zeros = np.zeros_like(gap)
-        return Scene(gap, zeros, zeros, zeros > 0), memory  # never over
+        return Scene(gap, zeros, zeros, over=zeros > 0), memory  # never over
 
     def encounter(self, trace: Trace) -> Encounter:
         """Safety degree: distance between the centres of two vehicles of equal length; TTC = gap / v (docs/method.md,

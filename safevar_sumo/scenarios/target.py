@@ -1,7 +1,6 @@
-"""A target that does not react to the vehicles under test: the common part of Euro NCAP's scenarios.
+"""The common part of Euro NCAP's scenarios: a target that does not react to the vehicles under test.
 
-As the target's motion does not depend on the vehicles, it is computed once per recorded scene, at all samples, for
-thousands of vehicles.
+Its motion is therefore computed once per recorded scene, at all samples, for thousands of vehicles.
 """
 
 from __future__ import annotations
@@ -26,9 +25,7 @@ from safevar_sumo.scenarios.euro_ncap import (
 )
 
 APPROACH_SPEED = 0.5
-"""Closing speed above which a vehicle approaches a target ahead [m/s]; if it is later no longer faster, it has avoided
-the target.
-"""
+"""Closing speed above which a vehicle approaches a target ahead [m/s]; once it is not faster, it has avoided it."""
 PARKED_GAP = 1.0
 """Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars
 [m].
@@ -39,8 +36,7 @@ Quantity = FloatArray | float
 
 
 class Target(NamedTuple):
-    """Position and speed of a target: numbers, or arrays of shape (M,), either of M copies at one time or of one target
-    at M samples.
+    """Position and speed of a target: numbers, or arrays of shape (M,), of M copies at one time or at M samples.
 
     - `edge`: position along the lane of the side of the target's body that vehicles reach first [m]
     - `lateral`, `lateral_speed`: as in `Scene` [m, m/s]
@@ -97,8 +93,18 @@ class TargetMotion(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """The target's motion, last lateral position [m], and speed set last [m/s]; the number of samples; which vehicles
-    have approached.
+    """What the scenario remembers of a run.
+
+    Attributes
+    ----------
+    motion
+        The target's motion.
+    last_lateral, last_speed
+        The target's last lateral position [m], and the speed that it was last set to [m/s].
+    sample
+        Number of the current sample.
+    approached
+        Which vehicles have approached the target, shape (N,).
     """
 
     motion: TargetMotion
@@ -109,7 +115,7 @@ class Memory(NamedTuple):
 
 
 class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario of the protocol, whose target does not react; its parameters are those that all of them have.
+    """Base of the protocol's scenarios, with the parameters that all of them have.
 
     Parameters
     ----------
@@ -154,16 +160,16 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
-        row, location = TESTS[self.test], self.impact_location
-        tested, legal = f"{row.slowest:g} to {row.fastest:g} km/h", ", ".join(f"{each:g}" for each in row.locations)
-        remarks = {
-            f"speed = {self.speed:g} km/h is outside the protocol's {tested}": not row.slowest
-            <= self.speed
-            <= row.fastest,
-            f"impact_location = {location:g} % is none of the protocol's {legal} %": location not in row.locations,
-            f"grade = {self.grade:g} %, and the protocol's road is level": self.grade,
-        }
-        return [f"{self.test}: {remark}" for remark, applies in remarks.items() if applies]
+        row, remarks = TESTS[self.test], []
+        if not row.slowest <= self.speed <= row.fastest:
+            tested = f"{row.slowest:g} to {row.fastest:g} km/h"
+            remarks.append(f"speed = {self.speed:g} km/h is outside the protocol's {tested}")
+        if self.impact_location not in row.locations:
+            tested = ", ".join(f"{location:g}" for location in row.locations)
+            remarks.append(f"impact_location = {self.impact_location:g} % is none of the protocol's {tested} %")
+        if self.grade:
+            remarks.append(f"grade = {self.grade:g} %, and the protocol's road is level")
+        return [f"{self.test}: {remark}" for remark in remarks]
 
     def _vehicle_at(self, front: float) -> XmlChanges:
         """The vehicle under test with its front at a position on its lane [m], at its speed."""
@@ -197,14 +203,16 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return memory._replace(sample=memory.sample + 1, last_speed=speed)
 
     def at_all_samples(self, world: World, step: float) -> tuple[TargetMotion, Target, BoolArray]:
-        """The target's motion in a recorded scene, whose T samples are the T copies of `world`; the target at each, and
-        whether it is not on the road.
+        """The target's motion in a recorded scene; the target at each of T samples, and whether it is not on the road.
+
+        The T copies of `world` are the samples. A target that has left the road stays where it was last.
         """
         motion = self._motion(world)
         positions = motion.mover.positions(world)
+        samples = np.arange(len(positions))
         is_absent = np.isnan(positions[:, 0])
-        positions = positions[np.maximum.accumulate(np.where(is_absent, 0, np.arange(len(positions))))]
-        target = motion.target(positions, [sample * step for sample in range(len(positions))])
+        last_present = np.maximum.accumulate(np.where(is_absent, 0, samples))
+        target = motion.target(positions[last_present], [sample * step for sample in samples.tolist()])
         last_lateral = np.concatenate([target.lateral[:1], target.lateral[:-1]])
         return motion, target._replace(lateral_speed=(target.lateral - last_lateral) / step), is_absent
 
@@ -215,10 +223,8 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 def scene_of(
     constants: EncounterConstants, target: Target, front: FloatArray, speed: FloatArray, approached: BoolArray
 ) -> tuple[Scene, BoolArray]:
-    """The scene of N vehicles, and which of them have approached; `front` is their fronts' position along the lane
-    [m].
-    """
-    gap, zeros = target.edge - front, np.zeros_like(front)
+    """The scene of N vehicles, and which of them have approached; `front` is where their fronts are on the lane [m]."""
+    gap, zeros = target.edge - front, np.zeros_like(front)  # a number plus zeros has shape (N,)
     over = np.asarray(target.is_clear | (gap < constants.passed_gap))
     if constants.follows is not False:
         approached = approached | (speed - target.speed > APPROACH_SPEED)
@@ -235,6 +241,7 @@ def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> 
     """
     to_middle = gap + constants.edge_to_middle + constants.setback
     to_corner = to_middle - target.ahead - PARKED_GAP
+    # The line is `-lateral * to_corner / to_middle` from the lane's middle where it passes the car's corner.
     is_free = (to_corner <= 0) | (-target.lateral * to_corner < constants.parked_offset * to_middle)
     return np.asarray(~np.asarray(constants.hidden) | is_free)
 
