@@ -1,6 +1,4 @@
-"""Vehicle models by name, and their characteristics; and the calibration drive of the original vehicle, for the
-throttle and brake controller of an ADS.
-"""
+"""Vehicle models by name; and the calibration drive of the original vehicle, from which an ADS knows its pedals."""
 
 from collections.abc import Mapping
 from functools import cache, lru_cache, partial
@@ -34,7 +32,6 @@ from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {"carla": Carla, "lgsvl": Lgsvl, "sumo": SumoVehicle, "worn": WornVehicle}
 
-
 DRY_ROAD_FRICTION, STEP = 1.0, 0.1  # -, s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
 LONGEST_DRIVE = 60.0  # s
@@ -62,20 +59,21 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     rest = vehicle.at_rest(prepared)
 
     def drive(state: VehicleState, throttle: float, brake: float) -> tuple[list[float], VehicleState]:
-        """The speed after each step [m/s], until it leaves the range of the tables, and the last state."""
+        """The speed after each step [m/s], until it leaves the range of the tables; and the last state."""
         speeds = [float(state.speed[0])]
         command = Command(np.full(1, throttle), np.full(1, brake))
         for _ in range(round(LONGEST_DRIVE / STEP)):
             state = vehicle.advance(prepared, state, command)
             speeds.append(float(state.speed[0]))
-            if (throttle and speeds[-1] >= SPEEDS[-1] + 1) or (not throttle and speeds[-1] < SPEEDS[1]):
+            is_complete = speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] < SPEEDS[1]
+            if is_complete:
                 break
         return speeds, state
 
     launch, fast_state = drive(rest, throttle=1.0, brake=0.0)
     coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
     braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)
-    # Decelerations: time reversed.
+    # With time reversed, decelerations are accelerations:
     coasting, braking = _accelerations(coasting_speeds[::-1]), _accelerations(braking_speeds[::-1])
     tables = PedalTables(
         speeds=SPEEDS,
@@ -83,7 +81,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
         coasting=coasting,
         braking=float(np.median(braking - coasting)) / LIGHT_BRAKE,
     )
-    for table in tables[:3]:
+    for table in (tables.speeds, tables.full_throttle, tables.coasting):
         table.flags.writeable = False  # many ADSs read them
     return tables
 
@@ -94,10 +92,9 @@ def _accelerations(speeds: list[float]) -> FloatArray:
     Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has acceleration 0.
     """
     distinct_speeds, samples = np.unique(np.maximum.accumulate(np.array(speeds)), return_index=True)
-    grid = SPEEDS[(distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)]
-    if len(grid) < 2:
+    reached = np.flatnonzero((distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS))
+    if len(reached) < 2:
         return np.zeros(len(SPEEDS))
-    accelerations = np.diff(grid) / np.diff(np.interp(grid, distinct_speeds, samples * STEP))
-    return np.asarray(
-        accelerations[np.clip(np.arange(len(SPEEDS)) - round(grid[0] / SPEEDS[1]), 0, len(accelerations) - 1)]
-    )
+    times = np.interp(SPEEDS[reached], distinct_speeds, samples * STEP)
+    accelerations = np.diff(SPEEDS[reached]) / np.diff(times)
+    return np.asarray(accelerations[np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)])

@@ -1,4 +1,4 @@
-"""The contract of a vehicle model, slopes, sensors and delayed signals, and the guard of a user's model."""
+"""The contract of a vehicle model; slopes, sensors and delayed signals; and the guard of a user's model."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ Characteristics = Mapping[str, FloatArray]
 class SumoType(NamedTuple):
     """The attributes of N SUMO vehicle types, each of shape (N,), in kg, m/s^2, m/s^2, m/s and s.
 
-    `tau`, SUMO's desired headway, holds the actuator lag. It has no effect in SUMO, whose driver models do not drive
-    the vehicle.
+    `tau`, which is SUMO's desired headway, holds the actuator lag here. It has no effect in SUMO, as SUMO's driver
+    models do not drive the vehicle.
     """
 
     mass: FloatArray
@@ -59,8 +59,17 @@ LONGEST_DELAY = 3600.0
 
 
 class DelayedSignal(NamedTuple):
-    """The last samples of a signal, newest first, shape (L, ..., N), and where each vehicle finds the two between which
-    its delay ends: numbers of the newer one, shape (..., N), and the share of the older one, shape (N,).
+    """A signal of N vehicles, each with its own delay, which ends between two samples: a newer and an older one.
+
+    Attributes
+    ----------
+    samples
+        The last L samples, newest first, shape (L, ..., N).
+    newer
+        For every value of a sample, its number in the newer sample, counted over all values of `samples`; shape
+        (..., N).
+    share
+        The older sample's share, shape (N,).
     """
 
     samples: FloatArray
@@ -116,8 +125,8 @@ class Sensors(NamedTuple):
 def sensed_observation(
     seen: Observation, past: DelayedSignal | None, latency: FloatArray, reach: FloatArray, step: float
 ) -> tuple[Observation, DelayedSignal]:
-    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history
-    for the next call.
+    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; and the history for
+    the next call.
     """
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
     sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
@@ -213,13 +222,11 @@ class Vehicle:
         rest, is_rolling = self.at_rest(prepared), speed > 0
         if not is_rolling.any():
             return rest
-        steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))
+        steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))  # any speed for those that stand
         return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
 
     def hold_gear(self, prepared: Prepared, state: State, holds: BoolArray) -> State:
-        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; the robot of tests at a
-        speed needs it.
-        """
+        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; for the robot of tests."""
         return state
 
     def sensors(self, prepared: Prepared) -> Sensors | None:
@@ -294,7 +301,9 @@ class GuardedVehicle(Vehicle):
         wet: bool | BoolArray = False,
     ) -> _Prepared:
         n = len(next(iter(characteristics.values())))
-        road = (slope, wet) if np.any(wet) else (slope,) if slope is not LEVEL else ()
+        road: tuple[Any, ...] = () if slope is LEVEL else (slope,)
+        if np.any(wet):
+            road = slope, wet
         arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)
         constants = self._guard.call("prepare", self.model.prepare, *arguments)
         types = self._guard.call("sumo_type", self.model.sumo_type, constants)
@@ -349,8 +358,10 @@ class GuardedVehicle(Vehicle):
 
     def _result(self, method: str, prepared: _Prepared, *arguments: object) -> Any:
         """What a method of the user's model returns; it gets its own constants and state as it returned them."""
-        own = [each.model_state if isinstance(each, _State) else read_only_copy(each) for each in arguments]
-        return self._guard.call(method, getattr(self.model, method), prepared.constants, *own)
+        passed = [
+            argument.model_state if isinstance(argument, _State) else read_only_copy(argument) for argument in arguments
+        ]
+        return self._guard.call(method, getattr(self.model, method), prepared.constants, *passed)
 
     def _checked(self, method: str, prepared: _Prepared, state: State) -> _State:
         return _State(**self._guard.columns(method, state, (prepared.n,), LEGAL_STATE), model_state=state)

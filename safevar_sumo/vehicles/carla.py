@@ -77,7 +77,10 @@ class _Prepared(NamedTuple):
 
 
 class CarlaState(NamedTuple):
-    """N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-]."""
+    """N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-].
+
+    `gear` is neutral during a shift to `target_gear`. `since_shift` is minus infinity while the gear is held.
+    """
 
     speed: FloatArray
     wheel_speed: FloatArray
@@ -90,8 +93,10 @@ class CarlaState(NamedTuple):
 
 
 def _driveline(p: _Prepared, gear: FloatArray) -> tuple[FloatArray, ...]:
-    """Coefficients that depend on the gears: the clutch's strength, times the ratio, times the ratio squared; the
-    engine's inertia over a tyre step plus its damping without throttle; its further damping by full throttle.
+    """Coefficients that depend on the gears, for `Carla._roll`.
+
+    They are the clutch's strength, this strength times the ratio, and times the ratio squared; the engine's inertia
+    over a tyre step plus its damping without throttle; and its further damping by full throttle.
     """
     in_gear, ratio = gear > NEUTRAL, OVERALL_RATIOS[gear.astype(np.intp)]
     clutch, damping = p.clutch * in_gear, np.where(in_gear, p.damping_engaged, p.damping_neutral)
@@ -211,11 +216,10 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return CarlaState(*(zeros for _ in CarlaState._fields))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
-        """The steady state with the pedals that hold the speed: every equation of `_roll` with its rate of change set
-        to zero.
+        """The steady state, with the pedals that hold the speed: in every equation of `_roll` the rate of change is 0.
 
-        The gearbox has shifted up to the gear for this speed; where it would now shift down, its last shift has just
-        ended.
+        The gearbox has shifted up to the gear for this speed. Where it would now shift down, its last shift has just
+        ended, so that it must wait.
         """
         p = prepared
         rim, force = self._rim_at(p, speed)
@@ -233,7 +237,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
         gear = np.ones_like(p.mass)
         for ratio in OVERALL_RATIOS[1:-1]:
-            gear += engine_in(ratio)[-1] > self.shift_up * p.engine_limit
+            _, _, engine_speed = engine_in(ratio)
+            gear += engine_speed > self.shift_up * p.engine_limit
         clutch_torque, brake_torque, engine_speed = engine_in(OVERALL_RATIOS[gear.astype(np.intp)])
         brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
         throttle_torque = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
@@ -244,8 +249,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return CarlaState(speed, wheel_speed, engine_speed, gear, gear, since_shift, throttle, brake)
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
-        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may
-        shift at once.
+        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does. It may change as soon as it is
+        released.
         """
         since_shift = np.where(state.since_shift < 0, self.shift_latency, state.since_shift)
         return state._replace(since_shift=np.where(holds, -np.inf, since_shift))
@@ -277,7 +282,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             )
             brake = _pedal_position(command.brake, s.brake, self.brake_fall * p.step, self.brake_rise * p.step)
             gear, target, since_shift = self._shift(p, s, throttle)
-            if driveline is None or gear is not s.gear:
+            if driveline is None or gear is not s.gear:  # `_shift` returns the old array if no gear changes
                 driveline = _driveline(p, gear)
             s = CarlaState(*self._roll(p, s, driveline, throttle, brake), gear, target, since_shift, throttle, brake)
         is_held = (s.brake > ZERO) & (s.speed < p.standstill)

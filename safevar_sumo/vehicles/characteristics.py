@@ -22,17 +22,17 @@ from safevar_sumo.study import Study, unit_text
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
-"""Smallest width of a domain, and the share beta of the width from which on the filter keeps changes (method section
-2).
+"""Pairs of the smallest width of a domain, and the share beta of the width above which the filter keeps changes (method
+section 2).
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff.
+    """One characteristic of the vehicle under test; all quantities are in `unit`.
 
-    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines it; both may be
-    empty.
+    A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names the part of a real
+    vehicle that determines it; both may be empty.
     """
 
     name: str

@@ -33,6 +33,8 @@ rise over run.
 """
 OUTPUTS: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
 TYPE_UNITS: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
+SPEED_TOLERANCE = 1e-6
+"""Largest difference between an FMU's speed at the start and the initial speed [m/s]."""
 DEFAULT_LAG = 0.1
 """Actuator lag that a driving system assumes if the study gives no `tau` [s]."""
 SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
@@ -69,7 +71,7 @@ class _State(NamedTuple):
 
 
 class FmuVehicle(Vehicle):
-    """N vehicles with an instance of an FMU each; see `Vehicle`.
+    """N vehicles, each an instance of an FMU; see `Vehicle`.
 
     Parameters
     ----------
@@ -106,13 +108,11 @@ class FmuVehicle(Vehicle):
         inputs = description.ports(table["inputs"], quantities, ("input",), source, "vehicle.inputs", CONSTANTS)
         outputs = description.ports(table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
         types = description.ports(variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
-        names = {
-            each: each for each in units if each in description.variables or each not in self._sensor_entries.values()
-        }
-        key = CHARACTERISTICS
-        characteristics = description.ports(names, units, ("parameter",), source, key, types=REAL_TYPES)
+        only_of_sensors = set(self._sensor_entries.values()) - description.variables.keys()
+        names = {name: name for name in units if name not in only_of_sensors}
+        characteristics = description.ports(names, units, ("parameter",), source, CHARACTERISTICS, types=REAL_TYPES)
         self._has_grade, self._has_initial_speed = "grade" in inputs, "initial_speed" in inputs
-        inputs |= {f"{key}.{name}": port for name, port in characteristics.items()}
+        inputs |= {f"{CHARACTERISTICS}.{name}": port for name, port in characteristics.items()}
         constants = description.constants(table["parameters"], inputs.values(), source, "vehicle.parameters")
         self._instances = Instances(description, inputs, outputs | types, constants)
         self._reads_type = bool(types)
@@ -131,8 +131,9 @@ class FmuVehicle(Vehicle):
         description: Description,
         table: Parameters,
     ) -> dict[str, str]:
-        """Check the study's table `vehicle.sensors` or `vehicle.sumo_type`, whose entries are numbers or
-        characteristics, and keep the units of the latter; returns the entries that are neither, variables of the FMU.
+        """Check the study's table `vehicle.sensors` or `vehicle.sumo_type`, and keep the units of its characteristics.
+
+        Entries are numbers, characteristics or, in `sumo_type`, variables of the FMU, which are returned.
         """
         variables = {}
         for name, entry in entries.items():
@@ -168,7 +169,7 @@ class FmuVehicle(Vehicle):
     ) -> _Prepared:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self._has_grade:
-            self._refuse_road("grade", "the road has a grade", "grade 0")
+            self._refuse_start("grade", "the road has a grade", "grade 0")
         zeros = np.zeros(n)
         inputs = {
             "throttle": zeros,
@@ -198,7 +199,7 @@ class FmuVehicle(Vehicle):
         sensors = {SENSOR_FIELDS[name]: quantity(name, entry) for name, entry in self._sensor_entries.items()}
         return _Prepared(fleet, inputs, SumoType(*checked), Sensors.perfect(n)._replace(**sensors), step)
 
-    def _refuse_road(self, name: str, reason: str, otherwise: str) -> None:
+    def _refuse_start(self, name: str, reason: str, otherwise: str) -> None:
         problem = f"{self._guard.name} has no vehicle.inputs.{name}, and {reason}"
         raise UserCodeError(self._guard.source, problem, f"a variable for it, or scenarios with {otherwise}")
 
@@ -214,12 +215,12 @@ class FmuVehicle(Vehicle):
     def at_start(self, prepared: _Prepared, speed: FloatArray) -> _State:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self._has_initial_speed:
-            self._refuse_road("initial_speed", "the traffic puts it onto the road in motion", "departSpeed 0")
+            self._refuse_start("initial_speed", "the traffic puts it onto the road in motion", "departSpeed 0")
         inputs = {**prepared.inputs, "initial_speed": speed}
         outputs, history = self._guard.call("initialisation", prepared.fleet.start, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(outputs, released, None, history)
-        for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
+        for i in np.flatnonzero(np.abs(state.speed - speed) > SPEED_TOLERANCE)[:1]:
             raise self._guard.wrong_value(
                 "initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed"
             )

@@ -21,17 +21,23 @@ N_REPAIR_SHARES = 64
 """Number of settings that a repair tries between an infeasible setting and the original."""
 REJECTIONS = 1000
 """Maximum number of settings drawn for each feasible setting."""
+LARGEST_DRAW = 10_000
+"""Largest number of settings that are drawn at once, unless more are missing."""
+MIXTURE_CONCENTRATION = 0.5
+"""Concentration of the weights of vertices in a mixture: below 1, few vertices have most of the weight."""
 N_PROBES = 512
 """Number of random settings among which a feasible change is sought, besides vertices of the region and ends of the
 domains.
 """
-DrawSettings = Callable[[int], FloatArray]
-"""A function that draws the given number of settings."""
+MEAN_CHANGES = 2
+"""Mean number of changes in a sparse setting; other random settings change every characteristic."""
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size
-    `width`; `condition` and `suffix` are its bounds and its unit in words.
+    """A constraint as a computation.
+
+    `quantity` maps settings, shape (N, n), to values, shape (N,), whose range in the domains has the size `width`;
+    `condition` and `suffix` are the bounds and the unit in words.
     """
 
     constraint: Constraint
@@ -55,7 +61,7 @@ class _Bounds(NamedTuple):
 class FeasibleRegion:
     """Settings that satisfy all constraints of a study; without constraints, all settings.
 
-    `vertices` are vertices of the polytope of the linear constraints, shape (V, n), empty without such constraints.
+    `vertices`, shape (V, n), are vertices of the polytope of the linear constraints; none without such constraints.
     """
 
     characteristics: CharacteristicSet
@@ -69,7 +75,7 @@ class FeasibleRegion:
         return "; ".join(map(str, self.bounds))
 
     def violation(self, settings: FloatArray) -> FloatArray:
-        """Sum of the violations of all constraints, each as a share of the range of its quantity, shape (N,); 0 if
+        """Sum of a setting's violations, each as a share of the range of the constraint's quantity, shape (N,); 0 if
         feasible.
         """
         excess = np.zeros(len(settings))
@@ -90,55 +96,55 @@ class FeasibleRegion:
             Naming the constraint that the first infeasible setting violates, and the values of that setting.
         """
         for setting in settings[~self.feasible(settings)][:1]:
-            one = setting[np.newaxis]
-            bound = next(each for each in self.bounds if each.excess(one)[0] > SLACK / len(self.bounds))
+            row = setting[np.newaxis]
+            bound = next(bound for bound in self.bounds if bound.excess(row)[0] > SLACK / len(self.bounds))
             values = ", ".join(
                 f"{characteristic.name} = {value:g}{characteristic.suffix}"
                 for characteristic, value in zip(self.characteristics, setting, strict=True)
                 if characteristic.name in bound.constraint.sum
                 or (bound.constraint.function and value != characteristic.original)
             )
-            quantity = f"{bound.constraint.quantity} = {bound.quantity(one)[0]:g}{bound.suffix}"
+            quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
             problem = f"violates a constraint: {quantity} ({values or 'the original'})"
             raise InputError(source, problem, bound.condition + otherwise)
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
-        """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape
-        (N, n).
+        """Settings moved towards the original until they are feasible, shape (N, n); if `filtered`, feasible after the
+        filter.
         """
-        repaired = settings.copy()
+        repaired, original = settings.copy(), self.characteristics.original
         infeasible = np.flatnonzero(~self._are_accepted(settings, filtered))
         for share in np.arange(N_REPAIR_SHARES - 1, -1, -1) / N_REPAIR_SHARES:
             if not len(infeasible):
                 break
-            original = self.characteristics.original
             repaired[infeasible] = original + share * (settings[infeasible] - original)
             infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered)]
         return repaired
 
     def draw_feasible(
         self,
-        draw: DrawSettings,
+        draw: Callable[[int], FloatArray],
         number: int,
         rng: np.random.Generator | None = None,
         *,
         filtered: bool = False,
         rejections: int = REJECTIONS,
     ) -> FloatArray:
-        """The first `number` feasible settings drawn (if `filtered`, feasible after the filter), shape (number, n).
+        """The first `number` feasible settings that `draw` draws, shape (number, n); if `filtered`, feasible after the
+        filter.
 
-        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest;
-        without `rng`, fewer settings are returned.
+        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices and the original fill
+        the rest; without `rng`, fewer settings are returned.
         """
         batches, draws = [np.zeros((0, len(self.characteristics)))], 0
         while (shortage := number - sum(map(len, batches))) and draws < rejections * number:
-            settings = draw(max(shortage, min(draws, 10_000)))
+            settings = draw(max(shortage, min(draws, LARGEST_DRAW)))  # as many as all draws before
             draws += len(settings)
             batches.append(settings[self._are_accepted(settings, filtered)][:shortage])
         if shortage and rng is not None:
             corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
-            mixtures = rng.dirichlet(np.full(len(corners), 0.5), shortage) @ corners
-            mixtures = np.clip(mixtures, self.characteristics.lower, self.characteristics.upper)
+            weights = rng.dirichlet(np.full(len(corners), MIXTURE_CONCENTRATION), shortage)
+            mixtures = np.clip(weights @ corners, self.characteristics.lower, self.characteristics.upper)
             batches.append(self.repaired(mixtures, filtered=filtered))
         return np.concatenate(batches)
 
@@ -196,7 +202,7 @@ def _bounds_of(
     constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str
 ) -> _Bounds:
     table = study.vehicle.characteristics
-    ends_and_words = (
+    bounds_and_words = (
         -np.inf if constraint.at_least is None else constraint.at_least,
         np.inf if constraint.at_most is None else constraint.at_most,
         constraint.bounds_in_words(table),
@@ -205,7 +211,7 @@ def _bounds_of(
     if constraint.sum:
         weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
         width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
-        return _Bounds(constraint, lambda settings: _weighted_sum(settings, weights), float(width), *ends_and_words)
+        return _Bounds(constraint, lambda settings: _weighted_sum(settings, weights), float(width), *bounds_and_words)
     member = lookup.find({}, constraint.function, f"{key}.function")
     guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
     if not callable(member.target):
@@ -218,7 +224,7 @@ def _bounds_of(
 
     samples = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
     width = float(np.ptp(samples)) or max(1.0, abs(float(samples[0])))
-    return _Bounds(constraint, quantity, width, *ends_and_words)
+    return _Bounds(constraint, quantity, width, *bounds_and_words)
 
 
 def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
@@ -231,8 +237,9 @@ def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) ->
 
 @lru_cache(maxsize=16)
 def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
-    """For each characteristic, settings with its least and its greatest value under the linear constraints; None if no
-    setting fits.
+    """Settings with the least and with the greatest value of each characteristic under the linear constraints.
+
+    None if no setting satisfies the constraints.
     """
     from scipy.optimize import linprog  # loading takes half a second
 
@@ -257,5 +264,5 @@ def _candidate_changes(region: FeasibleRegion) -> FloatArray:
     ends = [np.where(np.eye(size, dtype=bool), end, original) for end in (lower, upper)]
     rng = np.random.default_rng(0)
     probes = rng.uniform(lower, upper, (N_PROBES, size))
-    sparse_probes = np.where(rng.random((N_PROBES, size)) < 2 / size, probes, original)
+    sparse_probes = np.where(rng.random((N_PROBES, size)) < MEAN_CHANGES / size, probes, original)
     return np.concatenate([region.vertices, *ends, region.repaired(np.concatenate([probes, sparse_probes]))])

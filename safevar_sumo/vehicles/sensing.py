@@ -1,5 +1,7 @@
-"""Vehicles with delayed sensors and brakes: one with the parameters of a SUMO vType, and a car with worn tyres and
-brakes, a payload and degraded sensors.
+"""Vehicles with delayed sensors and brakes.
+
+`SumoVehicle` has the parameters of a SUMO vType; `WornVehicle` is a car with worn tyres and brakes, a payload and
+degraded sensors.
 """
 
 from __future__ import annotations
@@ -37,8 +39,9 @@ HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_
 
 
 class SensingState(NamedTuple):
-    """State of N vehicles: speed [m/s], actuator positions [-], histories of the delayed signals, and acceleration by
-    the wheels [m/s^2].
+    """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the wheels [m/s^2].
+
+    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation.
     """
 
     speed: FloatArray
@@ -53,9 +56,9 @@ class SensingState(NamedTuple):
 class SensingVehicle(Vehicle):
     """A vehicle with delayed sensors of limited range and a delayed brake.
 
-    Its constants have a `step` [s], the vehicle's `mass` [kg], the accelerations `drive` and `brake` by full pedals
-    [m/s^2], the dead time `brake_delay` of the brake [s], `max_speed` [m/s], the sensors' `latency` [s] and
-    `sensor_range` [m], and the `slope`.
+    Its constants, which `prepare` returns, have a `step` [s], the vehicle's `mass` [kg], the accelerations `drive` and
+    `brake` by full pedals [m/s^2], the dead time `brake_delay` of the brake [s], `max_speed` [m/s], the sensors'
+    `latency` [s] and `sensor_range` [m], and the `slope`.
     """
 
     __slots__ = ()
@@ -71,7 +74,7 @@ class SensingVehicle(Vehicle):
     def at_rest(self, prepared: Prepared) -> SensingState:
         zeros = np.zeros_like(prepared.mass)
         commands = DelayedSignal.of(zeros, prepared.brake_delay, prepared.step)
-        return SensingState(zeros, zeros, zeros, zeros + 1, None, commands, zeros)
+        return SensingState(zeros, zeros, zeros, np.ones_like(zeros), None, commands, zeros)
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
         """The steady state: the pedals balance the slope, the only resistance."""
@@ -103,7 +106,7 @@ class SensingVehicle(Vehicle):
 
 
 class _PreparedSumo(NamedTuple):
-    """Constants of a run, SI, shape (N,); see `SensingVehicle`."""
+    """Constants of a run, SI, shape (N,); see `SensingVehicle`. `grip` is the largest acceleration by the tyres."""
 
     step: float
     mass: FloatArray
@@ -182,16 +185,17 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         self, p: _PreparedSumo, state: SensingState, throttle: FloatArray, brake: FloatArray
     ) -> FloatArray:
         """The wheels follow the pedals with the actuator lag T: da/dt = (target - a) / T."""
-        target = np.where(brake > 0, -brake * p.brake_gain * p.decel, throttle * p.drive)
-        target = np.minimum(np.maximum(target, -p.grip), p.grip)
+        commanded = np.where(brake > 0, -brake * p.brake_gain * p.decel, throttle * p.drive)
+        target = np.minimum(np.maximum(commanded, -p.grip), p.grip)
         acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
         # Braking ends a positive acceleration at once, without lag.
         return np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
 
 
 class _PreparedWorn(NamedTuple):
-    """Constants of a run, SI, shape (N,); see `SensingVehicle`. `grip` is the friction coefficient; `front_load` and
-    `rear_load` are the axles' shares of the weight at rest [-].
+    """Constants of a run, SI, shape (N,); see `SensingVehicle`.
+
+    `grip` is the friction coefficient; `front_load` and `rear_load` are the axles' shares of the weight at rest [-].
     """
 
     step: float
@@ -304,10 +308,11 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 
     def _deceleration(self, p: _PreparedWorn, pedal: FloatArray) -> FloatArray:
         """Deceleration by the brakes of both axles together [m/s^2]."""
-        demand, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
-        rear_limit = (self.front_share * demand + p.grip * p.slope.down * p.rear_load) / (1 + lever)
-        front_limit = ((1 - self.front_share) * demand + p.grip * p.slope.down * p.front_load) / (1 - lever)
-        return np.minimum(np.minimum(demand, p.grip * p.slope.down), np.minimum(rear_limit, front_limit))
+        demand, grip_limit = pedal * p.brake, p.grip * p.slope.down
+        lever = p.grip * (self.centre_height / self.wheelbase)
+        rear_limit = (self.front_share * demand + grip_limit * p.rear_load) / (1 + lever)
+        front_limit = ((1 - self.front_share) * demand + grip_limit * p.front_load) / (1 - lever)
+        return np.minimum(np.minimum(demand, grip_limit), np.minimum(rear_limit, front_limit))
 
 
 def _loss_share(depth: FloatArray) -> FloatArray:
