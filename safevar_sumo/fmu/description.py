@@ -1,4 +1,4 @@
-"""An FMU's model description, as FMPy reads it: the variables, units and steps that a study may use; and units."""
+"""Units, and an FMU's model description, as FMPy reads it: the variables, units and steps that a study may use."""
 
 from __future__ import annotations
 
@@ -139,7 +139,8 @@ class Description:
         """
         simulation, default = self.model.coSimulation, getattr(self.model.defaultExperiment, "stepSize", None)
         takes_any = simulation.canHandleVariableCommunicationStepSize
-        step = stated or float(simulation.fixedInternalStepSize or (not takes_any and default) or 0.0)
+        required = simulation.fixedInternalStepSize or (None if takes_any else default)
+        step = stated or float(required or 0.0)
         if step and not MIN_STEP <= step <= MAX_STEP:
             problem = f"{Path(self.path).name} requires a step of {step:g} s"
             expected = f"a step from {MIN_STEP:g} to {MAX_STEP:g} s; {key}.step sets another"
@@ -171,16 +172,20 @@ class Description:
         return self.units.get(name) or COMMON_UNITS.get(name)
 
     def units_between(self, variable: ModelVariable, unit: str) -> tuple[Unit, Unit] | None:
-        """The unit of a variable and the unit in which its values are given: equal if it declares none; None if they
-        are not of one kind, or not defined.
+        """The unit that a variable declares, and the `unit` in which its values are given; None if one is not
+        defined or they are of different kinds.
+
+        If the variable declares no unit or the same one, values stay as they are: both are plain numbers.
         """
         name = declared(variable, "unit") if variable.type in REAL_TYPES else ""
-        own, given = self.unit(name), self.unit(unit)
         if name in ("", unit):
             return COMMON_UNITS["-"], COMMON_UNITS["-"]
-        if own is None or given is None or own.exponents != given.exponents:
+        declared_unit, given_unit = self.unit(name), self.unit(unit)
+        if declared_unit is None or given_unit is None or declared_unit.exponents != given_unit.exponents:
             return None
-        return own._replace(offset=0.0) if declared(variable, "relativeQuantity") else own, given
+        if declared(variable, "relativeQuantity"):
+            declared_unit = declared_unit._replace(offset=0.0)
+        return declared_unit, given_unit
 
     def ports(
         self,
@@ -222,11 +227,12 @@ class Description:
                 problem = f"{where} = {name!r}: its unit is {declared(variable, 'unit')!r}"
                 expected = f"a unit of the same kind as {units[quantity]}, with a BaseUnit in the UnitDefinitions"
                 raise InputError(source, problem, expected)
-            port = Port(variable, *both_units)
-            lower, upper = (number_of(variable, end) if port.is_input else None for end in ("min", "max"))
-            ports[quantity] = port._replace(
-                lower=-np.inf if lower is None else lower, upper=np.inf if upper is None else upper
-            )
+            ports[quantity] = port = Port(variable, *both_units)
+            if port.is_input:
+                lower, upper = number_of(variable, "min"), number_of(variable, "max")
+                ports[quantity] = port._replace(
+                    lower=-np.inf if lower is None else lower, upper=np.inf if upper is None else upper
+                )
         return ports
 
     def constants(
@@ -245,11 +251,11 @@ class Description:
             if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
                 raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
             constants.append((variable, value))
-        for one, other in combinations([port.variable for port in ports] + [variable for variable, _ in constants], 2):
-            if (one.type, one.valueReference) == (other.type, other.valueReference):
-                problem = (
-                    f"{key.partition('.')[0]}: {one.name!r} and {other.name!r} have one value, and two keys set it"
-                )
+        variables = [*(port.variable for port in ports), *(variable for variable, _ in constants)]
+        for first, second in combinations(variables, 2):
+            if (first.type, first.valueReference) == (second.type, second.valueReference):
+                table = key.partition(".")[0]
+                problem = f"{table}: {first.name!r} and {second.name!r} have one value, and two keys set it"
                 raise InputError(source, problem, "one key for each value reference of the FMU")
         return constants
 
@@ -275,14 +281,14 @@ class Description:
         variable = self.variables.get(name)
         if variable is None or causality_of(variable) != "parameter":
             return {}
-        own_name, meaning = declared(variable, "unit"), " ".join((variable.description or "").split())
-        units = self.units_between(variable, unit or own_name)
+        declared_unit, meaning = declared(variable, "unit"), " ".join((variable.description or "").split())
+        units = self.units_between(variable, unit or declared_unit)
         if units is None:
             return {}
         ends = {"original": "start", "lower": "min", "upper": "max"}
         numbers = {key: number_of(variable, attribute) for key, attribute in ends.items()}
         return {
-            "unit": own_name or "-",
+            "unit": declared_unit or "-",
             **{key: units[0].to(units[1], number) for key, number in numbers.items() if number is not None},
             **({"meaning": meaning} if 0 < len(meaning) <= MAX_MEANING else {}),
         }
@@ -352,10 +358,10 @@ def _read_description(path: str, digest: str, source: str, name: str) -> Descrip
     try:
         if not folder.is_dir():
             folder.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as new:
-                extract(path, new)
+            with tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as new_folder:
+                extract(path, new_folder)
                 with suppress(OSError):  # another process was faster
-                    os.rename(new, folder)
+                    os.rename(new_folder, folder)
         model = read_model_description(folder, validate=False)
         platforms = {*supported_platforms(folder)}
     except Exception as error:  # any error of FMPy about a user's file
@@ -369,9 +375,9 @@ def _read_description(path: str, digest: str, source: str, name: str) -> Descrip
         problem = f"{name} has no binary for this machine, only for {', '.join(sorted(platforms)) or 'none'}"
         raise InputError(source, problem, f"binaries/{platform}")
     units = {
-        unit.name: Unit(tuple(getattr(base, each) for each in BASE_UNITS), base.factor, base.offset)
-        for unit in model.unitDefinitions
-        if (base := unit.baseUnit) is not None
+        definition.name: Unit(tuple(getattr(base, name) for name in BASE_UNITS), base.factor, base.offset)
+        for definition in model.unitDefinitions
+        if (base := definition.baseUnit) is not None
     }
     variables = {variable.name: variable for variable in model.modelVariables if not variable.dimensions}
     return Description(path, digest, str(folder), model, units, variables)

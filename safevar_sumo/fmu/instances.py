@@ -1,4 +1,6 @@
-"""Instances of an FMU for N vehicles, with the variables that a study maps; vehicles continue from any earlier step."""
+"""Instances of an FMU for N vehicles, with the variables that a study maps; vehicles may continue from any earlier
+step.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,8 @@ class FmuError(Exception):
 
 
 class History(NamedTuple):
-    """All inputs so far, as a chain: `inputs` of step `step_number` after the steps of `previous`; the initialisation
-    is the first link.
+    """All inputs of a vehicle fleet so far, as a chain: the `inputs` of the step `step_number`, and those of all steps
+    before it, `previous`. The first link is the initialisation.
     """
 
     previous: History | None
@@ -64,7 +66,7 @@ class Instances:
     ) -> None:
         self.inputs, self.outputs = inputs, outputs
         self._description, self._constants = description, constants
-        self._is_3 = description.model.fmiVersion.startswith("3")
+        self._is_fmi3 = description.model.fmiVersion.startswith("3")
         self._free, self._messages = list["FMU2Slave"](), list[str]()
         self.max_vehicles = 1 if description.is_single else MAX_INSTANCES
         self.generation = 0
@@ -95,7 +97,7 @@ class Instances:
             self._write_inputs(slave, column, are_inputs=False)
             for variable, value in self._constants:
                 self._write(slave, variable, value)
-            if not self._is_3:
+            if not self._is_fmi3:
                 slave.setupExperiment(startTime=0.0)
             slave.enterInitializationMode()
             self._write_inputs(slave, column, are_inputs=True)
@@ -109,8 +111,10 @@ class Instances:
         def step(slave: FMU2Slave, column: Sequence[float]) -> None:
             self._write_inputs(slave, column, are_inputs=True)
             result = slave.doStep(time, length)
-            if self._is_3 and any(result[1:3]):
-                raise FmuError(f"it ends the simulation or returns early, at {result[3]:g} s")
+            if self._is_fmi3:
+                _, terminates, returns_early, end_time = result
+                if terminates or returns_early:
+                    raise FmuError(f"it ends the simulation or returns early, at {end_time:g} s")
 
         return self._on_each(f"is at {time:g} s", slaves, values, step)
 
@@ -119,7 +123,7 @@ class Instances:
         activity: str,
         slaves: Sequence[FMU2Slave],
         values: FloatArray,
-        work: Callable[[FMU2Slave, Sequence[float]], None],
+        act: Callable[[FMU2Slave, Sequence[float]], None],
     ) -> FloatArray:
         columns = np.array(
             [port.to_fmu(row) for port, row in zip(self.inputs.values(), values, strict=True)]
@@ -127,13 +131,13 @@ class Instances:
         outputs = np.zeros((len(self.outputs), len(slaves)))
         try:
             for i, slave in enumerate(slaves):
-                work(slave, columns[i])
+                act(slave, columns[i])
                 for row, port in enumerate(self.outputs.values()):
                     read = getattr(slave, f"get{self._function(port.variable)}")
                     outputs[row, i] = read([port.variable.valueReference])[0]
         except Exception as error:  # any error of FMPy about an FMU
             # Any further call of an instance that failed is undefined.
-            self._free, self.generation = ([], self.generation + 1)
+            self._free, self.generation = [], self.generation + 1
             messages, self._messages[:] = self._messages[-1:], []
             reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
             raise FmuError(f"{': '.join([reason, *messages])} while it {activity}") from error
@@ -154,7 +158,7 @@ class Instances:
 
     def _function(self, variable: ModelVariable) -> str:
         """End of the names of the functions that set and get a variable."""
-        integer = "Int64" if self._is_3 else "Integer"
+        integer = "Int64" if self._is_fmi3 else "Integer"
         return integer if variable.type == "Enumeration" else str(variable.type)
 
     def _new_slave(self) -> FMU2Slave:
@@ -162,7 +166,7 @@ class Instances:
 
         def note(*arguments: bytes | int | None) -> None:
             *_, status, _, message = arguments
-            if isinstance(message, bytes) and status not in (0, 1):  # worse than a warning
+            if isinstance(message, bytes) and status not in (0, 1):  # neither "OK" nor a warning
                 self._messages.append(" ".join(message.decode(errors="replace").split()))
 
         folder = self._description.folder

@@ -26,6 +26,8 @@ UserValue = Any
 INFINITY = float("inf")
 ABSTRACT = "__isabstractmethod__"
 """Attribute of an abstract method."""
+MAX_QUOTED_ELEMENTS, MAX_QUOTE = 4, 80
+"""Largest size of an array, and of any other value's text [characters], that an error quotes."""
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
@@ -42,6 +44,7 @@ def violation(candidate: Any, base: type) -> str:
         attribute, method = getattr(candidate, name, getattr(base, name)), f"{name}({', '.join(parameters)})"
         if hasattr(attribute, ABSTRACT) or not callable(attribute):
             return f"has no method {method}"
+        # A static or class method takes no `self`.
         takes_self = inspect.isfunction(inspect.getattr_static(candidate, name, getattr(base, name)))
         if not accepts(attribute, takes_self + len(parameters)):
             return f"has a method {name} that does not take ({', '.join(parameters)})"
@@ -65,9 +68,13 @@ def abstract_methods(base: type) -> dict[str, list[str]]:
 
 
 def _methods(base: type) -> dict[str, list[str]]:
-    """The public methods of a class, and the names of their parameters without default."""
+    """The public methods of a class, and the names of their parameters without default and without `self`."""
     return {
-        name: [each.name for each in inspect.signature(method).parameters.values() if each.default is each.empty][1:]
+        name: [
+            parameter.name
+            for parameter in list(inspect.signature(method).parameters.values())[1:]
+            if parameter.default is parameter.empty
+        ]
         for name, method in vars(base).items()
         if inspect.isfunction(method) and not name.startswith("_")
     }
@@ -102,10 +109,9 @@ def read_only_copy(value: UserValue) -> Any:
 
 @contextmanager
 def check_open_runs(are_open: BoolArray) -> Iterator[None]:
-    """Within the block, ignore wrong values of runs that have ended: a vehicle still moves while others in its batch
-    drive.
+    """Within the block, wrong values are ignored unless their run is open, `are_open`, shape (N,).
 
-    `are_open`, shape (N,), may change during the block.
+    A vehicle whose run has ended still moves while others in its batch drive. `are_open` may change during the block.
     """
     token = _open_runs.set(are_open)
     try:
@@ -238,8 +244,8 @@ class Guard(NamedTuple):
         """The attributes of a result that are named in `legal`, each checked; those in `scalars` are single numbers."""
         shapes = {name: () if name in scalars else shape for name in legal}
         columns = {
-            name: self.numbers(method, name, self.field(method, value, name), shapes[name], each)
-            for name, each in legal.items()
+            name: self.numbers(method, name, self.field(method, value, name), shapes[name], legal[name])
+            for name in legal
         }
         return {name: column.item() if name in scalars else column for name, column in columns.items()}
 
@@ -261,8 +267,9 @@ class Guard(NamedTuple):
             raise self._wrong_result(f"{quantity} of shape {array.shape}", method, expected)
         numbers = np.broadcast_to(array, shape).astype(bool if legal is TRUTH else float)
         is_legal = legal.holds(numbers)
-        for row in open_rows(~is_legal)[:1]:
-            raise self.wrong_value(method, quantity, float(numbers.flat[row]), expected)
+        wrong_rows = open_rows(~is_legal)
+        if len(wrong_rows):
+            raise self.wrong_value(method, quantity, float(numbers.flat[wrong_rows[0]]), expected)
         numbers[~is_legal] = 0
         return numbers
 
@@ -279,7 +286,7 @@ class Guard(NamedTuple):
 
 def _short_text(value: object) -> str:
     """A returned value in a few words on one line."""
-    if isinstance(value, np.ndarray) and value.size > 4:
+    if isinstance(value, np.ndarray) and value.size > MAX_QUOTED_ELEMENTS:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"a {type(value).__name__}"
+    return text if len(text) <= MAX_QUOTE else f"a {type(value).__name__}"

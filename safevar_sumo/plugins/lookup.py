@@ -135,7 +135,8 @@ class Lookup(NamedTuple):
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
-        modules_before, dont_write_bytecode, sys.dont_write_bytecode = set(sys.modules), sys.dont_write_bytecode, True
+        modules_before, dont_write_bytecode = set(sys.modules), sys.dont_write_bytecode
+        sys.dont_write_bytecode = True
         try:
             return guard._replace(folder=folders[0]).call("import", importlib.import_module, name)
         except UserCodeError as error:
@@ -148,8 +149,8 @@ class Lookup(NamedTuple):
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
-    """Let modules import from `folders` and the working directory; folders that Python's path lists before the latter
-    keep precedence.
+    """Let modules import from `folders` and the working directory. The folders come directly before the working
+    directory on Python's path: what is listed before it keeps precedence.
     """
     sys.path[:] = [folder for folder in sys.path if folder not in _added_folders]
     _added_folders[:] = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
@@ -185,11 +186,12 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str, sou
     """
     cls = member.target
     if issubclass(cls, msgspec.Struct):
-        audit_hook.call_depth += member.guard is not None
+        is_user_code = member.guard is not None
+        audit_hook.call_depth += is_user_code  # without its guard, which would hide the errors of `convert_table`
         try:
             return convert_table(source, parameters, cls, key)
         finally:
-            audit_hook.call_depth -= member.guard is not None
+            audit_hook.call_depth -= is_user_code
     check_parameters(cls, (), parameters, name, key, source)
     return (member.guard or Guard(source, name)).call("__init__", cls, **parameters)
 

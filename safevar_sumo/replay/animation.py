@@ -37,10 +37,10 @@ LAST_FRAME_DURATION = 2.0
 """Duration of the last frame [s]."""
 MAX_GIF_SIZE = 1_000_000
 """Size above which a gif gets fewer frames [bytes]."""
-EXACT = "-threads 1 -pix_fmt yuv420p -crf 26 -movflags +faststart -fflags +bitexact -flags:v +bitexact -map_metadata -1"
+FFMPEG_OPTIONS = (
+    "-threads 1 -pix_fmt yuv420p -crf 26 -movflags +faststart -fflags +bitexact -flags:v +bitexact -map_metadata -1"
+)
 """Options of ffmpeg for small files of the same bytes each time."""
-
-
 PLAYER_FOLDER = Path(__file__).parent / "web"
 WIDTH_IN_TEXT_HEIGHTS = 65
 """Width of a scene [heights of its text]."""
@@ -104,7 +104,9 @@ def _write_mp4(scene: FlatScene, path: Path) -> None:
     from matplotlib.animation import FFMpegWriter
 
     with matplotlib.rc_context({"animation.ffmpeg_path": find_ffmpeg()}):
-        _save(scene, 1, path, FFMpegWriter(fps=round(1 / scene.step), codec="libx264", extra_args=EXACT.split()))
+        _save(
+            scene, 1, path, FFMpegWriter(fps=round(1 / scene.step), codec="libx264", extra_args=FFMPEG_OPTIONS.split())
+        )
 
 
 def _save(scene: FlatScene, stride: int, path: Path, writer: AbstractMovieWriter) -> None:
@@ -122,7 +124,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
-    height = round(WIDTH * scene.height / scene.width / 2) * 2
+    height = round(WIDTH * scene.height / scene.width / 2) * 2  # an even number, which mp4 needs
     figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
     axis = figure.add_axes(
         (0, 0, 1, height / (PANEL_HEIGHT + height)),
@@ -159,7 +161,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
         clock.set_text(f"{sample * scene.step:.2f} s")
         for row, text in enumerate(texts):
             text.set_text(f"{scene.comparison.name(row)}  {scene.reading(row, sample)}")
-        return []
+        return []  # Matplotlib draws the whole figure again
 
     return figure, show
 
@@ -189,9 +191,7 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
 
 
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
-    """Draw an actor with its front bumper, or a person's middle, at the origin, heading along x; brake lights come
-    second.
-    """
+    """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle, is at the origin."""
     from matplotlib.patches import Circle, Rectangle
 
     length, width = body.length, body.width
@@ -314,6 +314,7 @@ def _body_data(body: FlatBody) -> JsonObject:
 
 def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | None]:
     """Rounded numbers for JSON; null for an undefined number."""
+    # + 0.0 turns -0.0 into 0.0
     return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
 
 

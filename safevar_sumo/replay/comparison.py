@@ -28,8 +28,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 
 class LaneLine(NamedTuple):
-    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; an area has its outline as `line` and
-    the width 0.
+    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; or the outline of an area, and 0.
 
     `kind` is road, path (only for persons), crossing or area (for persons, between paths).
     """
@@ -251,14 +250,14 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
-    """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no
-    rating points.
+    """List where the replay of a solution differs from its row of solutions.csv, with both values; rating points are
+    left out, as the replay of one cell has none.
     """
-    found = []
+    differences = []
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        found.append(f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now")
+        differences.append(f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now")
     for name, values in replayed.metrics.items():
         before = recorded.get(name, values[0])
         if name != RATING_POINTS.name and not np.array_equal(before, values[0], equal_nan=True):
-            found.append(f"{name} was {before:.6g} and is {values[0]:.6g} now")
-    return found
+            differences.append(f"{name} was {before:.6g} and is {values[0]:.6g} now")
+    return differences

@@ -32,22 +32,28 @@ CARLA_PHYSICS = {
     "mass": "mass",
     "dragCoeff": "drag_coefficient",
 }
-"""Characteristics by the attribute of CARLA's `VehiclePhysicsControl` with the same meaning and unit."""
+"""Attributes of CARLA's `VehiclePhysicsControl`, by the characteristic with the same meaning and unit."""
 CARLA_WHEELS = {
     "tireFric": "tire_friction",
     "dampRate": "damping_rate",
     "radius": "radius",
     "maxBrakeTorque": "max_brake_torque",
 }
-"""Characteristics by the attribute of each `WheelPhysicsControl`; CARLA's radius is in cm, as the characteristic is."""
+"""Attributes of each `WheelPhysicsControl`, by characteristic; CARLA's radius is in cm, as the characteristic is."""
 WHEELBASE = 0.58
 """Assumed wheelbase over the vehicle's length, with equal overhangs [-]."""
 HEIGHTS = {"pedestrian": 1.8, "bicycle": 1.7, "car": 1.5}
 """Assumed heights [m]; SUMO has no third dimension."""
 BICYCLE_WIDTH = 1.0
 """Width below which a vehicle is a bicycle [m]."""
-DISALLOWED = {"outline": ("id", "fillType", "outer", "closed", "laneType"), "cornerLocal": ("id",)}
-"""Attributes of a later OpenDRIVE that netconvert writes into its version 1.4, whose schema has none of them."""
+DROPPED_ATTRIBUTES = {
+    "outline": ("id", "fillType", "outer", "closed", "laneType"),
+    "cornerLocal": ("id",),
+    "header": ("date",),
+}
+"""Attributes, by element, that netconvert writes into OpenDRIVE 1.4 although only later versions have them; and the
+time of the conversion.
+"""
 
 
 class Poses(NamedTuple):
@@ -76,7 +82,7 @@ class Poses(NamedTuple):
         return 0.0 if self.kind == "pedestrian" else self.length * WHEELBASE / 2
 
     def places(self, behind: float = 0.0) -> list[tuple[float, float, float, float]]:
-        """Time, x, y and heading of the point so far behind the middle."""
+        """Time [s], x, y [m] and heading [rad] of the point that is `behind` the middle by so much [m]."""
         x, y = self.x - behind * np.cos(self.heading), self.y - behind * np.sin(self.heading)
         return list(zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True))
 
@@ -90,14 +96,16 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     time = np.round(comparison.runs.trace.time[:end], TIME_DECIMALS)
     for name, track in sorted(comparison.tracks.items(), key=lambda item: item[0] != VUT):
         x, y = track.x[:end, row], track.y[:end, row]
-        here = np.isfinite(x)
-        if not here.any():
+        is_present = np.isfinite(x)
+        if not is_present.any():
             continue
         heading = np.deg2rad(90.0 - track.angle[:end, row])
-        kind = "pedestrian" if track.is_person else "bicycle" if track.width < BICYCLE_WIDTH else "car"
-        to_middle = 0.0 if track.is_person else track.length / 2
+        kind, to_middle = "bicycle" if track.width < BICYCLE_WIDTH else "car", track.length / 2
+        if track.is_person:
+            kind, to_middle = "pedestrian", 0.0
         x, y = x - to_middle * np.cos(heading), y - to_middle * np.sin(heading)
-        actors.append(Poses(name, kind, track.length, track.width, *(values[here] for values in (time, x, y, heading))))
+        samples = (values[is_present] for values in (time, x, y, heading))
+        actors.append(Poses(name, kind, track.length, track.width, *samples))
     return actors
 
 
@@ -116,7 +124,7 @@ def open_drive(network: Network) -> str:
             raise EnvironmentFault(f"{network.folder}: netconvert writes no OpenDRIVE: {errors}")
         root = ElementTree.parse(Path(folder) / ROAD).getroot()
     for element in root.iter():
-        for name in DISALLOWED.get(element.tag, ("date",) if element.tag == "header" else ()):
+        for name in DROPPED_ATTRIBUTES.get(element.tag, ()):
             element.attrib.pop(name, None)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
@@ -140,7 +148,10 @@ def carla_physics(setting: Mapping[str, float], source: str) -> dict[str, dict[s
             source, f"its vehicle has no {', '.join(missing)}", "the vehicle `carla`, or `to=openscenario`"
         )
     tables = {"physics": CARLA_PHYSICS, "wheels": CARLA_WHEELS}
-    return {table: {to: setting[name] for name, to in pairs.items()} for table, pairs in tables.items()}
+    return {
+        table: {attribute: setting[name] for name, attribute in attributes.items()}
+        for table, attributes in tables.items()
+    }
 
 
 def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float]], handle: str) -> JsonObject:
@@ -157,9 +168,9 @@ def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float
         "blueprint": BLUEPRINT,
         **physics,
         "step": trace.step,
-        "start": dict(zip(("x", "y", "heading"), vut.places()[0][1:], strict=True)),
+        "start": {"x": float(vut.x[0]), "y": float(vut.y[0]), "heading": float(vut.heading[0])},
         "start_speed": float(trace.speed[0, row]),
-        "route": [place[1:3] for place in vut.places()],
+        "route": np.stack([vut.x, vut.y], axis=1).tolist(),
         "pedals": [
             {"throttle": throttle, "brake": brake}
             for throttle, brake in zip(trace.throttle[samples, row], trace.brake[samples, row], strict=True)

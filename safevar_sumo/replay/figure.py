@@ -134,13 +134,13 @@ def find_divergence(runs: SimulationRuns) -> int | None:
     do, or if nothing is changed.
     """
     trace = runs.trace
-    both = trace.active.all(axis=1)
-    (samples,) = np.nonzero(both & (np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE))
-    return int(samples[0]) if samples.size else None
+    have_diverged = trace.active.all(axis=1) & (np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE)
+    return int(np.argmax(have_diverged)) if have_diverged.any() else None
 
 
 def _heading(comparison: Comparison) -> str:
     """The study's title and, below it, the changes; lines break only between changes."""
+    # no line breaks at "\0", which stands for the spaces of a change
     changes = ", ".join(change.replace(" ", "\0") for change in comparison.changes)
     line = f"changed: {changes}" if changes else "the original vehicle"
     lines = [*textwrap.wrap(comparison.title, LINE_LENGTH), *textwrap.wrap(line, LINE_LENGTH)]

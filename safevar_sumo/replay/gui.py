@@ -141,8 +141,9 @@ def _road_origin(scene: FlatScene, row: int) -> tuple[float, float]:
 def _add_actor(api: Api, body: FlatBody) -> None:
     """Add an actor, which is a vehicle in sumo-gui; persons only have another shape."""
     name = f"{body.row}.{body.name}"
-    colour = COLOURS[body.row] if body.is_vut else PERSON_COLOUR if body.is_person else ACTOR_COLOUR
-    length, width = (max(body.length, body.width),) * 2 if body.is_person else (body.length, body.width)
+    length, width, colour = body.length, body.width, COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
+    if body.is_person:  # a circle
+        length, width, colour = max(length, width), max(length, width), PERSON_COLOUR
     api.vehicletype.copy("DEFAULT_VEHTYPE", name)
     api.vehicletype.setShapeClass(name, "pedestrian" if body.is_person else "evehicle")
     api.vehicletype.setLength(name, length)
@@ -176,8 +177,9 @@ def _show_sample(api: Api, scene: FlatScene, sample: int) -> None:
         words = f"{comparison.name(row)} ({('blue', 'orange')[row]}): {scene.reading(row, sample)}"
         api.poi.setPosition(f"legend.{row}", right + left + scene.width / 2, up + scene.bottom + LEGEND_HEIGHT)
         api.poi.setParameter(f"legend.{row}", "words", words)
-    top = ORIGIN + scene.bottom + scene.height  # `up` is the last road's
-    api.gui.setBoundary(VIEW_NAME, ORIGIN + left, up + scene.bottom, ORIGIN + left + scene.width, top)
+    top = ORIGIN + scene.bottom + scene.height
+    _, lowest_origin = _road_origin(scene, comparison.rows[-1])
+    api.gui.setBoundary(VIEW_NAME, ORIGIN + left, lowest_origin + scene.bottom, ORIGIN + left + scene.width, top)
     api.simulationStep()
 
 

@@ -24,6 +24,8 @@ MAX_LENGTH = 75.0
 """Length up to which a scene is shown whole; in a longer scene the camera follows the vehicles [m]."""
 CAMERA_LENGTH = 48.0
 """Length of road that a following camera shows [m]."""
+CAMERA_LEAD = 0.45
+"""Part of this length behind the front bumpers of the vehicles under test [-]."""
 MAX_DISTANCE = 30.0
 """Distance to the vehicle under test beyond which actors are not shown [m]."""
 MARK_DISTANCE = 10
@@ -137,7 +139,7 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> tuple[FloatAr
     left_ends, width = np.full(sample_count, left_end), right_end - left_end
     if width > MAX_LENGTH:
         width = CAMERA_LENGTH
-        left_ends = np.clip(x[is_vut].mean(axis=0) - width * 0.45, left_end, max(left_end, right_end - width))
+        left_ends = np.clip(x[is_vut].mean(axis=0) - width * CAMERA_LEAD, left_end, max(left_end, right_end - width))
     return left_ends, bottom - padding, width, height + 2 * padding
 
 

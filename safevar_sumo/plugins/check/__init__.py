@@ -33,8 +33,18 @@ from safevar_sumo.vehicles import CHANGES, VEHICLES, Change, Vehicle
 
 
 class Kind(NamedTuple):
-    """A kind of subjects: the key that names them in a study, the names that a study gives there, the shipped ones by
-    name, and the methods by which a class is recognised.
+    """A kind of subjects of `check`, such as driving systems.
+
+    Attributes
+    ----------
+    key
+        The key of a study that names such subjects.
+    names_in
+        The names that a study gives there.
+    members
+        The shipped subjects by name.
+    methods
+        The methods by which a class of this kind is recognised.
     """
 
     key: str
@@ -48,15 +58,19 @@ def _scenarios_in(study: Study) -> list[str]:
 
 
 KINDS: Mapping[str, Kind] = {
-    "traci": Kind("ads.model", lambda study: [study.ads.model] * (study.ads.kind == "traci"), {}, ("step",)),
-    "ads": Kind("ads.model", lambda study: [study.ads.model] * (study.ads.kind != "traci"), ADS, abstract_methods(Ads)),
+    "traci": Kind("ads.model", lambda study: [study.ads.model] if study.ads.kind == "traci" else [], {}, ("step",)),
+    "ads": Kind(
+        "ads.model", lambda study: [study.ads.model] if study.ads.kind != "traci" else [], ADS, abstract_methods(Ads)
+    ),
     "vehicle": Kind("vehicle.model", lambda study: [study.vehicle.model], VEHICLES, abstract_methods(Vehicle)),
     "scenario": Kind("scenario.model", _scenarios_in, SCENARIOS, abstract_methods(Scenario)),
     "metric": Kind("metrics.also", lambda study: study.metrics.also, {**METRICS, **OPTIONAL_METRICS}),
     "objective": Kind("search.objectives", lambda study: study.search.objectives, CHANGES),
     "algorithm": Kind("search.algorithms", lambda study: study.search.algorithms, ALGORITHMS, ("search",)),
     "constraint": Kind(
-        "constraints.function", lambda study: filter(None, (one.function for one in study.constraints)), {}
+        "constraints.function",
+        lambda study: filter(None, (constraint.function for constraint in study.constraints)),
+        {},
     ),
 }
 """Kinds of subjects by name."""
@@ -67,8 +81,8 @@ MAX_FILES = 50
 
 
 class Subject(NamedTuple):
-    """A subject and the study in which it is tried; `remark` says how the study was found, `is_guest` that no study
-    names the subject.
+    """A subject and the study in which it is tried; `remark` says how the study was found, `is_guest` whether the study
+    names the subject only for the trial.
     """
 
     name: str
@@ -95,7 +109,9 @@ class Subject(NamedTuple):
 
 def subjects_of(study: Study) -> list[Subject]:
     """Every subject that a study names."""
-    return [Subject(name, kind, study) for kind, each in KINDS.items() for name in dict.fromkeys(each.names_in(study))]
+    return [
+        Subject(name, kind, study) for kind, facts in KINDS.items() for name in dict.fromkeys(facts.names_in(study))
+    ]
 
 
 def find_subject(name: str, study: str | None) -> Subject:
@@ -115,12 +131,16 @@ def find_subject(name: str, study: str | None) -> Subject:
     """
     given_study = None if study is None else load_study(study)
     name = METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name
-    kind = shipped_kind = next((kind for kind, each in KINDS.items() if name in each.members), "")
-    folder, member = Path(name).absolute().parent, _look_up(name, given_study)
+    shipped_kind = next((kind for kind, facts in KINDS.items() if name in facts.members), "")
+    kind, folder, member = shipped_kind, Path(name).absolute().parent, _look_up(name, given_study)
     if member.guard:
         kind, folder = _kind_of(member.target), Path(member.guard.folder).absolute()
     elif not shipped_kind and not name.endswith(".fmu"):
-        names = {*study_names(), *METRIC_OF_OBJECTIVE, *(member for each in KINDS.values() for member in each.members)}
+        names = {
+            *study_names(),
+            *METRIC_OF_OBJECTIVE,
+            *(shipped for facts in KINDS.values() for shipped in facts.members),
+        }
         otherwise = ", package.module:Name, or the path of a study file"
         raise unknown_name("check", f"there is nothing called {name!r}", name, names, otherwise)
     candidates: Iterable[Study] = map(load_study, study_names())
@@ -129,8 +149,8 @@ def find_subject(name: str, study: str | None) -> Subject:
     for candidate in candidates:
         for subject in subjects_of(candidate):
             if Path(subject.name).name == Path(name).name:
-                tried = "" if given_study or shipped_kind else f"tried in {candidate.origin.called}, which names it"
-                return subject._replace(kind=kind if subject.kind == "objective" else subject.kind, remark=tried)
+                remark = "" if given_study or shipped_kind else f"tried in {candidate.origin.called}, which names it"
+                return subject._replace(kind=kind if subject.kind == "objective" else subject.kind, remark=remark)
     if not kind:
         problem = f"no study names {name!r}" if member.guard or Path(name).exists() else f"there is no file {name!r}"
         expected = "a model, metric, algorithm or controller that a study can name, or `study=STUDY` that names it"
@@ -140,7 +160,7 @@ def find_subject(name: str, study: str | None) -> Subject:
 
 
 def _look_up(name: str, study: Study | None) -> Member:
-    """A user's member by its name; nothing for other names."""
+    """A user's class, function or record by its name; a `Member` without any for other names."""
     if ":" not in name:
         return Member(None)
     unload_user_modules()
@@ -149,7 +169,7 @@ def _look_up(name: str, study: Study | None) -> Member:
 
 
 def _kind_of(target: Any) -> str:
-    """The kind of an object; "" if the object is of no kind."""
+    """The kind of an object: of a class, the kind of whose methods it has the largest share; "" if it is of no kind."""
     if isinstance(target, Metric | Change):
         return "metric" if isinstance(target, Metric) else "objective"
     if not inspect.isclass(target):
@@ -157,9 +177,9 @@ def _kind_of(target: Any) -> str:
     if issubclass(target, ScalarAds):
         return "ads"
     shares = {
-        kind: sum(hasattr(target, name) for name in each.methods) / len(each.methods)
-        for kind, each in KINDS.items()
-        if each.methods
+        kind: sum(hasattr(target, name) for name in facts.methods) / len(facts.methods)
+        for kind, facts in KINDS.items()
+        if facts.methods
     }
     likeliest_kind = max(shares, key=lambda kind: shares[kind])
     return likeliest_kind if shares[likeliest_kind] else ""
@@ -278,8 +298,8 @@ def check(name: str, study: str | None = None) -> Report:
             raise InputError("study", f"{study!r} is given, and {name!r} is itself a study", "one of them")
         kind, subjects = "study", subjects_of(load_study(name))
     else:
-        subjects = [find_subject(name, study)]
-        name, kind, _, remark, _ = subjects[0]
+        subject = find_subject(name, study)
+        name, kind, remark, subjects = subject.name, subject.kind, subject.remark, [subject]
     findings = [finding for _, finding in _findings_in(subjects[0].study, subjects)]
     if not findings and subjects[0].kind in ("ads", "traci") and not subjects[0].is_guest:
         findings = _reaction(subjects[0])
@@ -302,17 +322,21 @@ def refuse_defects(study: Study) -> None:
 
 
 def _findings_in(study: Study, subjects: list[Subject]) -> Iterator[tuple[str, Finding]]:
-    """The first failure of each trial, and the code on trial; all subjects that are simulated share one trial."""
+    """The names of the code on trial, and the first failure, of each trial that fails.
+
+    All subjects that are simulated share one trial.
+    """
     simulated = [subject for subject in subjects if subject.kind not in ("algorithm", "constraint")]
-    for trial in ([simulated] if simulated else []) + [[subject] for subject in subjects if subject not in simulated]:
+    trials = [simulated, *([subject] for subject in subjects if subject not in simulated)]
+    for trial in filter(None, trials):
         code = [subject for subject in trial if subject.is_user_code] or trial
         try:
             with np.errstate(all="ignore"):
                 failure, place = next(_failures(study, trial[0]), None), ""
         except UserCodeError as error:
             problem = error.problem
-            for one in code:
-                problem = problem.removeprefix(f"{one.key} ")
+            for subject in code:
+                problem = problem.removeprefix(f"{subject.key} ")
             failure, place = ("contract", error.legal or "no exception", problem), error.place
         if failure is not None:
             yield " and ".join(subject.key for subject in code), _finding(code[0], failure, place)

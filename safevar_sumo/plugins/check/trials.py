@@ -18,18 +18,16 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 SIMULATED, SIMULATED_BY_TRACI, COMPUTED = 100, 20, 200
-"""Numbers of settings that are simulated, with a controller that reads SUMO, and to which a constraint's function is
-applied.
+"""Numbers of settings: that are simulated; that are simulated with a TraCI controller, which is slower; and to which a
+constraint's function is applied.
 """
 SMALLER_BATCHES = 4
-"""Number of batches into which the settings are divided."""
+"""Number of batches into which the settings are divided for the check `alone`."""
 MATRIX_POINTS = 2
 """Approximate number of a study's test points that are simulated."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
-"""Largest budget of an algorithm's runs."""
+"""Largest budget, and largest population, of an algorithm's runs."""
 Rows = npt.NDArray[np.intp]
-
-
 Failure = tuple[str, str, str]
 """A failed check, the expected result, and the actual one with the input that shows it."""
 
@@ -74,32 +72,31 @@ def try_constraint(study: Study, function: str) -> Iterator[Failure]:
 
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     """Let an algorithm minimise a smooth function in place of simulations, twice, the second time after another run."""
-    outputs, others = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
-    problem = f"{len(others)} settings instead of {len(outputs)}" if len(outputs) != len(others) else ""
-    for row in np.flatnonzero((outputs != others).any(axis=1))[:1] if not problem else ():
-        problem = f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()}"
-    if problem:
-        yield (
-            "repetition",
-            "the same in every run with the same random numbers, to the bit",
-            f"{problem} in another run",
-        )
+    outputs, repeated = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
+    expected = "the same in every run with the same random numbers, to the bit"
+    if len(outputs) != len(repeated):
+        yield "repetition", expected, f"{len(repeated)} settings instead of {len(outputs)} in another run"
+    elif (outputs != repeated).any():
+        row = int(np.argmax((outputs != repeated).any(axis=1)))
+        difference = f"setting {row} is {repeated[row].tolist()} instead of {outputs[row].tolist()}"
+        yield "repetition", expected, f"{difference} in another run"
 
 
 def _try(
     load: Callable[[], Callable[[Rows], Results]], characteristics: CharacteristicSet, settings: FloatArray
 ) -> Iterator[Failure]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
-    run, everything = load(), np.arange(len(settings))
-    outputs, run_anew = run(everything), load()
-    others = [
-        ("repetition", "in a second run", everything),
-        ("order", "in another order", everything[::-1]),
-        *(("alone", "in a smaller batch", rows) for rows in np.array_split(everything, SMALLER_BATCHES)),
-        *(("alone", "alone", everything[i : i + 1]) for i in (0, len(settings) - 1)),
+    run, all_rows = load(), np.arange(len(settings))
+    outputs, run_anew = run(all_rows), load()
+    other_runs = [
+        (run, "repetition", "in a second run", all_rows),
+        (run_anew, "order", "in another order", all_rows[::-1]),
+        *((run_anew, "alone", "in a smaller batch", rows) for rows in np.array_split(all_rows, SMALLER_BATCHES)),
+        (run_anew, "alone", "alone", all_rows[:1]),
+        (run_anew, "alone", "alone", all_rows[-1:]),
     ]
-    for check, circumstance, rows in others:
-        other_outputs = (run if check == "repetition" else run_anew)(rows)
+    for other_run, check, circumstance, rows in other_runs:
+        other_outputs = other_run(rows)
         for row, difference in differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
             yield (
                 check,
@@ -167,11 +164,11 @@ def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     safety_degree = 1.0 - 1.5 * share.mean(axis=1)
     names = {metric.name for metric in scoring.metrics} | {objective.name for objective in scoring.objectives}
-    columns = (name for name in names if not name.startswith("f_"))
+    metrics = (name for name in names if not name.startswith("f_"))  # without f_diff and f_num_diff
     return Evaluations(
         settings=settings,
         outcome=np.where(safety_degree < 0, "collision", "stopped").astype("U16"),
-        metrics=dict.fromkeys(sorted(columns), np.abs(safety_degree)) | {"safety_degree": safety_degree},
+        metrics=dict.fromkeys(sorted(metrics), np.abs(safety_degree)) | {"safety_degree": safety_degree},
         collision_speed=np.where(safety_degree < 0, -safety_degree, np.nan),
         f_diff=characteristics.largest_change(settings),
         f_num_diff=characteristics.number_changed(settings),
