@@ -23,16 +23,17 @@ def whole_file(path: Path, source: str = "") -> Iterator[Path]:
     OSError becomes an InputError that names `source`, if it is given.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
-    is_new = target.is_file() or not target.exists()
-    file = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(4)}.tmp{target.suffix}") if is_new else path
+    is_stream = target.exists() and not target.is_file()
+    short_stem = target.stem[:100]  # file systems limit the length of names
+    file = path if is_stream else target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
     try:
         yield file
-        if is_new:
+        if not is_stream:
             with open(file, "rb+") as stream:
                 os.fsync(stream.fileno())
             os.replace(file, target)
     except BaseException as error:
-        if is_new:
+        if not is_stream:
             file.unlink(missing_ok=True)
         if source and isinstance(error, OSError):
             raise unwritable(path, source, error) from None

@@ -28,12 +28,14 @@ SECONDS_BETWEEN_LINES = 30.0
 """Interval of the lines that show progress without a terminal [s]."""
 SETTLING_TIME = 2.0
 """Work before the time left is shown [s]: batches that end together make earlier estimates meaningless."""
+UNLIMITED_WIDTH = 1_000_000
+"""Width in which no line is broken [characters]."""
 
 
 class WholeTable(Table):
     """A table of plain text that cuts nothing off.
 
-    It breaks lines between words, without padding if need be, and words only if they do not fit.
+    In a narrow terminal it breaks lines between words; then it goes without padding; only then it breaks words.
 
     Columns under `text_heads` hold text, those under `right` numbers. Text is shown as it is, without markup.
     """
@@ -53,11 +55,11 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self._title_line:
             yield self._title_line  # rich breaks a title where its table ends
-        wide_options, sizes = options.update(width=1_000_000), list[tuple[int, int]]()
+        wide_options, sizes = options.update(width=UNLIMITED_WIDTH), list[tuple[int, int]]()
         for column in self.columns:
             cells = [Measurement.get(console, wide_options, cell) for cell in (column.header, *column.cells)]
             sizes.append((max(cell.minimum for cell in cells), max(cell.maximum for cell in cells)))
-        least_width = sum(longest_word + 1 for longest_word, _ in sizes) + 1
+        least_width = sum(longest_word + 1 for longest_word, _ in sizes) + 1  # with a line around each column
         words_fit = least_width <= options.max_width
         if words_fit and least_width + 2 * len(sizes) > options.max_width:
             self.padding = 0
@@ -211,7 +213,7 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            console.print(f"{line}, {time_left.render()}", soft_wrap=True, markup=False, highlight=False)
+            print_text(console, f"{line}, {time_left.render()}")
 
     stage = TextColumn("{task.description}", markup=False)
     columns = (stage, BarColumn(bar_width=None), MofNCompleteColumn(), time_left)

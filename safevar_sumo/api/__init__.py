@@ -1,5 +1,5 @@
-"""The public library without the questions of `safevar_sumo.analysis`, but with the research questions as tables and
-figures; `import safevar_sumo` re-exports the names.
+"""The public library, which `import safevar_sumo` re-exports, without the questions of `safevar_sumo.analysis`; but the
+research questions are here, as tables and figures.
 """
 
 from __future__ import annotations

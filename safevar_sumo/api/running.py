@@ -150,11 +150,12 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
     if not (results.path / MANIFEST).exists():
         return []
     earlier, now = read_manifest(results.path)["study"]["search"]["evaluations"], study.search.evaluations
-    changed = (
-        f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
-        "name another solution than in earlier output and reports"
-    )
-    remarks = [] if earlier == now else [changed]
+    remarks = []
+    if earlier != now:
+        remarks.append(
+            f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
+            "name another solution than in earlier output and reports"
+        )
     names = stored_runs(results.path) - set(map(str, all_runs(study)))
     if names:
         remarks.append(

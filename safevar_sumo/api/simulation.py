@@ -51,7 +51,7 @@ OBSERVATION_HEADS = {
 
 
 def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd.DataFrame:
-    """One row per step of the only vehicle while its simulation counts.
+    """One row for each step of a simulation of one vehicle, until its end.
 
     The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true
     position; the columns that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the
@@ -193,8 +193,8 @@ class Simulation:
     def _repr_html_(self) -> str:
         import pandas as pd
 
-        both = [{**one.setting, **one.metrics, **one.objectives} for one in (self.original, self)]
-        return f"<p>{escape(repr(self))}</p>\n{pd.DataFrame(both, ['original', 'simulated']).T.to_html()}"
+        rows = [{**vehicle.setting, **vehicle.metrics, **vehicle.objectives} for vehicle in (self.original, self)]
+        return f"<p>{escape(repr(self))}</p>\n{pd.DataFrame(rows, ['original', 'simulated']).T.to_html()}"
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
@@ -233,8 +233,8 @@ def simulate(
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or (after the
-    filter, with `filtered`) infeasible.
+    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, after the filter if
+    `filtered`, infeasible.
     """
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
@@ -243,7 +243,7 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool) -> Simulation:
-    """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
+    """Simulate a setting, shape (n,), which is filtered first if `filtered`, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
     no_verdict = why_no_verdict(system)
@@ -254,7 +254,7 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     return replace(
         simulation,
         _original=original if is_changed else None,
-        reset_values={name: value for name, value, kept in values if value != kept},
+        reset_values={name: value for name, value, simulated in values if value != simulated},
     )
 
 

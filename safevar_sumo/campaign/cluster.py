@@ -99,7 +99,8 @@ class ClusterPool:
             return None
 
         try:
-            messages = Queue(name := f"safevar-{uuid4()}", client=self._client)
+            name = f"safevar-{uuid4()}"
+            messages = Queue(name, client=self._client)
             future = self._client.submit(_carry, self._time_limit, _versions(), job, name, pure=False)
             while (message := receive()) is not None:
                 report(message)

@@ -49,7 +49,11 @@ def check_output(path: Path | None, flag: str, endings: tuple[str, ...] = PICTUR
 def check_study_output(path: Path | None, flag: str, studies: Sequence[Study]) -> None:
     """Refuse an output file that is no study file, cannot be written, or is a file of one of the studies."""
     check_output(path, flag, (".toml",))
-    if path is not None and path.exists() and any(path.samefile(file) for one in studies for file in one.origin.files):
+    if (
+        path is not None
+        and path.exists()
+        and any(path.samefile(file) for study in studies for file in study.origin.files)
+    ):
         raise InputError(flag, f"{path} is an input of the command", "another file")
 
 
@@ -160,7 +164,9 @@ Decorator = Callable[[CommandFunction], CommandFunction]
 
 
 class CommandTarget(NamedTuple):
-    """A study and its name in errors; if a solution is to be replayed, its handle, setting and row of the results."""
+    """What a command works on: a study, and its name in errors; of a solution to replay, also the handle, the setting,
+    and the row of the results.
+    """
 
     study: Study
     source: str
@@ -170,7 +176,7 @@ class CommandTarget(NamedTuple):
 
 
 def load_target(source: str, solution: str | None, choice: str | None) -> CommandTarget:
-    """Load the subject of a command: a study by name or path, or a results directory.
+    """Load a study by name or path, or the study of a results directory, with the solution that is named or chosen.
 
     Raises
     ------
@@ -339,8 +345,8 @@ class Condition(NamedTuple):
 
 
 def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:
-    """The values under names in the JSON; in a list, an element by its index, or all elements that have the name.
-    Nothing under an undefined value (None) is defined.
+    """The values under `names`, one below the other, in the JSON. In a list, an index names an element, and any other
+    name a value of each element that has it. Whatever is under an undefined value (None) is undefined.
     """
     values = [answer]
     for name in names:
@@ -351,7 +357,7 @@ def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:
                 raise InputError("--fail-if", problem, f"an index below {len(shortest)}")
             values = [*(value[int(name)] for value in lists), *(None for value in values if value is None)]
             continue
-        elements = [one for value in values for one in (value if isinstance(value, list | tuple) else [value])]
+        elements = [element for value in values for element in (value if isinstance(value, list | tuple) else [value])]
         tables = [element for element in elements if isinstance(element, dict)]
         undefined = [element for element in elements if element is None]
         if elements and not undefined and not any(name in table for table in tables):

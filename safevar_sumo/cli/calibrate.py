@@ -106,8 +106,8 @@ def calibrate_command(
 def _fit(
     subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: bool, jobs: int | None
 ) -> list[Calibration]:
-    """Fit the studies with progress; now and then, and if it is interrupted, write the best so far, without the spread
-    before the fit.
+    """Fit the studies with progress; now and then, and if it is interrupted, write the best studies so far, without
+    `spread` and `model_error`, which belong to the values before the fit.
     """
     studies = [subject.study for subject in subjects]
     fit, done, lowest_loss, best, last_save = studies[0].fit, 0, 0.0, list(studies), time.monotonic()
@@ -115,8 +115,8 @@ def _fit(
 
     def save_best(ending: str) -> None:
         comment = f"Best of {done} of {trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
-        found = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
-        _write_studies(targets, studies, found, [comment] * len(studies))
+        best_without_spread = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
+        _write_studies(targets, studies, best_without_spread, [comment] * len(studies))
 
     def after_trial(loss: float, best_studies: tuple[Study, ...]) -> None:
         nonlocal done, lowest_loss, best, last_save

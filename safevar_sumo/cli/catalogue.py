@@ -69,6 +69,7 @@ def list_command(section: str | None, as_json: bool) -> None:
         return
     console = Console()
     for key, rows in catalogue.items():
+        # One table for each vehicle, one for each other section.
         owners: list[JsonObject] = rows if key == "vehicles" else [{"name": "", "characteristics": rows}]
         for owner in owners:
             title, columns = TABLES[key]
@@ -115,7 +116,7 @@ def _catalogue(
         "vehicles": [
             {
                 "name": name,
-                "characteristics": [{key: getattr(one, key) for key in keys} for one in characteristics.get(name, ())],
+                "characteristics": [{key: getattr(row, key) for key in keys} for row in characteristics.get(name, ())],
             }
             for name in VEHICLES
         ],

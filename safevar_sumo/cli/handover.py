@@ -61,7 +61,8 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
     write = FORMATS[format_name]
     answers = answer_questions(load_cases(directories), question)
     if format_name in FORMATS_WITHOUT_NOTES:
-        _print_notes(list(dict.fromkeys(note for answer in answers for note in answer.notes)))
+        for note in dict.fromkeys(note for answer in answers for note in answer.notes):
+            print_note(note)
     if out is not None:
         make_directory(out)
         for answer in answers:
@@ -89,14 +90,10 @@ def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
     paths, notes = save_figures(cases, out, format_name)
-    _print_notes([*(remark for case in cases for remark in case.remarks), *notes])
+    for note in (*(remark for case in cases for remark in case.remarks), *notes):
+        print_note(note)
     for path in paths:
         click.echo(str(path))
-
-
-def _print_notes(notes: list[str]) -> None:
-    for note in notes:
-        print_note(note)
 
 
 @commands.command()
@@ -229,19 +226,20 @@ MAX_ROWS = 30
 
 
 def print_verification(console: Console, result: Verification) -> None:
-    """Print a row for each answer, a row for all the same solutions together, and a row for each that is not the
-    same.
+    """Print a row for each answer; for solutions and settings, a row for each that is not the same, and one for all of
+    a verdict together.
     """
-    table, number = WholeTable("study", "claim", "verdict", "in the pack", "here"), Counter[tuple[str, ...]]()
+    table, counts = WholeTable("study", "claim", "verdict", "in the pack", "here"), Counter[tuple[str, ...]]()
     for claim in result.claims:
-        kind = (claim.study, f"{claim.claim.partition(' ')[0]}s", claim.verdict)
-        is_row = claim.claim.startswith(("solution ", "setting "))
-        number[kind] += is_row
-        if not is_row or (claim.verdict != "same" and number[kind] <= MAX_ROWS):
+        kind = claim.claim.partition(" ")[0]
+        if kind not in ("solution", "setting"):
             table.add_row(*claim)
-    for (study, kinds, verdict), count in number.items():
-        if count:
-            table.add_row(study, f"{count} {kinds} together", verdict, "", "")
+            continue
+        counts[claim.study, kind, claim.verdict] += 1
+        if claim.verdict != "same" and counts[claim.study, kind, claim.verdict] <= MAX_ROWS:
+            table.add_row(*claim)
+    for (study, kind, verdict), count in counts.items():
+        table.add_row(study, f"{count} {kind}s together", verdict, "", "")
     console.print(table)
     same, differ = result.count_verdict("same"), result.count_verdict("differs")
     rest = len(result.claims) - same - differ

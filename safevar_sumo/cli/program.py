@@ -74,8 +74,6 @@ COMMANDS_BY_GROUP = {
 help.
 """
 COMMANDS = {name: command for group in COMMANDS_BY_GROUP.values() for name, command in group.items()}
-
-
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 """An argument of a function of the library in an error, such as `method=monte_carlo`."""
 
@@ -107,11 +105,8 @@ class LazyCommands(click.Group):
             return super().invoke(ctx)
         except InputError as error:
             command = super().get_command(ctx, str(ctx.invoked_subcommand))
-            flags = (
-                {option.name: option.opts[-1] for option in command.params if isinstance(option, click.Option)}
-                if command
-                else {}
-            )
+            parameters = command.params if command else []
+            flags = {option.name: option.opts[-1] for option in parameters if isinstance(option, click.Option)}
             if isinstance(error.source, str):  # a path is no argument
                 error.source = flags.get(error.source, error.source)
             to_flag = partial(_to_flag, flags)
@@ -125,8 +120,11 @@ class LazyCommands(click.Group):
 
 
 def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
+    """The flag that sets an argument, with its value unless the flag takes none; other words as they are."""
     name, value = argument.groups()
-    return argument[0] if name not in flags else flags[name] if value in (None, "True") else f"{flags[name]} {value}"
+    if name not in flags:
+        return argument[0]
+    return flags[name] if value in (None, "True") else f"{flags[name]} {value}"
 
 
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})

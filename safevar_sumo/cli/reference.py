@@ -130,7 +130,7 @@ def _print_agreement(
 def print_by_metric(console: Console, title: str, columns: Mapping[str, Sequence[Mapping[str, float | None]]]) -> None:
     """Print a table with a row for each metric; a cell shows the metric's numbers in each mapping of its column."""
     table = WholeTable("", right=columns, title=title)
-    for name in next(iter(columns.values()))[0]:
+    for name in next(iter(columns.values()))[0]:  # all mappings have the same metrics
         table.add_row(
             METRICS[name].heading,
             *(
@@ -182,7 +182,7 @@ def read_rows(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
 
 
 def find_owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
-    """Find the index of the study that a reference file belongs to, as STUDY=FILE or the file's name says, and the
+    """Find the index of the study that a reference file belongs to, as `STUDY=FILE` or the file's name says, and the
     file's path.
     """
     names = [study.name for study in studies]
@@ -197,7 +197,7 @@ def find_owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
             f"{word} may belong to any of {', '.join(names)}",
             "STUDY=FILE.csv, or a file name that begins with the study's name",
         )
-    return names.index(max(candidates, key=len)), path
+    return names.index(max(candidates, key=len)), path  # sun_wet.csv belongs to `sun_wet`, not to `sun`
 
 
 MULTIVALUE_FLAGS = ("--published", "--reference")

@@ -223,6 +223,7 @@ def _print_results(
         print_json(answer)
     else:
         print_simulation(Console(), simulation)
+        # strict=False: without --spread there are none
         for vehicle, model_spread in zip(("the simulated vehicle", "the original"), spreads, strict=False):
             print_text(Console(), f"The vehicle model's own uncertainty, {vehicle}: {model_spread}.")
         if system.rater is None:

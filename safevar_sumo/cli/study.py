@@ -233,7 +233,8 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         )
     if solutions.empty:
         lines.append("No solution.")
-    for worst in solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").head(1).to_dict("records"):
+    else:
+        worst = solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").iloc[0]
         lines.append(
             f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
             f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:"
@@ -272,8 +273,8 @@ MAX_RUNS_NAMED = 12
 
 
 def status_view(progress: Status, rate: float | None) -> Group:
-    """The study's runs by algorithm and its front so far; `rate` is the share of all work that is done per second, None
-    if unknown.
+    """The study's runs by algorithm, and its front so far; `rate` is the share of all work that is done in a second,
+    None if unknown.
     """
     table = WholeTable(
         "algorithm",
@@ -302,6 +303,7 @@ def status_view(progress: Status, rate: float | None) -> Group:
         right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
         title=f"Front so far: {len(front)} points, the most severe ones",
     )
-    for f_safe, f_diff, number in front[front[:, 0].argsort(kind="stable")][:MAX_FRONT_ROWS].tolist():
+    by_safety_degree = front[:, 0].argsort(kind="stable")
+    for f_safe, f_diff, number in front[by_safety_degree][:MAX_FRONT_ROWS].tolist():
         front_table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
     return Group(table, Text(under_way), Text(done), front_table)

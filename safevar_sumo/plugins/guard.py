@@ -242,12 +242,12 @@ class Guard(NamedTuple):
         scalars: Collection[str] = (),
     ) -> dict[str, Any]:
         """The attributes of a result that are named in `legal`, each checked; those in `scalars` are single numbers."""
-        shapes = {name: () if name in scalars else shape for name in legal}
-        columns = {
-            name: self.numbers(method, name, self.field(method, value, name), shapes[name], legal[name])
-            for name in legal
-        }
-        return {name: column.item() if name in scalars else column for name, column in columns.items()}
+        columns = dict[str, Any]()
+        for name, legal_numbers in legal.items():
+            is_scalar, attribute = name in scalars, self.field(method, value, name)
+            column = self.numbers(method, name, attribute, () if is_scalar else shape, legal_numbers)
+            columns[name] = column.item() if is_scalar else column
+        return columns
 
     def numbers(
         self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...], legal: Legal = FINITE

@@ -147,10 +147,9 @@ def carla_physics(setting: Mapping[str, float], source: str) -> dict[str, dict[s
         raise InputError(
             source, f"its vehicle has no {', '.join(missing)}", "the vehicle `carla`, or `to=openscenario`"
         )
-    tables = {"physics": CARLA_PHYSICS, "wheels": CARLA_WHEELS}
     return {
-        table: {attribute: setting[name] for name, attribute in attributes.items()}
-        for table, attributes in tables.items()
+        "physics": {attribute: setting[name] for name, attribute in CARLA_PHYSICS.items()},
+        "wheels": {attribute: setting[name] for name, attribute in CARLA_WHEELS.items()},
     }
 
 
@@ -184,23 +183,20 @@ def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float
 
 def export(comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, Mapping[str, float]]) -> None:
     """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or "openscenario"."""
-    road, scene = open_drive(comparison.network), carla_scene(comparison, physics, handle) if to == "carla" else {}
+    files = {ROAD: open_drive(comparison.network)}
     if to == "carla":
-        script = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")
-        files = {SCRIPT: script, VEHICLE: json.dumps(scene, indent=1, allow_nan=False) + "\n"}
+        scene = carla_scene(comparison, physics, handle)
+        files[SCRIPT] = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")
+        files[VEHICLE] = json.dumps(scene, indent=1, allow_nan=False) + "\n"
     else:
-        actors = poses_of(comparison)
-        files = {
-            SCENARIO: template_environment()
-            .get_template(f"{SCENARIO}.j2")
-            .render(
-                title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
-                road=ROAD,
-                actors=actors,
-                end=max(float(actor.time[-1]) for actor in actors),
-                wheelbase=WHEELBASE,
-            )
-        }
+        actors, template = poses_of(comparison), template_environment().get_template(f"{SCENARIO}.j2")
+        files[SCENARIO] = template.render(
+            title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
+            road=ROAD,
+            actors=actors,
+            end=max(float(actor.time[-1]) for actor in actors),
+            wheelbase=WHEELBASE,
+        )
     make_directory(out)
-    for name, text in {**files, ROAD: road}.items():
+    for name, text in files.items():
         write_whole(out / name, text)

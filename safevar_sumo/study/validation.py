@@ -44,7 +44,10 @@ def convert_table(source: object, raw: object, table: type[T], prefix: str = "")
         return msgspec.convert(raw, table)
     except msgspec.ValidationError as error:
         raise_mistakes(schema_mistakes(source, raw, table, prefix))
-        raise error_with_key(source, error, prefix) from None
+        # The schema finds nothing: msgspec's own error, whose place becomes the key.
+        problem, _, location = str(error).partition(" - at `$")
+        path = f"{prefix}{location.rstrip('`')}".removeprefix(".")
+        raise InputError(source, f"{path}: {problem}" if path else problem) from None
 
 
 def raise_mistakes(errors: Iterable[InputError]) -> None:
@@ -132,11 +135,10 @@ def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str]) 
         for field in msgspec.structs.fields(Study)
         for known in getattr(field.type, "__struct_fields__", ())
     ]
-    suggestions = [f"{table}.{known}" for table, known in keys_of_tables if known == key]
     hint = did_you_mean(key, [*names, *(known for _, known in keys_of_tables if key_path == key)])
-    if not suggestions:
-        nearest = [(table, known) for table, known in keys_of_tables if repr(known) in hint and known not in names]
-        suggestions = [f"{table}.{known}" for table, known in nearest]
+    same = [f"{table}.{known}" for table, known in keys_of_tables if known == key]
+    nearest = [f"{table}.{known}" for table, known in keys_of_tables if repr(known) in hint and known not in names]
+    suggestions = same or nearest
     if suggestions and "[" not in key_path:
         hint = f"; did you mean {' or '.join(suggestions)}?"
     return InputError(source, f"{key_path}: there is no such key{hint}", one_of(names))
@@ -150,13 +152,6 @@ def _path_text(path: Sequence[str | int]) -> str:
         else:
             text += ("." if text else "") + (repr(key) if ("." in key and text) or not key.isprintable() else key)
     return text
-
-
-def error_with_key(source: object, error: msgspec.ValidationError, prefix: str) -> InputError:
-    """Turn msgspec's error into an error that names the key."""
-    problem, _, location = str(error).partition(" - at `$")
-    path = f"{prefix}{location.rstrip('`')}".removeprefix(".")
-    return InputError(source, f"{path}: {problem}" if path else problem)
 
 
 def short_text(value: object) -> str:
