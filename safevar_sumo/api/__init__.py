@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from safevar_sumo.analysis.case import Case
-    from safevar_sumo.analysis.research_questions.answer import Answer
+    from safevar_sumo.analysis.research_questions.answer import TableAnswer
 
 
 class Tables(dict[str, "pd.DataFrame"]):
     """Answers by name, each a tidy frame over all results; a notebook shows them in the paper's layout."""
 
-    def __init__(self, answers: list[Answer]) -> None:
+    def __init__(self, answers: list[TableAnswer]) -> None:
         super().__init__({answer.name: answer.frame for answer in answers})
         self.answers = answers
 

@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.case import load_cases
-from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_questions
+from safevar_sumo.analysis.research_questions.answer import QUESTION_NAMES, answer_questions
 from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS
 from safevar_sumo.cli.arguments import (
@@ -46,7 +46,7 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
 
 @commands.command()
 @directories_argument
-@click.option("--rq", "question", type=click.Choice(QUESTIONS), help="Answer only this question.")
+@click.option("--rq", "question", type=click.Choice(QUESTION_NAMES), help="Answer only this question.")
 @click.option(
     "--format",
     "format_name",

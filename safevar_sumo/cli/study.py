@@ -19,7 +19,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from safevar_sumo.analysis.research_questions.statistics import nondominated_points
+from safevar_sumo.analysis.research_questions.fronts import nondominated_points
 from safevar_sumo.analysis.words import change_texts, two_decimals
 from safevar_sumo.api.running import ENGINES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast

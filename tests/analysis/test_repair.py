@@ -18,7 +18,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.analysis.repair import attack, compute, smallest
 from safevar_sumo.analysis.repair.answer import NotRepairable, write_repair
-from safevar_sumo.analysis.repair.problem import Parameter, Problem
+from safevar_sumo.analysis.repair.problem import Parameter, RepairProblem
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.shipped import STUDY_SCHEMA
@@ -196,9 +196,12 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
 ) -> None:
     problem: Any = Adding(parameters, need)
     search = smallest.Search(problem, np.linspace(0.5, 0, 20)[:, np.newaxis], [])
-    search.pareto_set(lambda one: 0.0)
+    search.pareto_set(lambda _: 0.0)
     search.add(np.linspace(1, 0.5, 20)[:, np.newaxis])  # what was found before becomes a lower bound
-    found = {int((one != problem.today).sum()): float(search.change(one)) for one in search.pareto_set(lambda one: 0.0)}
+    found = {
+        int((change != problem.today).sum()): float(search.largest_change(change))
+        for change in search.pareto_set(lambda _: 0.0)
+    }
     assert found == pytest.approx(changed, abs=0.005)
 
 
@@ -226,7 +229,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
     nothing: Any = None
     rows = [Parameter("a", "m", "", low, high, False, low) for low, high in ((1000.0, 1001.0), (0.0, 20.0))]
-    problem = Problem(evaluator=nothing, promise=nothing, parameters=rows, margin=0.3)
+    problem = RepairProblem(evaluator=nothing, promise=nothing, parameters=rows, margin=0.3)
     assert problem.values(np.array([[0.45678, 0.41234567]])).tolist() == [[1000.457, 8.247]]
 
 

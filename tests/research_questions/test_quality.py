@@ -20,20 +20,22 @@ from hypothesis import given, strategies as st
 
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.statistics import (
-    EXACT_TEST,
-    compare_samples,
+from safevar_sumo.analysis.research_questions.fronts import (
     compute_attainment,
     compute_convergence,
     compute_indicators,
-    correct_by_holm,
-    critical_difference,
-    defined_minimised_values,
     hypervolume,
-    magnitude_of,
     nondominated_points,
     normalised,
+    points_of,
     reference_front,
+)
+from safevar_sumo.analysis.research_questions.statistics import (
+    EXACT_TEST,
+    compare_samples,
+    correct_by_holm,
+    critical_difference,
+    magnitude_of,
     signed_rank_test,
 )
 from safevar_sumo.analysis.research_questions.tables import as_json, as_latex, as_markdown, as_text
@@ -84,7 +86,7 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     assert set(grown["evaluations"]) >= {10, 100}
     for run, group in grown.groupby("run"):
         assert (np.diff(group["hypervolume"]) >= 0).all()
-        points = defined_minimised_values(case, case.evaluations[case.evaluations["run"] == run])
+        points = points_of(case, case.evaluations[case.evaluations["run"] == run])
         volume = moocore.hypervolume(normalised(points, reference_front(case)), ref=[1.1] * 3)
         assert group["hypervolume"].iloc[-1] == pytest.approx(volume)
     early = grown[(grown["run"] == 0) & (grown["evaluations"] >= 40)]
@@ -107,7 +109,7 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[fl
     won = sum((a > b) + 0.5 * (a == b) for a in x for b in y)
     there, back = compare_samples(x, y), compare_samples(y, x)
     assert there.effect_size == pytest.approx(won / (len(x) * len(y)))
-    assert back.reversed_if(True).effect_size == pytest.approx(there.effect_size)
+    assert back.reversed().effect_size == pytest.approx(there.effect_size)
     assert 0 <= there.p_value <= 1
     assert back.p_value == pytest.approx(there.p_value)
 

@@ -12,7 +12,7 @@ import pandas as pd
 from rich.table import Table
 
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, VERMILION, escape_dollars, new_figure
-from safevar_sumo.analysis.research_questions.answer import WEATHER, Answer
+from safevar_sumo.analysis.research_questions.answer import WEATHER, TableAnswer
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
 from safevar_sumo.analysis.research_questions.tables import as_json
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
@@ -141,7 +141,7 @@ class SystemComparison:
         if self.a.points is not None:
             answer["rating"] = {"a": self.a.points, "b": self.b.points}
         if self.weather is not None:
-            answer[WEATHER] = json.loads(as_json([Answer(WEATHER, self.weather, ())]))
+            answer[WEATHER] = json.loads(as_json([TableAnswer(WEATHER, self.weather, ())]))
         return answer
 
     @property

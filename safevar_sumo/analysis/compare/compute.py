@@ -13,7 +13,7 @@ from safevar_sumo.analysis.compare.answer import Side, SystemComparison
 from safevar_sumo.analysis.evaluator import MAX_REJECTIONS, Evaluator, sobol_points
 from safevar_sumo.analysis.rating.compute import rate
 from safevar_sumo.analysis.research_questions.changes import compare_weathers
-from safevar_sumo.analysis.research_questions.statistics import compare_samples, fewest_runs, signed_rank_test
+from safevar_sumo.analysis.research_questions.statistics import FEWEST_RUNS, compare_samples, signed_rank_test
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance.scans import scan
 from safevar_sumo.analysis.words import number_of
@@ -170,7 +170,7 @@ def _test(frame: pd.DataFrame) -> tuple[float | None, float | None, str, int]:
     pairs, unit = frame[frame["source"] == SAMPLE][["a", "b"]], "setting"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[["a", "b"]].mean()
-        if len(means) >= fewest_runs("RQ1"):
+        if len(means) >= FEWEST_RUNS["RQ1"]:
             pairs, unit = means, "run"
     a, b = pairs.to_numpy(dtype=float).T
     p, a12 = signed_rank_test(a - b, 0.0).p_value, compare_samples(a, b).effect_size

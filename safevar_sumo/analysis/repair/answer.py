@@ -32,8 +32,10 @@ if TYPE_CHECKING:
 
 
 class NotRepairable(NamedTuple):
-    """A part of the promise that no driving system survives: `limits` are the values of a minimal cause at which full
-    braking at the first possible moment first fails, at a test `point`; `share` of the first counterexamples fail so.
+    """A part of the promise that no driving system survives.
+
+    `limits` are the values of a minimal cause at which full braking at the first possible moment first fails, at a test
+    `point`; `share` of the first vehicles tried cannot be kept safe.
     """
 
     limits: dict[str, float]
@@ -125,39 +127,35 @@ class Repairs:
 
     def to_dict(self) -> list[JsonObject]:
         """The JSON of `repair`."""
-        largest = (
-            {}
-            if self.repairs or self.proof_of_today
-            else {"largest_promise": None if self.largest_promise is None else self.largest_promise.to_dict()}
-        )
-        summary = {
+        summary: JsonObject = {
             "record": "summary",
             "promise": self.promise.to_dict(),
             "margin": self.margin,
             "repairs": len(self.repairs),
-            "not_repairable": [one._asdict() for one in self.not_repairable],
+            "not_repairable": [part._asdict() for part in self.not_repairable],
             "attacks": self.attacks,
             "simulations": self.simulations,
             "counterexamples": self.counterexamples,
-            **largest,
         }
-        exchanges = [{"record": "exchange", **one._asdict()} for one in self.curve]
-        return [*(one.to_dict() for one in self.repairs), *exchanges, summary, *summary_entry(self.no_verdict)]
+        if not self.repairs and not self.proof_of_today:
+            summary["largest_promise"] = self.largest_promise.to_dict() if self.largest_promise else None
+        exchanges = [{"record": "exchange", **exchange._asdict()} for exchange in self.curve]
+        return [*(repair.to_dict() for repair in self.repairs), *exchanges, summary, *summary_entry(self.no_verdict)]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each repair: `parameters`, `changed`, `largest_change`, and the price [m, s, m/s^2, m/s^3]."""
         rows = [
             {
-                "parameters": self._changes_in_words(one),
-                "changed": len(one.values),
-                "largest_change": one.largest_change,
-                "metres_earlier_mean": one.price.mean,
-                "metres_earlier_worst": one.price.worst,
-                "seconds_earlier": one.price.seconds,
-                "largest_deceleration": one.price.deceleration,
-                "largest_jerk": one.price.jerk,
+                "parameters": self._changes_in_words(repair),
+                "changed": len(repair.values),
+                "largest_change": repair.largest_change,
+                "metres_earlier_mean": repair.price.mean,
+                "metres_earlier_worst": repair.price.worst,
+                "seconds_earlier": repair.price.seconds,
+                "largest_deceleration": repair.price.deceleration,
+                "largest_jerk": repair.price.jerk,
             }
-            for one in self.repairs
+            for repair in self.repairs
         ]
         columns = ["parameters", "changed", "largest_change", "metres_earlier_mean", "metres_earlier_worst"]
         return pd.DataFrame(rows, columns=[*columns, "seconds_earlier", "largest_deceleration", "largest_jerk"])
@@ -172,16 +170,19 @@ class Repairs:
         """
         if not self.curve:
             raise InputError("plot", "there is no curve", "a characteristic for the curve")
-        (one,) = (one for one in self.promise.region.characteristics if one.name == self.curve[0].characteristic)
+        name = self.curve[0].characteristic
+        (unit,) = (member.unit for member in self.promise.region.characteristics if member.name == name)
         figure, (axis,) = new_panels(
             f"{self.study.name}: promised wear and earlier braking", 1, 1, (4.0, 2.6), min_width=4.6, title_height=1.0
         )
-        repaired = [(part.promise, part.metres_earlier) for part in self.curve if part.metres_earlier is not None]
-        axis.plot([end for end, _ in repaired], [metres for _, metres in repaired], "o-", color=BLUE)
-        lost = [part.promise for part in self.curve if not part.repairable]
+        priced = {
+            exchange.promise: exchange.metres_earlier for exchange in self.curve if exchange.metres_earlier is not None
+        }
+        axis.plot(list(priced), list(priced.values()), "o-", color=BLUE)
+        lost = [exchange.promise for exchange in self.curve if not exchange.repairable]
         if lost:
             axis.axvspan(min(lost), max(lost), facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white")
-        axis.set_xlabel(f"promised {one.name} [{as_formula(one.unit)}]", fontsize=FONT_SIZE)
+        axis.set_xlabel(f"promised {name} [{as_formula(unit)}]", fontsize=FONT_SIZE)
         axis.set_ylabel("brakes earlier [m]", fontsize=FONT_SIZE)
         return figure
 
@@ -211,7 +212,8 @@ class Repairs:
             return f"{number} this wear ({self.promise.in_words}): {self._changes_in_words(first)}."
         if self.largest_promise is None:
             return (
-                f"No change of {join_phrases(one.name for one in self.parameters)} survives any part of this promise."
+                f"No change of {join_phrases(parameter.name for parameter in self.parameters)} survives any part of "
+                "this promise."
             )
         return (
             f"No change survives this promise ({self.promise.in_words}). The largest that can be kept: "
@@ -228,8 +230,8 @@ class Repairs:
             worst = f"safety degree {degree:.2f} m" if degree >= 0 else f"a collision at {-degree:.2f} m/s"
             yield f"  today              the worst vehicle of the promise: {worst}"
             yield f"  price on a new car {_price_in_words(first.price)}"
-            for one in self.repairs[1:]:
-                yield f"  or                 {self._changes_in_words(one)}: {_price_in_words(one.price)}"
+            for other in self.repairs[1:]:
+                yield f"  or                 {self._changes_in_words(other)}: {_price_in_words(other.price)}"
             yield f"  checked            {_proof_in_words(first.proof)}{_held_out_in_words(first.held_out)}"
         if self.curve:
             yield self._curve_table()
@@ -237,33 +239,34 @@ class Repairs:
             yield f"  not searched       no simulation reads {name}"
         for part in self.not_repairable:
             limits = [
-                f"{name} {'below' if value < one.original else 'above'} {one.text(value)}{one.suffix}"
-                for one in self.promise.region.characteristics
+                f"{name} {'below' if value < member.original else 'above'} {member.text(value)}{member.suffix}"
+                for member in self.promise.region.characteristics
                 for name, value in part.limits.items()
-                if name == one.name
+                if name == member.name
             ]
             place = f" ({part.point})" if part.point else ""
-            part_text = " with ".join(limits) or "even the original"
-            yield f"  not repairable     {part_text}{place}: needs another part, not a parameter"
+            wear = " with ".join(limits) or "even the original"
+            yield f"  not repairable     {wear}{place}: needs another part, not a parameter"
 
     def _curve_table(self) -> WholeTable:
         name = self.curve[0].characteristic
         table = WholeTable(f"promise of {name}", right=("brakes earlier [m]",), title="The exchange rate")
-        for one in self.curve:
-            metres = "-" if one.metres_earlier is None else f"{one.metres_earlier:.2f}"
-            table.add_row(f"{one.promise:.4g}", metres if one.repairable else "no parameter repairs it")
+        for exchange in self.curve:
+            metres = "-" if exchange.metres_earlier is None else f"{exchange.metres_earlier:.2f}"
+            table.add_row(f"{exchange.promise:.4g}", metres if exchange.repairable else "no parameter repairs it")
         return table
 
     def _changes_in_words(self, repair: Repair) -> str:
         return ", ".join(
-            f"{one.name} {one.today:.6g} -> {repair.values[one.name]:.10g}{unit_text(one.unit)} ({one.meaning})"
-            for one in self.parameters
-            if one.name in repair.values
+            f"{name} {today:.6g} -> {repair.values[name]:.10g}{unit_text(unit)} ({meaning})"
+            for name, unit, meaning, _, _, _, today in self.parameters
+            if name in repair.values
         )
 
 
 def write_repair(path: Path, result: Repairs) -> None:
-    """Write a study file with the first repair, which extends the study; the whole study, if results hold it alone.
+    """Write a study file with the first repair. It extends the study's file; without a file, it is the whole repaired
+    study.
 
     Raises
     ------
@@ -276,8 +279,8 @@ def write_repair(path: Path, result: Repairs) -> None:
         write_study(path, result.repaired_study(), comment)
         return
     base = os.path.abspath(study.origin.called) if study.origin.called else study.name
-    name = {"name": path.stem} if re.fullmatch(NAME_PATTERN, path.stem) else {"name": f"{study.name}-repaired"}
-    tables = {"extends": base, **name, "ads": {"parameters": values}}
+    name = path.stem if re.fullmatch(NAME_PATTERN, path.stem) else f"{study.name}-repaired"
+    tables = {"extends": base, "name": name, "ads": {"parameters": values}}
     text = f"{SCHEMA_LINE}# {comment}\n\n{tomli_w.dumps(tables)}"
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")

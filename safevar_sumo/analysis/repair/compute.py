@@ -1,8 +1,9 @@
 """Finds repairs by counterexamples: the smallest changes that survive them, attacks, and proof on fresh wear.
 
-The steps of the algorithm: 0. what no driving system survives; 1. counterexamples; 2. the smallest changes that survive
-them (`smallest`); 3. attacks on these, whose failures are new counterexamples (`attack`); 4. the end, when attacks find
-nothing, or the largest promise that can be kept; 5. proof on fresh wear; 6. what the repair has not seen (`price`).
+The steps of the algorithm: 1. counterexamples, without those that no driving system survives; 2. the smallest changes
+that survive them (`smallest`); 3. attacks on these, whose failures are new counterexamples (`attack`); 4. when attacks
+find nothing, the points left out at first; 5. proof on fresh wear; 6. what the repair has not seen (`price`). Without a
+change that survives: the largest promise that can be kept.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.repair.answer import Exchange, NotRepairable, Repair, Repairs
 from safevar_sumo.analysis.repair.attack import Proof, attack, prove
 from safevar_sumo.analysis.repair.price import Prices, check_unseen
-from safevar_sumo.analysis.repair.problem import Problem, Promise, parameters_of
+from safevar_sumo.analysis.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.analysis.repair.smallest import Search
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import FloatArray, JsonObject, differences
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject, differences
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -40,11 +41,13 @@ LEFT_OUT = 3
 HALVINGS = 6
 """Halvings that locate the largest promise that can be kept."""
 CAUSES_OF, WORST_AT_POINTS = 4, 16
-"""Failures of full braking whose causes are told; the worst vehicles that are driven at each point left out."""
+"""Number of failures of full braking whose causes are told; of the worst vehicles, which are driven at each point that
+was left out.
+"""
 EVERY_READER = 8
-"""One in so many counterexamples shows whether a simulation reads a parameter."""
+"""Every so many counterexamples, one is simulated to find whether simulations read a parameter."""
 CURVE_PROMISES, CURVE_VEHICLES = 10, 32
-"""Promises of a curve; Sobol points of each, besides its corners."""
+"""Number of promises of a curve; of Sobol points of each, besides its corners."""
 
 
 def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evaluator) -> Repairs:
@@ -57,28 +60,28 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
     """
     problem = _problem_of(evaluator, options)
     system = assemble(problem.study)
-    prices, count = Prices(problem.study, system), len(system.matrix)
     # 1. Counterexamples: corners and Sobol points of the promise, and failures of the results; the worst first.
-    vehicles = problem.promise.spread(SOBOL_VEHICLES, problem.study.search.seed)
+    vehicles = problem.promise.corners_and_sobol_points(SOBOL_VEHICLES, problem.study.search.seed)
     if not isinstance(source, Study):
         names = list(evaluator.characteristics.names)
         settings = source.solutions[Unsafe(problem.margin).rows(source.solutions)][names].to_numpy(dtype=float)
-        vehicles = np.unique(
-            np.concatenate([vehicles, problem.promise.feasible(problem.promise.of_solutions(settings))]), axis=0
-        )
-    degrees = problem.degrees(problem.today[np.newaxis], vehicles, "the driving system of today")[0][0]
+        failures = problem.promise.feasible(problem.promise.vehicles_among(settings))
+        vehicles = np.unique(np.concatenate([vehicles, failures]), axis=0)
+    degrees = problem.degrees_today(vehicles, "the driving system of today")
     order = np.argsort(degrees, kind="stable")
     vehicles, degrees = vehicles[order], degrees[order]
-    failing = degrees < problem.margin
-    # 0. What no driving system survives needs another part, not a parameter; the rest is repaired.
-    can = ~failing
-    can[failing] = problem.repairable(vehicles[failing])
-    lost, vehicles = vehicles[~can], vehicles[can]
-    not_repairable = _describe(problem, system, lost, len(lost) / len(can))
-    seen = [number for number in range(count) if number % LEFT_OUT != LEFT_OUT - 1]
-    finder = _Finder(problem=problem, prices=prices, points=count, search=Search(problem, vehicles, seen))
+    is_unsafe = degrees < problem.margin
+    # What no driving system survives needs another part, not a parameter; the rest is repaired.
+    is_repairable = ~is_unsafe
+    is_repairable[is_unsafe] = problem.repairable(vehicles[is_unsafe])
+    not_repairable = _describe_not_repairable(problem, system, vehicles, is_repairable)
+    vehicles = vehicles[is_repairable]
+    points = range(len(system.matrix))
+    seen = [number for number in points if number % LEFT_OUT != LEFT_OUT - 1]
+    prices, search = Prices(problem.study, system), Search(problem, vehicles, seen)
+    finder = _Finder(problem=problem, prices=prices, points=points, search=search)
     repairs, unread, largest, curve = list[Repair](), list[str](), None, list[Exchange]()
-    proof_of_today = finder.prove_today() if len(vehicles) and not failing[can].any() else None
+    proof_of_today = finder.prove_today() if len(vehicles) and not is_unsafe[is_repairable].any() else None
     if len(vehicles) and proof_of_today is None:
         finder.problem, unread = _without_unread(problem, finder.search.vehicles)
         finder.search = Search(finder.problem, finder.search.vehicles, seen)
@@ -92,7 +95,7 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
         margin=problem.margin,
         parameters=tuple(problem.parameters),
         repairs=tuple(repairs),
-        worst_today=float(degrees[0] if proof_of_today is None else degrees[can][0]),
+        worst_today=float(degrees[0] if proof_of_today is None else degrees[is_repairable][0]),
         proof_of_today=proof_of_today,
         not_repairable=tuple(not_repairable),
         largest_promise=largest,
@@ -105,7 +108,7 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
     )
 
 
-def _problem_of(evaluator: Evaluator, options: RepairOptions) -> Problem:
+def _problem_of(evaluator: Evaluator, options: RepairOptions) -> RepairProblem:
     """The problem that options state."""
     study = evaluator.study
     if is_rated(study):
@@ -115,24 +118,29 @@ def _problem_of(evaluator: Evaluator, options: RepairOptions) -> Problem:
     if options.curve is not None and options.curve not in evaluator.characteristics.names:
         evaluator.characteristics.setting({options.curve: 0.0}, "curve")  # raises the error of an unknown name
     margin = study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if options.margin is None else options.margin
-    problem = Problem(
+    problem = RepairProblem(
         evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), margin=margin
     )
     return replace(problem, arrays=problem.takes_arrays())
 
 
-def _without_unread(problem: Problem, vehicles: FloatArray) -> tuple[Problem, list[str]]:
+def _without_unread(problem: RepairProblem, vehicles: FloatArray) -> tuple[RepairProblem, list[str]]:
     """The problem without the parameters that no simulation reads, and their names; an error if none is left."""
     vehicles, count = vehicles[::EVERY_READER], len(problem.parameters)
-    ends = np.repeat([problem.today], 1 + 2 * count, axis=0)
-    ends[np.arange(1, 1 + 2 * count), np.repeat(range(count), 2)] = np.tile([0.0, 1.0], count)
-    rows = np.repeat(ends, len(vehicles), axis=0), np.tile(vehicles, (len(ends), 1))
+    # The set of today, then two sets for each parameter, with the parameter at its lower and at its upper bound.
+    sets = np.repeat([problem.today], 1 + 2 * count, axis=0)
+    sets[np.arange(1, 1 + 2 * count), np.repeat(range(count), 2)] = np.tile([0.0, 1.0], count)
+    rows = np.repeat(sets, len(vehicles), axis=0), np.tile(vehicles, (len(sets), 1))
     evaluations = problem.evaluate(*rows, "which parameters matter")
-    today, *others = np.split(np.arange(len(evaluations)), len(ends))
+    today, *others = np.split(np.arange(len(evaluations)), len(sets))
     results = evaluations.take(today).results
-    is_read = [any(differences(results, evaluations.take(other).results)) for other in others]
-    read = [one for one, flags in zip(problem.parameters, np.reshape(is_read, (-1, 2)), strict=True) if flags.any()]
-    unread = [one.name for one in problem.parameters if one not in read]
+    differs = [any(differences(results, evaluations.take(other).results)) for other in others]
+    read = [
+        parameter
+        for parameter, at_bounds in zip(problem.parameters, np.reshape(differs, (count, 2)), strict=True)
+        if at_bounds.any()
+    ]
+    unread = [parameter.name for parameter in problem.parameters if parameter not in read]
     if not read:
         raise InputError(
             "change", f"{', '.join(unread)}: no simulation reads it", "a parameter that changes a simulation"
@@ -140,41 +148,50 @@ def _without_unread(problem: Problem, vehicles: FloatArray) -> tuple[Problem, li
     return replace(problem, parameters=read), unread
 
 
-def _describe(problem: Problem, system: System, vehicles: FloatArray, share: float) -> list[NotRepairable]:
+def _describe_not_repairable(
+    problem: RepairProblem, system: System, vehicles: FloatArray, is_repairable: BoolArray
+) -> list[NotRepairable]:
     """What no driving system can survive: the minimal causes of failures of full braking, shrunk to the limit."""
-    if not len(vehicles):
+    failures = vehicles[~is_repairable]
+    if not len(failures):
         return []
     driver, unsafe = problem.best_driver, Unsafe(problem.margin)
-    rows = vehicles[np.linspace(0, len(vehicles) - 1, min(len(vehicles), CAUSES_OF)).astype(int)]
-    causes = find_minimal_causes(driver, problem.promise.settings(rows), unsafe)
-    chosen = list({cause_key(driver.characteristics, cause): cause for group in causes for cause in group}.values())
-    described = describe_causes(driver, chosen, unsafe)
-    limits = np.array([cause.setting(driver.characteristics) for cause in chosen])
-    worst = driver.evaluate(limits, "full braking").worst_points
-    names = [""] * len(chosen) if worst is None else [system.points[number].name for number in worst.tolist()]
-    return [NotRepairable(cause.boundary, name, share) for cause, name in zip(described, names, strict=True)]
+    chosen = failures[np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)]
+    groups = find_minimal_causes(driver, problem.promise.settings(chosen), unsafe)
+    causes = list({cause_key(driver.characteristics, cause): cause for group in groups for cause in group}.values())
+    settings = np.array([cause.setting(driver.characteristics) for cause in causes])
+    worst = driver.evaluate(settings, "full braking").worst_points
+    names = [""] * len(causes) if worst is None else [system.points[number].name for number in worst.tolist()]
+    return [
+        NotRepairable(cause.boundary, name, len(failures) / len(vehicles))
+        for cause, name in zip(describe_causes(driver, causes, unsafe), names, strict=True)
+    ]
 
 
 @dataclass(kw_only=True)
 class _Finder:
-    """The search for repairs, by counterexamples."""
+    """The search for repairs by counterexamples, at the numbers `points` of a matrix.
 
-    problem: Problem
+    `at_left_out` counts the points that were left out at first, and those of them where all repairs were safe at once.
+    """
+
+    problem: RepairProblem
     search: Search
     prices: Prices
-    points: int
+    points: range
     attacks: int = 0
     at_left_out: JsonObject | None = None
 
     def prove_today(self) -> Proof | None:
-        """The proof that the driving system of today survives attacks and fresh wear; None if it does not: its failures
-        join the counterexamples.
+        """The proof that the driving system of today survives attacks and fresh wear.
+
+        None if it does not; its failures join the counterexamples.
         """
-        today = self.problem.today
-        (found,), proof = self._attack([today], range(self.points)), None
-        if not len(found):
-            proof, found = prove(self.problem, today, 0)
-        self.search.add(found)
+        today, proof = self.problem.today, None
+        (failures,) = self._attack([today], self.points)
+        if not len(failures):
+            proof, failures = prove(self.problem, today, 0)
+        self.search.add(failures)
         return proof
 
     def _attack(self, sets: Sequence[FloatArray], points: Sequence[int]) -> list[FloatArray]:
@@ -182,102 +199,104 @@ class _Finder:
         return attack(self.problem, sets, self.search.vehicles, points, self.attacks) if sets else []
 
     def find(self) -> list[Repair]:
-        """Search, attack and prove in turns until the repairs kept survive everything."""
-        survived, attempt = set[bytes](), 0
+        """Search, attack and prove in turns until the smallest changes survive everything."""
+        unbroken, attempt = set[bytes](), 0
         self.search.add(np.concatenate(self._attack([self.problem.today], self.search.seen)))
         for _ in range(MAX_ROUNDS):
             # 2. The smallest changes that survive all counterexamples.
-            kept = self.search.pareto_set(lambda one: self.prices.of(self.problem.changed_values(one)).mean or 0.0)
-            if not kept:
+            changes = self.search.pareto_set(
+                lambda change: self.prices.of(self.problem.changed_values(change)).mean or 0.0
+            )
+            if not changes:
                 return []
-            # 3. Attacks on those that have survived none yet; new failures are counterexamples.
-            fresh = [one for one in kept if one.tobytes() not in survived]
-            failures = self._attack(fresh, self.search.seen)
-            survived |= {one.tobytes() for one, failing in zip(fresh, failures, strict=True) if not len(failing)}
-            # 4. Attacks find nothing: the points left out count, too, and then fresh wear.
+            # 3. Attacks on changes that have survived none yet; new failures are counterexamples.
+            attacked = [change for change in changes if change.tobytes() not in unbroken]
+            failures = self._attack(attacked, self.search.seen)
+            unbroken |= {change.tobytes() for change, found in zip(attacked, failures, strict=True) if not len(found)}
             if not any(map(len, failures)):
-                if len(self.search.seen) < self.points:
-                    self._look_at_left_out(kept)
-                    survived.clear()
+                # 4. Attacks find nothing: the points left out count, too.
+                if len(self.search.seen) < len(self.points):
+                    self._look_at_left_out(changes)
+                    unbroken.clear()
                     continue
                 # 5. Proof on fresh wear.
-                proofs = list[Proof]()
-                for one in kept:
-                    proof, failing = prove(self.problem, one, attempt)
+                repairs = list[tuple[FloatArray, Proof]]()
+                for change in changes:
+                    proof, found = prove(self.problem, change, attempt)
                     if proof is None:
-                        failures, attempt = [failing], attempt + 1
+                        failures, attempt = [found], attempt + 1
                         break
-                    proofs.append(proof)
+                    repairs.append((change, proof))
                 else:
-                    return [self._repair(one, proof) for one, proof in zip(kept, proofs, strict=True)]
+                    return [self._repair(*repair) for repair in repairs]
             self.search.add(np.concatenate(failures))
         return []
 
-    def _look_at_left_out(self, sets: Sequence[FloatArray]) -> None:
-        """Note at how many of the points left out all repairs are safe, and let the search see all points from now
+    def _look_at_left_out(self, changes: Sequence[FloatArray]) -> None:
+        """Note at how many of the points left out all changes are safe, and let the search see all points from now
         on.
         """
-        left_out = [number for number in range(self.points) if number not in self.search.seen]
+        left_out = [number for number in self.points if number not in self.search.seen]
         worst, stage = self.search.vehicles[:WORST_AT_POINTS], "points left out"
-        safe = [
-            (self.problem.degrees(np.array(sets), worst, stage, [number])[0] >= self.problem.margin).all()
+        are_safe = [
+            (self.problem.degrees(np.array(changes), worst, stage, [number])[0] >= self.problem.margin).all()
             for number in left_out
         ]
-        self.at_left_out = {"all": len(left_out), "safe": int(sum(safe))}
-        self.search.seen = list(range(self.points))
+        self.at_left_out = {"all": len(left_out), "safe": int(sum(are_safe))}
+        self.search.seen = list(self.points)
 
-    def _repair(self, one: FloatArray, proof: Proof) -> Repair:
-        """A repair with its price, and what it has not seen (6)."""
-        values, problem = self.problem.changed_values(one), self.problem
+    def _repair(self, change: FloatArray, proof: Proof) -> Repair:
+        """A repair with its price, and (6.) what it has not seen."""
+        values, problem = self.problem.changed_values(change), self.problem
         unseen = check_unseen(problem, values, self.search.vehicles)
         lost = self.prices.lost_points(values, problem.margin)
         return Repair(
             values=values,
-            largest_change=float(self.search.change(one)),
+            largest_change=float(self.search.largest_change(change)),
             price=self.prices.with_needless_braking(values),
             proof=proof,
             held_out={"points": self.at_left_out, **unseen, "lost_on_new_car": lost},
         )
 
     def largest_promise(self) -> Promise | None:
-        """The largest part of the promise, shrunk towards the original, that some change keeps by the counterexamples;
-        None if none does.
+        """The promise shrunk towards the original as little as some change needs to survive the counterexamples, which
+        shrink with it; None if no change does.
         """
         original, vehicles, low, high = self.problem.promise.worn.original, self.search.vehicles, 0.0, 1.0
         for _ in range(HALVINGS):
             middle = (low + high) / 2
             search = Search(self.problem, original + middle * (vehicles - original), self.search.seen)
-            low, high = (middle, high) if search.pareto_set(lambda one: 0.0) else (low, middle)
+            low, high = (middle, high) if search.pareto_set(lambda _: 0.0) else (low, middle)
         return self.problem.promise.shrunk(low) if low else None
 
     def exchange_rate(self, name: str, repairs: Sequence[Repair]) -> list[Exchange]:
         """How much earlier the ADS has to brake for promises of a characteristic, from new to the end of its wear.
 
-        The parameters of the first repair change, or each by itself without a repair.
+        The parameters of the first repair change; without a repair, each parameter alone.
         """
         problem, seed = self.problem, self.problem.study.search.seed
         names = [parameter.name for parameter in problem.parameters]
-        changed = tuple(names.index(value) for value in repairs[0].values) if repairs else ()
+        changed = tuple(names.index(parameter) for parameter in repairs[0].values) if repairs else ()
         subsets = [changed] if changed else [(number,) for number in range(len(names))]
-        (one,) = (one for one in problem.promise.region.characteristics if one.name == name)
-        falls = one.original - one.lower >= one.upper - one.original
-        ends = np.linspace(one.original, one.lower if falls else one.upper, CURVE_PROMISES + 1)[1:].tolist()
+        (whole,) = (member for member in problem.promise.region.characteristics if member.name == name)
+        new, wears_down = whole.original, whole.original - whole.lower >= whole.upper - whole.original
+        ends = np.linspace(new, whole.lower if wears_down else whole.upper, CURVE_PROMISES + 1)[1:].tolist()
         exchanges = []
         for end in ends:
-            worn = replace(one, lower=min(end, one.original), upper=max(end, one.original))
-            others = {other.name: other for other in problem.promise.worn}
-            members = tuple((others | {name: worn}).values())
-            part = replace(problem, promise=replace(problem.promise, worn=CharacteristicSet(members)))
-            vehicles = part.promise.spread(CURVE_VEHICLES, seed)
-            degrees = part.degrees(part.today[np.newaxis], vehicles, "exchange rate")[0][0]
+            worn = {member.name: member for member in problem.promise.worn}
+            worn[name] = replace(whole, lower=min(end, new), upper=max(end, new))
+            promise = replace(problem.promise, worn=CharacteristicSet(tuple(worn.values())))
+            narrowed = replace(problem, promise=promise)
+            vehicles = promise.corners_and_sobol_points(CURVE_VEHICLES, seed)
+            degrees = narrowed.degrees_today(vehicles, "exchange rate")
             vehicles = vehicles[np.argsort(degrees, kind="stable")]
-            if (degrees >= part.margin).all():
+            if (degrees >= narrowed.margin).all():
                 exchanges.append(Exchange(name, end, 0.0, True))
                 continue
-            search = Search(part, vehicles, range(self.points))
-            if part.repairable(vehicles).all():
+            search = Search(narrowed, vehicles, self.points)
+            if narrowed.repairable(vehicles).all():
                 search.search(dict.fromkeys(subsets, 1.0))
-            prices = [self.prices.of(part.changed_values(found)).worst for found in search.best.values()]
+            prices = [self.prices.of(narrowed.changed_values(change)).worst for change in search.best.values()]
             metres = min((price for price in prices if price is not None), default=None)
             exchanges.append(Exchange(name, end, metres, bool(search.best)))
         return exchanges

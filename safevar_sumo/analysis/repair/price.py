@@ -14,7 +14,7 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.analysis.explain.braking_comparison import brake_onset
 from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.opinion.compute import assemble_both_systems
-from safevar_sumo.analysis.repair.problem import PREFIX, Problem, degrees_of
+from safevar_sumo.analysis.repair.problem import PREFIX, RepairProblem, degrees_of
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import OPTIONAL_METRICS
@@ -32,21 +32,25 @@ Values = Mapping[str, float]
 
 
 class NewCar(NamedTuple):
-    """How a new vehicle drives with some parameters: by point, where and when it begins to brake [m, s], NaN if it does
-    not, and its safety degree; the largest deceleration and jerk of all points [m/s^2, m/s^3].
+    """How a new vehicle drives with some parameters through N points.
+
+    `onsets`, shape (2, N), are where and when it begins to brake [m, s], NaN if it does not; `degrees`, shape (N,), its
+    safety degrees; `deceleration` and `jerk` the largest of all points [m/s^2, m/s^3].
     """
 
-    begins: FloatArray
+    onsets: FloatArray
     degrees: FloatArray
     deceleration: float
     jerk: float
 
 
 class Price(NamedTuple):
-    """The price of parameters against today's [m, s, m/s^2, m/s^3].
+    """The price of changed parameters against today's, on a new vehicle.
 
-    `needless` is the numbers of benign scenes, of those in which it brakes with the repair, and with today's
-    parameters; None without benign scenes.
+    `mean` and `worst` are how much earlier it brakes [m], on average and at the `worst_point`, where it brakes
+    `seconds` earlier; None if it brakes nowhere. `deceleration` and `jerk` are the largest [m/s^2, m/s^3]. `needless`
+    counts benign scenes: all, those in which it brakes with the change, and those with today's parameters; None without
+    benign scenes.
     """
 
     mean: float | None
@@ -87,7 +91,7 @@ class Prices:
     def of(self, values: Values) -> Price:
         """The price without needless braking."""
         car, today = self._drive(values), self._drive({})
-        metres, seconds = today.begins - car.begins
+        metres, seconds = today.onsets - car.onsets
         braked = np.flatnonzero(np.isfinite(metres))
         if not len(braked):
             return Price(None, None, None, "", car.deceleration, car.jerk)
@@ -99,7 +103,7 @@ class Prices:
         """The whole price."""
         if not self.benign:
             return self.of(values)
-        repaired, original = (_brakes_in(self._system(one), self.benign) for one in (values, {}))
+        repaired, original = (_brakes_in(self._system(parameters), self.benign) for parameters in (values, {}))
         return self.of(values)._replace(needless=(len(repaired), int(repaired.sum()), int(original.sum())))
 
     def lost_points(self, values: Values, margin: float) -> int:
@@ -120,39 +124,39 @@ class Prices:
 def _drive_new_car(system: System) -> NewCar:
     """Drive the new vehicle through all points of a study."""
     results = simulate_all_points(system, system.characteristics.original[np.newaxis])
-    begins, deceleration, jerk = np.full((2, len(results)), np.nan), 0.0, 0.0
+    onsets, deceleration, jerk = np.full((2, len(results)), np.nan), 0.0, 0.0
     for column, result in enumerate(results):
-        trace, onset = result.runs.trace, brake_onset(result.runs, 0)
-        if onset is not None:
-            begins[:, column] = trace.position[onset, 0], trace.time[onset]
+        trace, step = result.runs.trace, brake_onset(result.runs, 0)
+        if step is not None:
+            onsets[:, column] = trace.position[step, 0], trace.time[step]
         speed = trace.speed[trace.active[:, 0], 0]
         deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))
         jerk = float(np.fmax(jerk, OPTIONAL_METRICS["max_jerk"](result.runs, system.metrics_table)[0]))
-    return NewCar(begins, np.array([one.evaluations.f_safe[0] for one in results]), deceleration, jerk)
+    return NewCar(onsets, np.array([result.evaluations.f_safe[0] for result in results]), deceleration, jerk)
 
 
 def _brakes_in(system: System, benign: list[Point]) -> BoolArray:
-    """In which benign scenes the new vehicle brakes; with every speed also without anybody."""
+    """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road without anybody."""
     original = system.characteristics.original[np.newaxis]
-    empty = {point.scenario.test_speed: point for point in benign}.values()
+    one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
     results = [
         *simulate_all_points(replace(system, matrix=tuple(benign), rater=None), original),
-        *simulate_all_points(replace(system, matrix=tuple(empty), rater=None, sees_nobody=True), original),
+        *simulate_all_points(replace(system, matrix=tuple(one_per_speed), rater=None, sees_nobody=True), original),
     ]
     traces = [result.runs.trace for result in results]
-    return np.array([(np.where(one.active, one.brake, 0.0) > NEEDLESS_BRAKE).any() for one in traces])
+    return np.array([(np.where(trace.active, trace.brake, 0.0) > NEEDLESS_BRAKE).any() for trace in traces])
 
 
 WORST_VEHICLES, SECOND_VEHICLES = 16, 11
-"""Number of the worst vehicles within the promise that are driven in other weathers and by other sets of parameters;
+"""Number of the worst vehicles within the promise that are driven in other weathers and with other fitted parameters;
 with the second vehicle model.
 """
 
 
-def check_unseen(problem: Problem, values: Values, vehicles: FloatArray) -> JsonObject:
-    """Counts of `safe` among `all` the worst vehicles, for each check that the study allows; `vehicles` are sorted.
+def check_unseen(problem: RepairProblem, values: Values, vehicles: FloatArray) -> JsonObject:
+    """Count how many of the worst vehicles are safe, for each check that the study allows; `vehicles` are sorted.
 
-    In other weathers only vehicles count that full braking at the first possible moment keeps safe there.
+    In other weathers only those vehicles count that full braking at the first possible moment keeps safe there.
     """
     study, settings = with_parameters(problem.study, values), problem.promise.settings(vehicles[:WORST_VEHICLES])
     system, show = assemble(study), problem.evaluator.progress
@@ -163,17 +167,18 @@ def check_unseen(problem: Problem, values: Values, vehicles: FloatArray) -> Json
             return np.zeros(0, dtype=bool)
         return np.asarray(degrees_of(evaluate(system, settings)) >= problem.margin)
 
-    own = {point.weather.name for point in system.points}
-    others = [one for name, one in WEATHERS.items() if name not in own and not equals_clear(one)]
+    tested = {point.weather.name for point in system.points}
+    others = [weather for name, weather in WEATHERS.items() if name not in tested and not equals_clear(weather)]
     checks: JsonObject = {"weathers": {}, "second_vehicle": None, "fitted_sets": None}
     for number, weather in enumerate(others):
         show("other weathers", number, len(others))
+        # A point's name ends with its weather: points that differ in the weather alone are one here.
         points = {point.name.rpartition(", ")[0]: point for point in system.points}
         matrix = tuple(point._replace(weather=weather, name=name) for name, point in points.items())
         there = replace(system, matrix=matrix, weather=weather)
         try:
-            able = settings[are_safe(replace(there, ads=best_driver), settings)]
-            checks["weathers"][weather.name] = _counts(are_safe(there, able))
+            repairable = settings[are_safe(replace(there, ads=best_driver), settings)]
+            checks["weathers"][weather.name] = _counts(are_safe(there, repairable))
         except UserCodeError:
             continue  # a user's vehicle that knows no wet road
     try:
@@ -185,7 +190,7 @@ def check_unseen(problem: Problem, values: Values, vehicles: FloatArray) -> Json
     if study.spread:
         spread = {key: row for key, row in study.spread.items() if key.removeprefix(PREFIX) not in values}
         sets = studies_of_sets(replace_in(study, spread=spread)) if spread else []
-        checks["fitted_sets"] = _counts(np.array([are_safe(assemble(one), settings).all() for one in sets]))
+        checks["fitted_sets"] = _counts(np.array([are_safe(assemble(variant), settings).all() for variant in sets]))
     return checks
 
 

@@ -1,10 +1,11 @@
-"""The problem of a repair: the promised wear, and the parameters of the ADS that may change."""
+"""What a repair is asked: the promised wear, and the parameters of the ADS that may change."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,13 +26,13 @@ from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 MAX_PARAMETERS = 8
 DIGITS = 4
-"""Significant digits of a changed parameter, or of its range if that needs more decimals: the value that is printed is
+"""Significant digits of a parameter's changed value, or of its range if that is smaller: the value that is printed is
 the one that has been tried.
 """
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
 MAX_CORNERS = 256
-"""Largest number of corners of the promised part; of a part with more, so many random ones are taken."""
+"""Largest number of corners of the promised domain that are tried; of more, so many random ones are taken."""
 PREFIX = "ads.parameters."
 ALL = "all"
 """The promise of the whole domain."""
@@ -51,9 +52,9 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True)
 class Promise:
-    """The promised wear: the characteristics that may wear, with the promised ends as their domains.
+    """The promised wear: the w characteristics that may wear, with the promised ends as their domains.
 
-    Worn vehicles are arrays of shape (M, w) of these; all other characteristics stay as in the original.
+    Arrays of vehicles, shape (M, w), hold these characteristics; all others stay as in the original.
     """
 
     region: FeasibleRegion
@@ -73,92 +74,96 @@ class Promise:
             if len(texts) > 1:
                 raise InputError("promise", f"{ALL} beside another promise", f"{ALL} alone, or limits")
             return cls(region, region.characteristics)
-        own = stated if stated and isinstance(stated, dict) else study.limits
-        for mistake in limit_mistakes(study.source, rows, own, "repair.promise."):
+        of_study = stated if stated and isinstance(stated, dict) else study.limits
+        for mistake in limit_mistakes(study.source, rows, of_study, "repair.promise."):
             raise mistake
-        limits = limits_of(texts, rows, None if texts else own, "promise")
+        limits = limits_of(texts, rows, None if texts else of_study, "promise")
         if not limits:
             raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
         ends = {name: limit.interval(rows[name]) for name, limit in limits.items()}
-        worn = [
-            replace(one, lower=ends[one.name][0], upper=ends[one.name][1])
-            for one in region.characteristics
-            if one.name in ends and ends[one.name][0] < ends[one.name][1]
-        ]
+        worn = []
+        for characteristic in region.characteristics:
+            lower, upper = ends.get(characteristic.name, (0.0, 0.0))
+            if lower < upper:
+                worn.append(replace(characteristic, lower=lower, upper=upper))
         if not worn:
             raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
         return cls(region, CharacteristicSet(tuple(worn)))
 
     @cached_property
     def columns(self) -> list[int]:
-        """Columns of the characteristics that may wear, among all."""
+        """Columns of the characteristics that may wear, among those of all characteristics."""
         return [self.region.characteristics.names.index(name) for name in self.worn.names]
 
     def settings(self, vehicles: FloatArray) -> FloatArray:
-        """Worn vehicles with all characteristics of the study, shape (M, n)."""
+        """The settings of vehicles: all characteristics of the study, shape (M, n)."""
         settings = np.tile(self.region.characteristics.original, (len(vehicles), 1))
         settings[:, self.columns] = vehicles
         return settings
 
-    def at(self, points: FloatArray) -> FloatArray:
-        """Worn vehicles at points of the unit cube."""
+    def vehicles_at(self, points: FloatArray) -> FloatArray:
+        """The vehicles at points of the unit cube, shape (M, w)."""
         return self.worn.lower + points * (self.worn.upper - self.worn.lower)
 
     def feasible(self, vehicles: FloatArray) -> FloatArray:
-        """Those of M worn vehicles that keep the study's constraints."""
+        """Those vehicles that keep the study's constraints."""
         return vehicles[self.region.feasible(self.settings(vehicles))]
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Vehicles drawn uniformly in the feasible part."""
-        size = len(self.worn)
-        settings = self.region.draw_feasible(lambda count: self.settings(self.at(rng.random((count, size)))), number)
-        return np.asarray(settings[:, self.columns])
+        """Vehicles drawn uniformly among the feasible ones."""
 
-    def spread(self, number: int, seed: int) -> FloatArray:
+        def draw_settings(count: int) -> FloatArray:
+            return self.settings(self.vehicles_at(rng.random((count, len(self.worn)))))
+
+        return np.asarray(self.region.draw_feasible(draw_settings, number)[:, self.columns])
+
+    def corners_and_sobol_points(self, number: int, seed: int) -> FloatArray:
         """Distinct feasible vehicles: the corners, or `MAX_CORNERS` of them, and `number` Sobol points."""
         size = len(self.worn)
         if 2**size <= MAX_CORNERS:
-            corners = np.indices((2,) * size).reshape(size, -1).T.astype(float)
+            corners = np.array(list(product((0.0, 1.0), repeat=size)))
         else:
             corners = np.round(sobol_points(MAX_CORNERS, size, seed))
-        inner = self.feasible(self.at(sobol_points(4 * number if self.region else number, size, seed)))[:number]
-        return np.unique(np.concatenate([self.feasible(self.at(corners)), inner]), axis=0)
+        # Constraints refuse some points.
+        points = sobol_points(4 * number if self.region else number, size, seed)
+        inner = self.feasible(self.vehicles_at(points))[:number]
+        return np.unique(np.concatenate([self.feasible(self.vehicles_at(corners)), inner]), axis=0)
 
-    def of_solutions(self, settings: FloatArray) -> FloatArray:
-        """The worn vehicles among settings of all characteristics, shape (M, n)."""
+    def vehicles_among(self, settings: FloatArray) -> FloatArray:
+        """The vehicles within the promise among settings of all characteristics, shape (M, n)."""
         vehicles = settings[:, self.columns]
         is_within = ((vehicles >= self.worn.lower) & (vehicles <= self.worn.upper)).all(axis=1)
         return np.asarray(vehicles[is_within & (self.settings(vehicles) == settings).all(axis=1)])
 
     def shrunk(self, share: float) -> Promise:
-        """The promise whose ends lie at a share of the way from the original."""
+        """The promise whose ends lie at a share of the way from the original to the ends of this promise."""
         members = [
             replace(
-                one,
-                lower=one.original + share * (one.lower - one.original),
-                upper=one.original + share * (one.upper - one.original),
+                characteristic,
+                lower=characteristic.original + share * (characteristic.lower - characteristic.original),
+                upper=characteristic.original + share * (characteristic.upper - characteristic.original),
             )
-            for one in self.worn
+            for characteristic in self.worn
         ]
         return replace(self, worn=CharacteristicSet(tuple(members)))
 
     def to_dict(self) -> dict[str, list[float]]:
         """The ends of every characteristic that may wear."""
-        return {one.name: [one.lower, one.upper] for one in self.worn}
+        return {worn.name: [worn.lower, worn.upper] for worn in self.worn}
 
     @property
     def in_words(self) -> str:
         """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`."""
         return ", ".join(
-            f"{one.name} {sign} {end:.5g}{one.suffix}"
-            for one in self.worn
-            for sign, end in ((">=", one.lower), ("<=", one.upper))
-            if end != one.original
+            f"{worn.name} {sign} {end:.5g}{worn.suffix}"
+            for worn in self.worn
+            for sign, end in ((">=", worn.lower), ("<=", worn.upper))
+            if end != worn.original
         )
 
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
-    """The parameters that may change: `names`, or all under [repair], or those that come with a shipped ADS.
+    """The parameters that may change: those called `names`, or all under [repair], or those of a shipped ADS.
 
     Raises
     ------
@@ -178,9 +183,10 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     if len(chosen) > MAX_PARAMETERS:
         raise InputError(source, f"repair: {len(chosen)} parameters may change", f"at most {MAX_PARAMETERS}")
     ads: Any = assemble(study).ads
+    ads = getattr(ads, "_ads", ads)  # a user's ADS within its guard
     parameters = []
     for name in chosen:
-        row, today = table[name], study.ads.parameters.get(name, getattr(getattr(ads, "_ads", ads), name, None))
+        row, today = table[name], study.ads.parameters.get(name, getattr(ads, name, None))
         if today is None:
             known = {*study.ads.parameters, *CHANGEABLE.get(study.ads.model, ())}
             raise unknown_name(source, f"repair.{name}: there is no ads.parameters.{name}", name, known)
@@ -200,11 +206,11 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Problem:
-    """A study's ADS with parameters that may change, and the safety degree `margin` to keep within a promise.
+class RepairProblem:
+    """A study's ADS with P parameters that may change, and the safety degree `margin` to keep within a promise.
 
-    Sets of parameters are arrays of shape (M, P) in [0, 1], shares of the range from lower to upper bound. With
-    `arrays`, one ADS drives vehicles with different parameters; otherwise each set has an own instance.
+    Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1]. With `arrays`, one
+    ADS drives vehicles with different parameters; otherwise there is an instance for each set.
     """
 
     evaluator: Evaluator
@@ -220,36 +226,42 @@ class Problem:
     @cached_property
     def today(self) -> FloatArray:
         """The parameters of today, shape (P,)."""
-        ends = np.array([(one.lower, one.upper, one.today) for one in self.parameters])
-        log = np.array([one.log for one in self.parameters])[:, np.newaxis]
-        lower, upper, today = np.where(log, np.log(np.where(log, ends, 1.0)), ends).T
+        values = np.array([(parameter.lower, parameter.upper, parameter.today) for parameter in self.parameters])
+        is_log = np.array([parameter.log for parameter in self.parameters])[:, np.newaxis]
+        lower, upper, today = np.where(is_log, np.log(np.where(is_log, values, 1.0)), values).T
         return np.asarray((today - lower) / (upper - lower))
 
     def values(self, shares: FloatArray) -> FloatArray:
-        """The parameters' values in their units, rounded (`DIGITS`); today's exactly where a share is today's."""
+        """The parameters' values in their units, shape (M, P): today's value where a share is today's, otherwise
+        rounded to `DIGITS`.
+        """
         columns = []
-        for one, share, today in zip(self.parameters, shares.T, self.today, strict=True):
-            if one.log:
-                value = one.lower * (one.upper / one.lower) ** share
-            else:
-                value = one.lower + share * (one.upper - one.lower)
+        for parameter, share, share_today in zip(self.parameters, shares.T, self.today, strict=True):
+            lower, upper = parameter.lower, parameter.upper
+            value = lower * (upper / lower) ** share if parameter.log else lower + share * (upper - lower)
             distinct, row_of = np.unique(value, return_inverse=True)
-            sizes = np.minimum(np.where(distinct == 0, np.inf, np.abs(distinct)), one.upper - one.lower)
+            sizes = np.minimum(np.where(distinct == 0, np.inf, np.abs(distinct)), upper - lower)
             decimals = (DIGITS - 1 - np.floor(np.log10(sizes))).astype(int).tolist()
             rounded = np.array(list(map(round, distinct.tolist(), decimals)))[row_of]
-            columns.append(np.where(share == today, one.today, np.clip(rounded, one.lower, one.upper)))
+            columns.append(np.where(share == share_today, parameter.today, np.clip(rounded, lower, upper)))
         return np.stack(columns, axis=1)
 
-    def changed_values(self, one: FloatArray) -> dict[str, float]:
-        """The values of the parameters that a set, shape (P,), changes, by name."""
-        names, values = [parameter.name for parameter in self.parameters], self.values(one[np.newaxis])[0].tolist()
-        return {name: value for name, value, flag in zip(names, values, one != self.today, strict=True) if flag}
+    def changed_values(self, change: FloatArray) -> dict[str, float]:
+        """The values of the parameters that a change, one set of shape (P,), changes, by name."""
+        (values,) = self.values(change[np.newaxis]).tolist()
+        return {
+            parameter.name: value
+            for parameter, value, is_changed in zip(self.parameters, values, change != self.today, strict=True)
+            if is_changed
+        }
 
     def evaluate(self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()) -> Evaluations:
-        """Row i: parameters i in vehicle i, at the worst of some points; without any, at the worst of all. The settings
-        are the worn characteristics.
+        """Evaluate each set of parameters with the vehicle of its row, at the worst of `points`, or of all points if
+        none is named.
+
+        The settings of the evaluations are the worn characteristics.
         """
-        selection = Selection(tuple(one.name for one in self.parameters), tuple(points), self.arrays)
+        selection = Selection(tuple(parameter.name for parameter in self.parameters), tuple(points), self.arrays)
         rows = np.concatenate([self.promise.settings(vehicles), self.values(shares)], axis=1)
         worn = self.promise.worn
         return replace(
@@ -260,14 +272,15 @@ class Problem:
         )
 
     def takes_arrays(self) -> bool:
-        """Whether one ADS may drive vehicles with different parameters: a shipped one, or the user's if a sample has
-        the same results to the bit.
+        """Whether one ADS may drive vehicles with different parameters: a shipped one, or the user's class if a sample
+        has the same results to the bit.
         """
-        table = self.study.ads
-        if table.kind or table.model in ADS:
-            return not table.kind
+        if self.study.ads.kind:
+            return False
+        if self.study.ads.model in ADS:
+            return True
         shares = sobol_points(ARRAY_CHECKS, len(self.parameters), 0)
-        vehicles = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.worn), 1))
+        vehicles = self.promise.vehicles_at(sobol_points(ARRAY_CHECKS, len(self.promise.worn), 1))
         stage = "does the driving system take arrays?"
         try:
             together = replace(self, arrays=True).evaluate(shares, vehicles, stage)
@@ -279,8 +292,8 @@ class Problem:
     def degrees(
         self, shares: FloatArray, vehicles: FloatArray, stage: str, points: Sequence[int] = ()
     ) -> tuple[FloatArray, npt.NDArray[np.intp]]:
-        """Safety degrees of each of M sets of parameters in each of L vehicles, shape (M, L), and the numbers of their
-        points among `points`.
+        """Safety degrees of each of M sets of parameters in each of L vehicles, shape (M, L), and the places of their
+        worst points among `points`.
         """
         shape = len(shares), len(vehicles)
         rows = np.repeat(shares, len(vehicles), axis=0), np.tile(vehicles, (len(shares), 1))
@@ -289,6 +302,11 @@ class Problem:
         numbers = np.zeros(shape, dtype=np.intp) if worst is None else worst.reshape(shape)
         return degrees_of(evaluations).reshape(shape), numbers
 
+    def degrees_today(self, vehicles: FloatArray, stage: str) -> FloatArray:
+        """Safety degrees of vehicles with the parameters of today, shape (L,)."""
+        degrees, _ = self.degrees(self.today[np.newaxis], vehicles, stage)
+        return degrees.reshape(-1)
+
     @cached_property
     def best_driver(self) -> Evaluator:
         """Full braking at the first possible moment."""
@@ -296,11 +314,11 @@ class Problem:
         return self.evaluator.for_study(replace_in(self.study, ads=ads), verified=0)
 
     def repairable(self, vehicles: FloatArray) -> BoolArray:
-        """Which vehicles full braking at the first possible moment, or the ADS of today, keeps safe."""
+        """Which vehicles full braking at the first possible moment, or else the ADS of today, keeps safe."""
         stage = "full braking"
         is_safe = degrees_of(self.best_driver.evaluate(self.promise.settings(vehicles), stage)) >= self.margin
         rest = np.flatnonzero(~is_safe)
-        is_safe[rest] = self.degrees(self.today[np.newaxis], vehicles[rest], stage)[0][0] >= self.margin
+        is_safe[rest] = self.degrees_today(vehicles[rest], stage) >= self.margin
         return is_safe
 
 

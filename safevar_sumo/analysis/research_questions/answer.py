@@ -14,7 +14,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
 from safevar_sumo.analysis.research_questions import changes, comparisons
-from safevar_sumo.analysis.research_questions.statistics import fewest_runs
+from safevar_sumo.analysis.research_questions.statistics import FEWEST_RUNS
 from safevar_sumo.errors import unknown_name
 
 SAFETY_TABLE = "rq3.3-safety"
@@ -39,13 +39,11 @@ FRAMES: Mapping[str, Callable[..., pd.DataFrame]] = {
     WEATHER: changes.compare_weathers,
 }
 """Functions that answer a question from one case, and about the weather from all."""
-QUESTIONS = tuple(FRAMES)
+QUESTION_NAMES = tuple(FRAMES)
 
 
-class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if no case has an answer), notes on the frame, and
-    the cases.
-    """
+class TableAnswer(NamedTuple):
+    """The answer to the question `name`: a tidy frame over all cases, empty if no case has an answer, and its notes."""
 
     name: str
     frame: pd.DataFrame
@@ -53,7 +51,7 @@ class Answer(NamedTuple):
     cases: Sequence[Case] = ()
 
 
-def answer_questions(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
+def answer_questions(cases: Sequence[Case], question: str | None = None) -> list[TableAnswer]:
     """Answer one question, or all questions.
 
     Raises
@@ -61,10 +59,13 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
     InputError
         If there is no such question, or no case has an answer.
     """
-    if question is not None and question not in QUESTIONS:
-        raise unknown_name("question", f"there is no question {question!r}", question, QUESTIONS)
-    answers, all_errors = list[Answer](), list[UnanswerableError]()
-    for name in QUESTIONS if question is None else ("rq3.3", SAFETY_TABLE) if question == "rq3.3" else (question,):
+    if question is not None and question not in QUESTION_NAMES:
+        raise unknown_name("question", f"there is no question {question!r}", question, QUESTION_NAMES)
+    names = QUESTION_NAMES if question is None else (question,)
+    if question == "rq3.3":
+        names = (question, SAFETY_TABLE)
+    answers, all_errors = list[TableAnswer](), list[UnanswerableError]()
+    for name in names:
         frames, notes, case_notes = list[pd.DataFrame](), list[str](), list[str]()
         for group in [cases] if name == WEATHER else [[case] for case in cases]:
             try:
@@ -77,53 +78,56 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
                 compared = {*frame["setting"], *frame["other"]} if name == WEATHER else {case.name for case in group}
                 case_notes += [note for case in group if case.name in compared for note in _notes(name, case)]
         table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
-        answers.append(Answer(name, table, tuple(dict.fromkeys([*notes, *case_notes])), cases))
+        answers.append(TableAnswer(name, table, tuple(dict.fromkeys([*notes, *case_notes])), cases))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
     return answers
 
 
 def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
-    """RQ1's algorithms or RQ2's baselines with too few runs for a significant test; none if the runs are unknown
-    (imported).
+    """The algorithms of RQ1, or the baselines of RQ2, with too few runs for a significant test.
+
+    Imported solutions, whose runs are unknown, have none.
     """
+    if not case.has_runs:
+        return []
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
+    # RQ2 compares a baseline's runs with NSGA-II's: the smaller number counts.
     most = runs.pop(NSGA2, 0) if question == "RQ2" else math.inf
-    known = case.algorithms if case.has_runs else ()
-    return [name for name in known if name in runs and min(runs[name], most) < fewest_runs(question)]
+    return [name for name in case.algorithms if name in runs and min(runs[name], most) < FEWEST_RUNS[question]]
 
 
 def _notes(question: str, case: Case) -> Iterator[str]:
     """Notes on a case for the readers of a table."""
     yield from case.remarks
-    name, rq = f"{case.name}: ", question.split("-")[0].upper()
+    prefix, rq = f"{case.name}: ", question.split("-")[0].upper()
     if question in ("rq1", "rq2"):
         if few := [ALGORITHM_TITLES.get(algorithm, algorithm) for algorithm in algorithms_with_few_runs(case, rq)]:
             yield (
-                f"{name}too few runs of {', '.join(few)} for a test ({fewest_runs(rq)} are needed): "
+                f"{prefix}too few runs of {', '.join(few)} for a test ({FEWEST_RUNS[rq]} are needed): "
                 "no p-value of pooled solutions stands out."
             )
         for metric in case.scoring.metrics:
             values = solutions_for_metric(case.solutions, metric)[metric.name]
             if undefined := int(values.isna().sum()):
                 share = f"{undefined} of {len(values)} solutions"
-                yield f"{name}{metric.name} is undefined in {share}, which the tests omit."
+                yield f"{prefix}{metric.name} is undefined in {share}, which the tests omit."
         undefined_names = ", ".join(metric for metric, value in case.original.items() if math.isnan(value))
         if question == "rq1" and undefined_names:
-            yield f"{name}the original vehicle's {undefined_names} is undefined, so that no test uses it."
+            yield f"{prefix}the original vehicle's {undefined_names} is undefined, so that no test uses it."
         if question == "rq2" and not case.has_runs:
-            yield f"{name}igd, igd_plus and hypervolume need runs, which imported solutions do not have."
+            yield f"{prefix}igd, igd_plus and hypervolume need runs, which imported solutions do not have."
     if question in ("rq1-runs", "rq2-runs"):
         tests = comparisons.compare_over_runs(case).dropna(subset="effect_size")
         tests = tests[tests.index == rq]
         if few_count := len(tests) - tests["enough"].sum():
             how_many = "all" if few_count == len(tests) else f"{few_count} of the"
-            yield f"{name}too few runs for {how_many} {len(tests)} tests of {rq} ({fewest_runs(rq)} are needed)."
+            yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({FEWEST_RUNS[rq]} are needed)."
     if question.startswith("rq3") or question in ("combinations", WEATHER):
-        counts = len(changes.critical_solutions(case)), len(case.solutions_of(NSGA2))
-        yield f"{name}{counts[0]} of {ALGORITHM_TITLES[NSGA2]}'s {counts[1]} solutions are critical."
+        critical_count, solution_count = len(changes.critical_solutions(case)), len(case.solutions_of(NSGA2))
+        yield f"{prefix}{critical_count} of {ALGORITHM_TITLES[NSGA2]}'s {solution_count} solutions are critical."
     if question == "combinations" and changes.frequent_combinations(case).empty:
-        yield f"{name}no critical solution has exactly four characteristics changed."
+        yield f"{prefix}no critical solution has exactly four characteristics changed."
     if question == "rq3.3":
         units = (f"{item.name} {item.unit}" for item in case.characteristics if item.unit != "-")
         yield f"Units of delta: {', '.join(units)}."

@@ -1,12 +1,13 @@
 """RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun
 against rain.
 
-Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if solutions belong to
-no run. In the frames, the columns `setting` and `other` hold the names of cases.
+In the frames, the columns `setting` and `other` hold the names of cases. Functions of a case raise `UnanswerableError`
+as `critical_solutions` does; `rq31` also raises it if solutions belong to no run.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import permutations, product
 
@@ -21,16 +22,14 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
-WEATHER_COLUMNS = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other"]
-WEATHER_COLUMNS += ["increase", "increase_other", "decrease", "decrease_other"]
+WEATHER_VALUES = ["percent", "percent_other", "difference", "rank", "rank_other"]
+WEATHER_VALUES += ["increase", "increase_other", "decrease", "decrease_other"]
 COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
 """Number of the most frequent combinations that are shown."""
-
-
 SAFETY_SCALES = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
-"""Metrics of the original vehicle that changes of safety are a share of."""
+"""For each quantity of `rq33_safety` with a percentage: the metric whose value for the original vehicle is 100 %."""
 
 
 def critical_solutions(case: Case) -> pd.DataFrame:
@@ -67,9 +66,10 @@ def count_changes(case: Case) -> npt.NDArray[np.str_]:
 def _means_by_change_count(
     case: Case, labels: Sequence[str], name: str, values: Iterable[tuple[tuple[str, ...], FloatArray]]
 ) -> pd.DataFrame:
-    """The mean `name` and number `n` of the critical solutions' values with j changes, for each key and j; NaN is none.
+    """Mean values of the critical solutions with j characteristics changed, for each key and j.
 
-    Columns setting, the `labels` of the keys, j ("1".."n", "any"), `name`, n.
+    `values` holds keys, each with one value per critical solution; NaN does not count. Columns: setting, the `labels`
+    of the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of values).
     """
     change_counts = count_changes(case)
     rows = list[tuple[str | float, ...]]()
@@ -121,8 +121,8 @@ def rq33(case: Case) -> pd.DataFrame:
         for direction, sign in (("increase", 1), ("decrease", -1))
     }
     frame = _means_by_change_count(case, ["characteristic", "direction"], "delta", values.items())
-    frame.insert(4, "pc", (frame["delta"] / frame["characteristic"].map(originals)).abs())
-    return frame
+    frame["pc"] = (frame["delta"] / frame["characteristic"].map(originals)).abs()
+    return frame[["setting", "characteristic", "direction", "j", "pc", "delta", "n"]]
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
@@ -138,18 +138,18 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     """
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
-    sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in SAFETY_SCALES.values())
+    safety_degree, tet, tit, deceleration = solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
     values = {
-        ("avgSD_mD",): np.where(has_collided, np.nan, case.original[SAFETY_DEGREE] - sd),
-        ("avgSD_cS",): np.where(has_collided, -sd, np.nan),
+        ("avgSD_mD",): np.where(has_collided, np.nan, case.original[SAFETY_DEGREE] - safety_degree),
+        ("avgSD_cS",): np.where(has_collided, -safety_degree, np.nan),
         ("TET",): np.where(has_collided, np.nan, tet - case.original["tet"]),
         ("TIT",): np.where(has_collided, np.nan, tit - case.original["tit"]),
-        ("aveDece",): case.original["ave_dece"] - dece,
+        ("aveDece",): case.original["ave_dece"] - deceleration,
     }
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
     scale = frame["quantity"].map(SAFETY_SCALES).map(case.original).abs().replace(0.0, np.nan)
-    frame.insert(4, "percent", 100 * frame["value"] / scale)
-    return frame
+    frame["percent"] = 100 * frame["value"] / scale
+    return frame[["setting", "quantity", "j", "value", "percent", "n"]]
 
 
 def count_collisions(case: Case) -> pd.DataFrame:
@@ -177,14 +177,12 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     """
     is_changed = changes_of(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
-    # Unique rows come in ascending order: reversed, the combination with the earliest characteristics is the first.
-    combinations, counts = (array[::-1] for array in np.unique(masks, axis=0, return_counts=True))
-    order = np.argsort(-counts, kind="stable")[:COMBINATIONS_SHOWN]
-    names = np.array(case.characteristics.names)
-    rows = [
-        (case.name, 1 + int(np.sum(counts > counts[i])), names[combinations[i]].tolist(), 100 * counts[i] / len(masks))
-        for i in order
-    ]
+    counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
+    most_frequent = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
+    rows = []
+    for indices, number in most_frequent:
+        rank = 1 + sum(other > number for other in counts.values())
+        rows.append((case.name, rank, [case.characteristics.names[i] for i in indices], 100 * number / len(masks)))
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
@@ -192,7 +190,7 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction,
     visibility, delays).
 
-    Parameters of the reaction are the ADS's delays, and those that the calibration of either study marks as its own.
+    The reaction's parameters are the ADS's delays, and the calibrated parameters that either study declares its `own`.
 
     Raises
     ------
@@ -224,18 +222,20 @@ def compare_weathers(*cases: Case) -> pd.DataFrame:
     signed change in the characteristic's unit).
     """
     tables = [
-        _changes_of_any_number(clearer)
-        .merge(_changes_of_any_number(other), "left", "characteristic", suffixes=("", "_other"))
+        _overall_changes(clearer)
+        .merge(_overall_changes(other), "left", "characteristic", suffixes=("", "_other"))
         .rename(columns={"setting_other": "other"})
         for clearer, other in find_weather_pairs(cases)
     ]
     table = pd.concat(tables, ignore_index=True)
     table["difference"] = table["percent_other"] - table["percent"]
-    return table[WEATHER_COLUMNS]
+    return table[["setting", "other", "characteristic", *WEATHER_VALUES]]
 
 
-def _changes_of_any_number(case: Case) -> pd.DataFrame:
-    """Columns setting, characteristic, percent, rank, increase, decrease, over all critical solutions."""
+def _overall_changes(case: Case) -> pd.DataFrame:
+    """How often and how far the critical solutions change each characteristic; columns setting, characteristic,
+    percent, rank, increase, decrease.
+    """
     shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
     deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
     return shares.drop(columns="j").join(deltas, "characteristic")
@@ -247,17 +247,17 @@ def _clearness(case: Case) -> tuple[float, float, float]:
     return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(reaction_delays)
 
 
-def _differences(one: Case, other: Case) -> list[str]:
-    """Keys, of what a simulation depends on, in which two studies differ other than by the weather and the ADS's
+def _differences(*pair: Case) -> list[str]:
+    """Keys on which a simulation depends and in which two studies differ, without those of the weather and of the ADS's
     reaction to it.
     """
-    studies = [msgspec.to_builtins(case.study) for case in (one, other)]
-    own_keys = [key for case in (one, other) for key, parameter in case.study.calibration.items() if parameter.own]
+    studies = [msgspec.to_builtins(case.study) for case in pair]
+    own_keys = [key for case in pair for key, parameter in case.study.calibration.items() if parameter.own]
     for study in studies:
         for name in (*REACTION_PARAMETERS, *(key.removeprefix("ads.parameters.") for key in own_keys)):
             study["ads"]["parameters"].pop(name, None)
-    whole = [key for key in ("matrix", "constraints", "step_length") if studies[0][key] != studies[1][key]]
-    return whole + [
+    top_keys = [key for key in ("matrix", "constraints", "step_length") if studies[0][key] != studies[1][key]]
+    return top_keys + [
         f"{table}.{key}"
         for table in ("scenario", "vehicle", "ads", "metrics")
         for key in studies[0][table] | studies[1][table]

@@ -18,15 +18,13 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.analysis.research_questions.fronts import INDICATOR_TITLES, MORE_IS_BETTER, compute_indicators
 from safevar_sumo.analysis.research_questions.statistics import (
     ALPHA,
-    INDICATOR_TITLES,
-    MORE_IS_BETTER,
+    FEWEST_RUNS,
     compare_samples,
-    compute_indicators,
     correct_by_holm,
     critical_difference,
-    fewest_runs,
     friedman_test,
     signed_rank_test,
 )
@@ -93,13 +91,13 @@ def rq2_runs(case: Case) -> pd.DataFrame:
 def compare_over_runs(case: Case) -> pd.DataFrame:
     """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2.
 
-    `enough` is whether there are enough runs for the test to be significant.
+    `enough` is whether the test has enough runs to be significant.
     """
     rows = {"RQ1": _test_original(case, over_runs=True)}
     if NSGA2 in case.algorithms and len(case.algorithms) > 1:
         rows["RQ2"] = _test_pairs(case, nsga2_pairs(case), over_runs=True)
     tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=tests["runs"] >= tests.index.map(fewest_runs))
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=tests["runs"] >= tests.index.map(FEWEST_RUNS))
 
 
 def compare_pairs(case: Case) -> pd.DataFrame:
@@ -115,7 +113,7 @@ def compare_pairs(case: Case) -> pd.DataFrame:
 
 
 def rank_algorithms(case: Case) -> pd.DataFrame:
-    """Mean ranks of three algorithms or more over runs, metric by metric, with Friedman's test.
+    """Mean ranks over runs of three algorithms or more, metric by metric, with Friedman's test.
 
     Runs with the same number form a block; a block in which an algorithm has no value is left out. Rank 1 is the best,
     `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of this case.
@@ -176,23 +174,21 @@ def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
             test = signed_rank_test(values, original)
         else:
             test = compare_samples(values, np.full(0 if np.isnan(original) else len(values), original))
+        if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
+            test = test.reversed()
         row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": test.n1}
-        # Below 0.5: the algorithm's solutions are more unsafe than the original.
-        test = test.reversed_if(metric.more_is_unsafe)
         rows.append({**row, **test._asdict(), "mean": values.mean(), "original": original})
     return rows
 
 
 def _test_pairs(case: Case, pairs: Iterable[tuple[str, str]], *, over_runs: bool = False) -> list[JsonObject]:
-    """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`; frames take the
-    column that they list.
-    """
+    """A row for each pair and metric; `other` and `baseline`, of which frames take one, name the second algorithm."""
     samples, rows = _samples(case, over_runs), []
     for (first, second), (metric, more_is_better) in product(pairs, _directions(case).items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, second)))
+        if not more_is_better:  # so that above 0.5 the first algorithm is better
+            test = test.reversed()
         row = {"setting": case.name, "algorithm": first, "other": second, "baseline": second, "metric": metric}
-        # Above 0.5: the first algorithm is better.
-        test = test.reversed_if(not more_is_better)
         rows.append({**row, **test._asdict(), "runs": min(test.n1, test.n2)})
     return rows
 
@@ -217,7 +213,7 @@ def _samples(case: Case, over_runs: bool) -> Samples:
 
 
 def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) -> pd.Series[float]:
-    """A metric's defined values over the solutions that count for it; over runs, each run's mean, by its number."""
+    """A metric's defined values over the solutions that count for it; over runs, the mean of each run."""
     solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(subset=metric.name)
     values = solutions[metric.name].astype(float)
     if not over_runs:
@@ -249,7 +245,7 @@ def summary_lines(case: Case) -> list[str]:
                 effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
                 line = f"  A12 of {heading.format(name)}: {', '.join(effects)}"
                 if untestable := ", ".join(group.loc[~group["enough"] & group["effect_size"].notna(), "metric"]):
-                    line += f"; too few runs for a test ({fewest_runs(question)} are needed): {untestable}"
+                    line += f"; too few runs for a test ({FEWEST_RUNS[question]} are needed): {untestable}"
                 lines.append(line)
     except UnanswerableError as error:
         lines.append(f"{'RQ2' if lines else 'RQ1 and RQ2'} over runs: {error.problem}.")

@@ -26,16 +26,16 @@ from safevar_sumo.analysis.figures import (
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq32
 from safevar_sumo.analysis.research_questions.comparisons import rank_algorithms
-from safevar_sumo.analysis.research_questions.statistics import (
-    ALPHA,
+from safevar_sumo.analysis.research_questions.fronts import (
     INDICATOR_TITLES,
     REFERENCE_COORDINATE,
     SURFACE_PERCENTAGES,
     compute_attainment,
     compute_convergence,
-    defined_minimised_values,
     nondominated_points,
+    points_of,
 )
+from safevar_sumo.analysis.research_questions.statistics import ALPHA
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.records import FloatArray
@@ -74,7 +74,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
     fronts = {
         algorithm: nondominated_points(points) * [objective.sign for objective in objectives]
         for algorithm in case.algorithms
-        if len(points := defined_minimised_values(case, case.solutions_of(algorithm)))
+        if len(points := points_of(case, case.solutions_of(algorithm)))
     }
     if not fronts:
         raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
@@ -171,13 +171,16 @@ def draw_attainment_surfaces(case: Case) -> Figure:
         If there are no runs with solutions.
     """
     surfaces, objectives = compute_attainment(case), case.scoring.objectives[:2]
-    figure, axes = new_panels(f"{case.name}: empirical attainment", len(surfaces), 3, (3.0, 3.1), 5.2, 0.8)
+    figure, axes = new_panels(
+        f"{case.name}: empirical attainment", len(surfaces), 3, (3.0, 3.1), min_width=5.2, title_height=0.8
+    )
     for axis in axes[1:]:
         axis.sharex(axes[0])
         axis.sharey(axes[0])
     signs = np.array([objective.sign for objective in objectives])
+    # Each surface goes on to the worst value that any surface has of an objective.
     worst = np.max([np.max(points * signs, axis=0) for surface in surfaces.values() for points in surface.values()], 0)
-    labels = {SURFACE_PERCENTAGES[0]: "half of the runs", SURFACE_PERCENTAGES[1]: "every run"}
+    labels = dict(zip(SURFACE_PERCENTAGES, ("half of the runs", "every run"), strict=True))
     for axis, (algorithm, surface) in zip(axes, surfaces.items(), strict=True):
         for (percentage, points), colour, dashes in zip(surface.items(), COLOURS, ("-", "--", "-."), strict=False):
             minimised = points * signs

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.answer import SAFETY_TABLE, Answer, algorithms_with_few_runs
-from safevar_sumo.analysis.research_questions.changes import WEATHER_COLUMNS
+from safevar_sumo.analysis.research_questions.answer import SAFETY_TABLE, TableAnswer, algorithms_with_few_runs
+from safevar_sumo.analysis.research_questions.changes import WEATHER_VALUES
 from safevar_sumo.analysis.research_questions.comparisons import titles_of
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
 from safevar_sumo.analysis.words import join_phrases
@@ -39,7 +39,7 @@ CELL_FORMATS = {
     **dict.fromkeys(("min", "Q1", "median", "Q3", "max"), "g"),
 }
 """Format specifications of the frames' columns; `p` is three decimals or `<0.001`."""
-HEADINGS: dict[str | int, str] = {
+HEADINGS = {
     "setting": "case",
     "p_value": "p",
     "p_holm": "p Holm",
@@ -67,15 +67,17 @@ class Table(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """A table of an answer: a row for each combination of `labels`, and a block of `columns` for each value of `over`.
+    """A table of an answer; its fields but the last are columns of the answer's frame.
 
-    `separate` are columns for whose values there are separate tables; `title` follows the answer's title.
+    A row stands for each combination of `labels`, a block of `columns` for each value of `blocks_of`, and a table for
+    each combination of `one_table_per`. A single column, given by its name alone, has no heading of its own in a block.
+    `title` follows the answer's title.
     """
 
     labels: Sequence[str]
     columns: Sequence[str] | str
-    over: str | None = "setting"
-    separate: Sequence[str] = ()
+    blocks_of: str | None = "setting"
+    one_table_per: Sequence[str] = ()
     title: str = ""
 
 
@@ -105,7 +107,7 @@ LAYOUTS: Mapping[str, Sequence[Layout]] = {
     ],
     "collisions": [Layout(["algorithm"], ["solutions", "collisions", "share"])],
     "combinations": [Layout(["setting", "rank", "characteristics"], ["percent"], None)],
-    "weather": [Layout(["characteristic"], WEATHER_COLUMNS[3:], None, ["setting", "other"])],
+    "weather": [Layout(["characteristic"], WEATHER_VALUES, None, ["setting", "other"])],
 }
 HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
 TITLES = {
@@ -170,45 +172,50 @@ NOTES: Mapping[str, Sequence[str]] = {
 }
 
 
-def lay_out(answer: Answer) -> list[Table]:
+def lay_out(answer: TableAnswer) -> list[Table]:
     """The tables of an answer, with notes below the last one; for an empty answer a table with the reason."""
     if answer.frame.empty:
         return [Table(TITLES[answer.name], pd.DataFrame(), answer.notes)]
     frame, tables = _readable_frame(answer), []
     for layout in LAYOUTS[answer.name]:
-        for key, group in frame.groupby(list(layout.separate), sort=False) if layout.separate else [((), frame)]:
-            title = f"{TITLES[answer.name]}{layout.title}" + (f": {' against '.join(map(str, key))}" if key else "")
-            tables.append(Table(title, _arrange(group, layout)))
-    notes = [*NOTES.get(answer.name, ()), *answer.notes]
+        title = f"{TITLES[answer.name]}{layout.title}"
+        if not layout.one_table_per:
+            tables.append(Table(title, _arrange(frame, layout)))
+            continue
+        for names, group in frame.groupby(list(layout.one_table_per), sort=False):
+            tables.append(Table(f"{title}: {' against '.join(map(str, names))}", _arrange(group, layout)))
+    notes = list[str]()
+    if "method" in frame:
+        for method in frame["method"].dropna().unique():
+            p_value = "p with e" if method == EXACT_TEST and "p_holm" not in frame else "p"
+            notes.append(f"{p_value}: {method}.")
+    notes += NOTES.get(answer.name, ())
     if "metric" in frame:
         metrics = {metric.name: metric for case in answer.cases for metric in case.scoring.metrics}.values()
-        notes.insert(len(notes) - len(answer.notes), _note_on_metrics(metrics))
-    if "method" in frame:
-        with_e = "" if "p_holm" in frame else " with e"
-        methods = frame["method"].dropna().unique()
-        notes = [*(f"p{with_e * (method == EXACT_TEST)}: {method}." for method in methods), *notes]
-    return [*tables[:-1], tables[-1]._replace(notes=tuple(notes))]
+        notes.append(_note_on_metrics(metrics))
+    return [*tables[:-1], tables[-1]._replace(notes=(*notes, *answer.notes))]
 
 
 def _arrange(frame: pd.DataFrame, layout: Layout) -> pd.DataFrame:
-    """The layout's columns, with labels as the index, and a block of columns for each value of `over`."""
-    cells = frame.set_index(list(layout.labels)).rename_axis(index=HEADINGS)[layout.columns]
+    """The layout's columns, with labels as the index, and a block of columns for each value of `blocks_of`."""
+    label_headings = [HEADINGS.get(label, label) for label in layout.labels]
+    cells = frame.set_index(list(layout.labels)).rename_axis(label_headings)[layout.columns]
     if isinstance(cells, pd.DataFrame):
         cells = cells.rename(columns=HEADINGS)
-    if layout.over is None:
+    if layout.blocks_of is None:
         return cells
-    groups = cells.groupby(frame[layout.over].to_numpy(), sort=False)
+    groups = cells.groupby(frame[layout.blocks_of].to_numpy(), sort=False)
     return pd.concat(dict(list(groups)), axis=1).fillna(UNDEFINED)
 
 
-def _readable_frame(answer: Answer) -> pd.DataFrame:
+def _readable_frame(answer: TableAnswer) -> pd.DataFrame:
     """The frame with titles in place of names and numbers as text."""
     name, frame = answer.name, answer.frame
     if name == "rq3.1":
         quartiles = frame.groupby(["setting", "j"], sort=False)["count"].quantile(np.linspace(0, 1, 5)).unstack()
         frame = quartiles.set_axis(["min", "Q1", "median", "Q3", "max"], axis=1).reset_index()
-    if name == "rq3.2":
-        frame = frame.assign(rank=frame.groupby(["setting", "characteristic"], sort=False)["rank"].transform("max"))
+    if name == "rq3.2":  # the rank by 'any', the only one, labels the whole row of a characteristic
+        frame = frame.assign(rank=frame.groupby(["setting", "characteristic"], sort=False)["rank"].transform("first"))
     if name == "combinations":
         frame = frame.assign(characteristics=frame["characteristics"].map(", ".join))
     titles = titles_of(answer.cases) | SAFETY_UNITS
@@ -216,31 +223,34 @@ def _readable_frame(answer: Answer) -> pd.DataFrame:
         column: [_format(value, CELL_FORMATS[column]) for value in frame[column]]
         for column in frame.columns.intersection(list(CELL_FORMATS))
     }
-    names = {
-        column: frame[column].replace(titles)
-        for column in ("algorithm", "baseline", "metric", "quantity", *(["other"] if name == "rq2-pairs" else []))
-        if column in frame
-    }
+    columns_of_names = ["algorithm", "baseline", "metric", "quantity"]
+    if name == "rq2-pairs":  # where `other` is an algorithm, not a case
+        columns_of_names.append("other")
+    names = {column: frame[column].replace(titles) for column in columns_of_names if column in frame}
     cells = frame.assign(**texts, **names)
     return _mark_tests(cells, answer) if "p_value" in frame else cells
 
 
-def _mark_tests(cells: pd.DataFrame, answer: Answer) -> pd.DataFrame:
-    """What stands out in bold: significant p-values (after Holm's correction if the frame has it), and significant
-    effect sizes, without the correction only notable ones.
+def _mark_tests(cells: pd.DataFrame, answer: TableAnswer) -> pd.DataFrame:
+    """Make significant p-values and their effect sizes bold.
+
+    Where p-values have Holm's correction, the corrected ones count. Without it (RQ1 and RQ2 over pooled solutions), the
+    algorithm needs enough runs, and effect sizes also have to be notable.
     """
     frame = answer.frame
-    name = "p_holm" if "p_holm" in frame else "p_value"
-    is_significant = is_notable = frame[name] < ALPHA
-    if name == "p_value":
-        few = {(case.name, one) for case in answer.cases for one in algorithms_with_few_runs(case, answer.name.upper())}
-        pairs = zip(frame["setting"], frame["algorithm" if answer.name == "rq1" else "baseline"], strict=True)
-        is_significant &= np.array([pair not in few for pair in pairs])
-        is_notable = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
+    if "p_holm" in frame:
+        p_column, is_significant = "p_holm", frame["p_holm"] < ALPHA
+        is_bold_effect = is_significant
+    else:
+        question, algorithm = ("RQ1", "algorithm") if answer.name == "rq1" else ("RQ2", "baseline")
+        few_runs = [(case.name, name) for case in answer.cases for name in algorithms_with_few_runs(case, question)]
+        has_few_runs = np.array([pair in few_runs for pair in zip(frame["setting"], frame[algorithm], strict=True)])
+        p_column, is_significant = "p_value", (frame["p_value"] < ALPHA) & ~has_few_runs
+        is_bold_effect = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
         cells["p_value"] += np.where(frame["method"] == EXACT_TEST, "e", "")
-    for column, condition in ((name, is_significant), ("effect_size", is_notable)):
+    for column, is_bold in ((p_column, is_significant), ("effect_size", is_bold_effect)):
         if column in cells:
-            cells[column] = cells[column].where(~condition, cells[column].map(BoldText))
+            cells[column] = cells[column].where(~is_bold, cells[column].map(BoldText))
     return cells
 
 
@@ -255,10 +265,14 @@ def _format(value: float, spec: str) -> str:
 def _note_on_metrics(metrics: Collection[MetricFacts]) -> str:
     """The metrics' units, and the solutions over which each metric is taken."""
     parts = []
-    for over_collisions, which in ((False, "solutions without collision"), (True, "all solutions")):
-        counted = [metric for metric in metrics if metric.over_collisions is over_collisions]
-        if counted:
-            parts.append(f"{join_phrases(one.title + unit_text(one.unit, ' [{}]') for one in counted)} over {which}")
+    for over_collisions, solutions in ((False, "solutions without collision"), (True, "all solutions")):
+        titles = [
+            metric.title + unit_text(metric.unit, " [{}]")
+            for metric in metrics
+            if metric.over_collisions is over_collisions
+        ]
+        if titles:
+            parts.append(f"{join_phrases(titles)} over {solutions}")
     return f"{'; '.join(parts)}."
 
 
@@ -276,7 +290,7 @@ _LATEX_CODES = str.maketrans(
 )
 
 
-def as_text(answers: Sequence[Answer]) -> str:
+def as_text(answers: Sequence[TableAnswer]) -> str:
     """Text for a terminal: aligned columns, bold cells with an asterisk."""
     texts = []
     for table in (table for answer in answers for table in lay_out(answer)):
@@ -286,7 +300,7 @@ def as_text(answers: Sequence[Answer]) -> str:
     return "\n".join(texts)
 
 
-def as_markdown(answers: Sequence[Answer]) -> str:
+def as_markdown(answers: Sequence[TableAnswer]) -> str:
     """Markdown tables; a heading over several columns is repeated in each column's heading."""
     texts = []
     for table in (table for answer in answers for table in lay_out(answer)):
@@ -317,7 +331,7 @@ def _markdown(source: str) -> str:
     return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", source.replace("\n", " "))
 
 
-def as_latex(answers: Sequence[Answer]) -> str:
+def as_latex(answers: Sequence[TableAnswer]) -> str:
     r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for an answer's second table."""
     numbered = ((answer.name, i, table) for answer in answers for i, table in enumerate(lay_out(answer), 1))
     tables = [render_latex(table, f"{name}-{i}" if i > 1 else name) for name, i, table in numbered]
@@ -355,7 +369,7 @@ def escaped_for_latex(source: str) -> str:
     return re.sub(r"(?<![\w)-])-(?=\.?\d)", r"\\textminus{}", escaped)
 
 
-def as_csv(answers: Sequence[Answer]) -> str:
+def as_csv(answers: Sequence[TableAnswer]) -> str:
     """The tidy frame as CSV; several frames are separated by empty lines, and each follows a line with its name."""
     tables = []
     for name, frame, *_ in answers:
@@ -366,20 +380,21 @@ def as_csv(answers: Sequence[Answer]) -> str:
     return "\n".join(tables)
 
 
-def as_json(answers: Sequence[Answer]) -> str:
-    """One list of records; undefined values are null, a missing rank has no key; with several tables, each record names
-    its "table".
+def as_json(answers: Sequence[TableAnswer]) -> str:
+    """One list of records; with several tables, each record names its "table".
+
+    Undefined values are null, but a rank, which rq3.2 has for j = any alone, is left out where there is none.
     """
     rows = list[JsonObject]()
     for name, frame, *_ in answers:
         table_key = {"table": name} if len(answers) > 1 else {}
         for row in frame.astype(object).where(frame.notna(), None).to_dict("records"):
-            defined = {str(key): value for key, value in row.items() if key != "rank" or value is not None}
-            rows.append(table_key | defined)
+            present = {str(key): value for key, value in row.items() if key != "rank" or value is not None}
+            rows.append(table_key | present)
     return json.dumps(rows, indent=2, allow_nan=False) + "\n"
 
 
-FORMATS: Mapping[str, Callable[[Sequence[Answer]], str]] = {
+FORMATS: Mapping[str, Callable[[Sequence[TableAnswer]], str]] = {
     "text": as_text,
     "markdown": as_markdown,
     "latex": as_latex,
