@@ -23,7 +23,7 @@ COLOURS = ("green", "yellow", "orange", "brown", "red")
 """Colours from best to worst; arrays hold indices of this tuple."""
 STANDARD, EXTENDED = "standard", "extended"
 NOT_RED = "Not red"
-"""A criterion; the other one is "Same or better than predicted"."""
+"""One of the two criteria of conditions; the other one is "Same or better than predicted"."""
 MITIGATION, WARNING = "mitigation", "warning"
 NIGHT = "Illumination (Night)"
 SPEED, ACCELERATION, OFFSET, HEADING = "Speed", "Acceleration", "Initial position offset", "Trajectory/Heading"
@@ -43,8 +43,8 @@ TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
 class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
     """A row of a matrix: speeds of the vehicle under test (VUT) and of the target [km/h].
 
-    Letters of columns: S (standard range), E (extended range), - (no cell); `has_function_choice`: the manufacturer
-    chooses AEB or FCW.
+    `range_letters` has a letter for each column: S (standard range), E (extended range) or - (no cell). With
+    `has_function_choice` the manufacturer chooses AEB or FCW.
     """
 
     vut_speed: float
@@ -57,8 +57,8 @@ class CellMatrix(Struct, frozen=True, forbid_unknown_fields=True):
     """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
 
     In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and
-    the function of each row (AEB or FCW) in the column with the letter `function_column`. `points`: of the standard
-    range, the extended range and robustness.
+    the function of each row (AEB or FCW) in the column with the letter `function_column`. `points` are those of the
+    standard range, the extended range and robustness.
     """
 
     test_name: str
@@ -95,8 +95,9 @@ class Condition(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Layer(Struct, frozen=True, forbid_unknown_fields=True):
-    """A robustness layer that counts for a test; in the official template, `claim_cell` on `sheet` states whether the
-    layer holds.
+    """A robustness layer that counts for a test.
+
+    In the official template, `claim_cell` on `sheet` states whether the layer holds.
     """
 
     test_name: str
@@ -163,7 +164,7 @@ class Cell(NamedTuple):
         parameters: Parameters = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
         if self.impact_location is not None:
             parameters["impact_location"] = self.impact_location
-        night = self.matrix.light == "night" or self.range_or_layer == NIGHT
+        is_night = self.matrix.light == "night" or self.range_or_layer == NIGHT
         if self.range_or_layer == ACCELERATION:
             parameters["target_deceleration"] = TARGET_DECELERATION - _leading_number(self.condition)
         elif self.range_or_layer == OFFSET and "headway" in self.condition:
@@ -172,7 +173,7 @@ class Cell(NamedTuple):
             parameters["start_share"] = 1 + _leading_number(self.condition) / 100
         elif self.range_or_layer == HEADING:
             parameters["heading"] = _leading_number(self.condition)
-        return model, parameters, night
+        return model, parameters, is_night
 
 
 def _leading_number(condition: str) -> float:
@@ -218,13 +219,13 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         that it cannot have.
         """
         fastest = max(map(int, self.starts_by_vut_speed))
-        starts = [
-            self.starts_by_vut_speed[str(min(int(cell.vut_speed), fastest))]
-            if cell.judged_by == MITIGATION
-            else self.starts_by_measure[cell.judged_by]
-            for cell in self.cells
-        ]
-        return np.array([[of_cell.get(colour, np.inf) for colour in COLOURS] for of_cell in starts])
+        rows = []
+        for cell in self.cells:
+            starts = self.starts_by_measure.get(cell.judged_by)
+            if starts is None:  # MITIGATION
+                starts = self.starts_by_vut_speed[str(min(int(cell.vut_speed), fastest))]
+            rows.append([starts.get(colour, np.inf) for colour in COLOURS])
+        return np.array(rows)
 
     @cached_property
     def nominal_numbers(self) -> list[int]:
@@ -303,7 +304,9 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 
 
 def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
-    """Numbers of the cells in one of `parts` parts; cells with the same network share a part as far as possible."""
+    """Numbers of the cells in the part with the number `part` of all `parts`; cells with the same network share a part
+    as far as possible.
+    """
 
     def network_of(number: int) -> tuple[str, bool, str]:
         model, parameters, _ = protocol.cells[number].scenario

@@ -75,10 +75,10 @@ class DrivingRobot:
         if not self._is_needed:
             return command, state
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
-        share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
-        is_larger = is_open & (share > self._error_share)
+        error_share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
+        is_larger = is_open & (error_share > self._error_share)
         np.copyto(self.error, error, where=is_larger)
-        np.copyto(self._error_share, share, where=is_larger)
+        np.copyto(self._error_share, error_share, where=is_larger)
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)

@@ -76,13 +76,13 @@ class Rater:
         tests = {}
         for test, matrices in protocol.tests.items():
             claimed, test_layers = self.claims.get(test, ()), protocol.layers_of(test)
-            held = sum(
+            held_count = sum(
                 layers.get((test, layer.name), np.full(len(fails), layer.name in claimed)) for layer in test_layers
             )
             for matrix in matrices:
                 standard, extended = _range_points(protocol, matrix, colours)
                 earns_robustness = _rounded_share(standard) >= _rounded_share(ROBUSTNESS_SHARE * matrix.points[0])
-                robustness = np.where(earns_robustness, held / len(test_layers) * matrix.points[2], 0.0)
+                robustness = np.where(earns_robustness, held_count / len(test_layers) * matrix.points[2], 0.0)
                 tests[matrix.name] = np.where(fails, 0.0, [standard, extended, robustness]).T
         return Points(colours=colours, tests=tests, layers=layers, fails=fails)
 
@@ -146,9 +146,7 @@ def passing_cells(protocol: Protocol, colours: npt.NDArray[np.int8]) -> BoolArra
 
 
 def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see
-    `CellResults`.
-    """
+    """Impact [km/h], warning [s] and validity of N simulations of a cell, as in `CellResults`; shape (N,) each."""
     is_valid = (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
     return runs.relative_speed * KMH_PER_MS, np.broadcast_to(runs.warning_ttc, is_valid.shape), is_valid
 

@@ -37,8 +37,9 @@ Numbers = dict[str, float | None]
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Comparison of values simulated by this package ("here") with reference values; None if there are no values to
-    compare.
+    """Comparison of values simulated by this package ("here") with reference values.
+
+    Numbers are None where there are no values to compare.
 
     Attributes
     ----------
@@ -110,23 +111,22 @@ def measure_agreement(
     study's values.
     """
     pairs = {name: defined_pairs(values, evaluations.metrics[name]) for name, values in reference.metrics.items()}
-    errors = {name: _mean(np.abs(here - there)) for name, (there, here) in pairs.items()}
+    mean_errors = {name: _mean(np.abs(here - there)) for name, (there, here) in pairs.items()}
     both_collide, differ = reference.collided & evaluations.collided, reference.collided != evaluations.collided
     counts = {
         "reference": int(reference.collided.sum()),
         "here": int(evaluations.collided.sum()),
         "both": int(both_collide.sum()),
     }
-    degrees, repeatability = reference.metrics[SAFETY_DEGREE], study.repeatability.get(SAFETY_DEGREE)
-    distance = np.minimum(np.abs(degrees), np.abs(evaluations.f_safe))
-    within = (
-        None if repeatability is None else int(np.count_nonzero(differ & (distance <= SCATTER_WIDTH * repeatability)))
-    )
-    error = evaluations.f_safe - degrees
+    degrees, within_repeats = reference.metrics[SAFETY_DEGREE], None
+    if (repeatability := study.repeatability.get(SAFETY_DEGREE)) is not None:
+        distance = np.minimum(np.abs(degrees), np.abs(evaluations.f_safe))
+        within_repeats = int(np.count_nonzero(differ & (distance <= SCATTER_WIDTH * repeatability)))
+    errors = evaluations.f_safe - degrees
     return Agreement(
         rows=len(evaluations),
         spearman={name: rank_correlation(*pair) for name, pair in pairs.items()},
-        mean_absolute_error=errors,
+        mean_absolute_error=mean_errors,
         bias={name: _mean(here - there) for name, (there, here) in pairs.items()},
         collisions=counts,
         original={
@@ -141,25 +141,25 @@ def measure_agreement(
         },
         in_repeats={
             name: None if error is None or name not in study.repeatability else error / study.repeatability[name]
-            for name, error in errors.items()
+            for name, error in mean_errors.items()
         },
-        undecided={"differ": int(differ.sum()), "within_repeats": within},
+        undecided={"differ": int(differ.sum()), "within_repeats": within_repeats},
         by_predicted=[
             {
                 "lowest": float(evaluations.f_safe[rows].min()),
                 "highest": float(evaluations.f_safe[rows].max()),
                 "rows": len(rows),
-                "bias": float(error[rows].mean()),
+                "bias": float(errors[rows].mean()),
             }
-            for rows in _bins_of(np.where(np.isnan(error), np.nan, evaluations.f_safe))
+            for rows in _bins_of(np.where(np.isnan(errors), np.nan, evaluations.f_safe))
         ],
     )
 
 
 def defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The values of rows that are defined on both sides."""
-    rows = ~np.isnan(values) & ~np.isnan(other_values)
-    return values[rows], other_values[rows]
+    """Both values of the rows in which both are defined."""
+    is_defined = ~np.isnan(values) & ~np.isnan(other_values)
+    return values[is_defined], other_values[is_defined]
 
 
 def _bins_of(values: FloatArray) -> list[npt.NDArray[np.intp]]:
@@ -168,7 +168,8 @@ def _bins_of(values: FloatArray) -> list[npt.NDArray[np.intp]]:
     if not defined.size:
         return []
     edges = np.unique(np.quantile(defined, np.linspace(0, 1, BINS + 1)))
-    numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+    last_bin = max(len(edges) - 2, 0)  # one edge alone, if all values are equal, is a bin
+    numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, last_bin)
     return [np.flatnonzero((numbers == i) & ~np.isnan(values)) for i in np.unique(numbers[~np.isnan(values)])]
 
 
@@ -199,7 +200,8 @@ def plot_agreement(
     InputError
         If the file cannot be written or its ending names no picture format.
     """
-    figure, axes = new_panels(title, 2 * len(reference.metrics) + len(characteristics), 4, (3.0, 2.4), 12.0, 0.8)
+    panel_count = 2 * len(reference.metrics) + len(characteristics)
+    figure, axes = new_panels(title, panel_count, 4, (3.0, 2.4), min_width=12.0, title_height=0.8)
     for i, (metric, values) in enumerate(reference.metrics.items()):
         here = evaluations.metrics[metric]
         label = f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
@@ -221,10 +223,11 @@ def plot_agreement(
 
 
 def _draw_scatter(axis: Axes, reference: FloatArray, here: FloatArray, is_collision: BoolArray, label: str) -> None:
-    """Draw simulated over reference values; those that collide on either side in another colour."""
+    """Draw simulated over reference values; settings that collide on either side have another colour."""
     axis.scatter(reference, here, s=6, alpha=0.4, c=np.where(is_collision, VERMILION, BLUE), linewidths=0)
     x, y = defined_pairs(reference, here)
-    axis.axline((float(x[0]), float(x[0])) if x.size else (0, 0), slope=1, color="black", linewidth=0.8, linestyle="--")
+    origin = float(x[0]) if x.size else 0.0  # in the range of the values, so that the line does not widen the axes
+    axis.axline((origin, origin), slope=1, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
     axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT_SIZE)
     axis.set(xlabel=f"reference: {label}", ylabel=f"here: {label}")
@@ -241,7 +244,7 @@ def _draw_error(axis: Axes, values: FloatArray, error: FloatArray, label: str, e
     axis.set(xlabel=label, ylabel=error_label)
 
 
-SHIPPED_TOTALS = Path(__file__).with_name("published.toml")
+SHIPPED_TOTALS = Path(__file__).with_name("agreement_totals.toml")
 TOTALS_COMMENT = (
     "Agreement of studies with published data: totals, no row of it. "
     "`validate STUDY FILE --totals THIS_FILE` writes an entry."

@@ -92,8 +92,10 @@ class Profiles(NamedTuple):
     def of(
         cls, parameters: Sequence[FittedParameter], space: FitSpace, races: Sequence[SearchRace], alike: float
     ) -> Profiles:
-        """The profiles of finished races; a trial fits as well as the best up to `alike` times the lowest loss above
-        it. The best trials of all races that fit so well are among the sets.
+        """The profiles of finished races.
+
+        A trial fits as well as the best if its loss exceeds the lowest loss by at most the share `alike`. The best
+        trials of all races that fit so well are among the sets.
         """
         bests = sorted(((race.lowest_loss, race.best_place) for race in races), key=lambda trial: trial[0])
         limit = bests[0][0] * (1 + alike)
@@ -127,7 +129,7 @@ class Profiles(NamedTuple):
 
 
 def _distant_trials(places: FloatArray, first: int) -> list[int]:
-    """Indices of trials that lie as far apart as possible, the `first` ones among them (farthest-point sampling)."""
+    """Indices of the `first` trials and of others that lie as far apart as possible, by farthest-point sampling."""
     indices = list(range(min(first, MAX_SETS)))
     distances = np.linalg.norm(places[:, np.newaxis] - places[indices], axis=2).min(axis=1)
     while len(indices) < min(MAX_SETS, len(places)) and distances.max() > 0:
@@ -205,7 +207,7 @@ def calibrate(
             best_loss, best_place = loss, place
         done(best_loss, space.studies_at(best_place))
 
-    races, reached = [], list[float]()
+    races, reached = [], []
     for seed in range(fit.seed, fit.seed + fit.repeats):
         races.append(SearchRace(space.misfits_at, fit.population, fit.trials, after_trial))
         reached += _run_race(races[-1], space, fit, seed, from_scratch)
@@ -283,8 +285,8 @@ def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], p
 
 
 def describe_fit(subject: FitSubject, result: Calibration, studies: Sequence[Study], *, from_scratch: bool) -> str:
-    """The fit of one of `studies` in words: search, loss, data with fingerprints, order, parameters of its own,
-    bounds.
+    """The fit of one of `studies` in words: search, loss, files with fingerprints and rank correlations, parameters of
+    its own, and parameters that lie on a bound.
     """
     (study, references), fit, values = subject, studies[0].fit, result.values.items()
     together = "".join(f", together with {other.name!r}" for other in studies if other is not study)
@@ -321,7 +323,7 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
     """
     names = [study.name for study in studies]
     title = f"Loss of {' and '.join(names)} over each parameter; band: fits as well as the best"
-    figure, axes = new_panels(title, len(profiles.parameters), 4, (2.75, 1.7), 11.0, 0.6)
+    figure, axes = new_panels(title, len(profiles.parameters), 4, (2.75, 1.7), min_width=11.0, title_height=0.6)
     for axis in axes[1:]:
         axis.sharey(axes[0])
     is_as_good = profiles.losses <= profiles.limit
@@ -330,10 +332,8 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
         axis.axvspan(*profiles.interval(k), color=BLUE, alpha=0.12, linewidth=0)
         axis.scatter(values, profiles.losses, s=4, alpha=0.5, c=np.where(is_as_good, BLUE, GREY), linewidths=0)
         axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
-        key = parameter.key.replace("vehicle.parameters.", "").replace("ads.parameters.", "")
-        owners = [] if len(parameter.study_indices) == len(names) else [names[i] for i in parameter.study_indices]
-        axis.set(
-            xlabel=f"{', '.join(owners)}: " * bool(owners) + key + unit_text(parameter.bounds.unit, " [{}]"),
-            ylabel="loss",
-        )
+        label = parameter.key.replace("vehicle.parameters.", "").replace("ads.parameters.", "")
+        if len(parameter.study_indices) < len(names):
+            label = f"{', '.join(names[i] for i in parameter.study_indices)}: {label}"
+        axis.set(xlabel=label + unit_text(parameter.bounds.unit, " [{}]"), ylabel="loss")
     save(figure, path, "plot")

@@ -62,7 +62,7 @@ def compare_tables(here: Sequence[Case], published: Sequence[Case]) -> list[Comp
             tables.append(ComparedTable(name, pd.DataFrame(), notes))
             continue
         for side, frame in frames.items():
-            if name == "combinations":  # those of equal rank are compared
+            if name == "combinations":  # those in the same place are compared
                 places, combinations = frame.groupby("setting").cumcount() + 1, frame["characteristics"].map(", ".join)
                 frame = frame.assign(place=places, characteristics=combinations)
             frames[side] = frame.astype(object).set_index(keys)
@@ -108,6 +108,8 @@ MIN_SHARE, MIN_SHARE_IN_DIRECTION = 0.8, 0.6
 direction."""
 MIN_LEAN = 0.2
 """Least difference between the shares of increases and decreases for a characteristic to lean to one direction."""
+CHARACTERISTICS_SHOWN = 3
+"""Number of the characteristics that are changed most often that a conclusion names."""
 RULES = (
     f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, if both effect sizes are of "
     "the same magnitude "
@@ -152,26 +154,28 @@ def draw_conclusions(tables: Sequence[ComparedTable]) -> list[Conclusion]:
 
 
 def _numbers(frame: pd.DataFrame, quantity: str) -> FloatArray:
-    """The values of a quantity here and published, shape (rows, 2); NaN where undefined."""
+    """The values of a quantity, here and published, shape (rows, 2); NaN where undefined."""
     return np.stack([frame[side][quantity].to_numpy(dtype=float) for side in COMPARED_SIDES], axis=1)
 
 
 def _missing(values: FloatArray) -> str:
-    """What is missing if a value here or published is undefined; else empty."""
+    """Which of two values, here and published, is undefined, in words; empty if none is."""
     sides = [side for side, is_missing in zip(COMPARED_SIDES, np.isnan(values), strict=True) if is_missing]
     return f"no value {' and '.join(sides)}" if sides else ""
 
 
 def judge_test(effect: float, p: float, published_effect: float, published_p: float) -> ReplicationVerdict:
     """Whether a published test holds here, by direction, magnitude and significance."""
-    is_same_direction = (effect - 0.5) * (published_effect - 0.5) > 0
+    is_same_direction = (effect - 0.5) * (published_effect - 0.5) > 0  # on the same side of 0.5
     magnitudes = {magnitude_of(effect), magnitude_of(published_effect)}
     is_equal = (p < ALPHA) == (published_p < ALPHA) and len(magnitudes) == 1
     return _judge(is_equal and (is_same_direction or p >= ALPHA or magnitudes == {"negligible"}), is_same_direction)
 
 
 def _judge(holds: bool, holds_in_direction: bool) -> ReplicationVerdict:
-    return HOLDS if holds else IN_DIRECTION if holds_in_direction else DIFFERS
+    if holds:
+        return HOLDS
+    return IN_DIRECTION if holds_in_direction else DIFFERS
 
 
 def _read_tests(question: str, if_larger: str, if_smaller: str, frame: pd.DataFrame) -> Iterator[Conclusion]:
@@ -182,12 +186,15 @@ def _read_tests(question: str, if_larger: str, if_smaller: str, frame: pd.DataFr
         if missing := _missing(effects):
             yield Conclusion(question, setting, name, UNDECIDED, missing)
             continue
-        difference = "no difference" if p_values[1] >= ALPHA else if_larger if effects[1] > 0.5 else if_smaller
+        (effect_here, published_effect), (p_here, published_p) = effects, p_values
+        difference = if_larger if published_effect > 0.5 else if_smaller
+        if published_p >= ALPHA:
+            difference = "no difference"
         numbers = (
             f"{effect:.2f} {side} ({magnitude_of(effect)}, p {p:.2g})"
             for side, effect, p in zip(COMPARED_SIDES, effects, p_values, strict=True)
         )
-        verdict = judge_test(effects[0], p_values[0], effects[1], p_values[1])
+        verdict = judge_test(effect_here, p_here, published_effect, published_p)
         yield Conclusion(question, setting, f"{name}: {difference}", verdict, f"effect size {', '.join(numbers)}")
 
 
@@ -228,7 +235,8 @@ def _read_orders(question: str, keys: Sequence[str], quantity: str, frame: pd.Da
         if is_defined.any():
             characteristics = group.index.get_level_values("characteristic").to_numpy()[is_defined]
             here, published = (
-                ", ".join(characteristics[np.argsort(-column, kind="stable")][:3]) for column in values[is_defined].T
+                ", ".join(characteristics[np.argsort(-column, kind="stable")][:CHARACTERISTICS_SHOWN])
+                for column in values[is_defined].T
             )
             rho = rank_correlation(*values[is_defined].T)
             verdict = UNDECIDED if rho is None else _judge(rho >= MIN_RHO, rho >= MIN_RHO_IN_DIRECTION)

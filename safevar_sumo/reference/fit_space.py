@@ -70,10 +70,10 @@ def free_parameters(studies: Sequence[Study]) -> list[FittedParameter]:
                 continue
             value = value_of(study, key)
             _check_bounds(study, key, value, bounds)
-            others = (
+            sharing = (
                 k for k, other in enumerate(studies) if k > index and not bounds.own and _shares(other, key, value)
             )
-            parameters.append(FittedParameter(key, (index, *others), bounds))
+            parameters.append(FittedParameter(key, (index, *sharing), bounds))
     return parameters
 
 
@@ -107,8 +107,9 @@ def _check_bounds(study: Study, key: str, value: float, bounds: FreeParameter) -
 
 
 class FitSpace:
-    """The unit cube of the parameters' bounds: a place in it determines the parameters' values, hence the studies and
-    their misfit.
+    """The unit cube of the parameters' bounds.
+
+    A place in it determines the parameters' values, and so the studies and their misfit.
     """
 
     def __init__(self, parameters: Sequence[FittedParameter], fits: Sequence[StudyFit]) -> None:
@@ -151,16 +152,16 @@ class FitSpace:
 
     def misfits_at(self, places: Sequence[FloatArray]) -> list[Misfit]:
         """The mean loss of the studies at each place, and the residuals of all of them."""
-        fits = [
+        work = [
             (fit, fit.batches(study))
             for place in places
             for fit, study in zip(self._fits, self.studies_at(place), strict=True)
         ]
-        evaluations = iter(evaluate_batches([batch for _, batches in fits for batch in batches], self._fits[0].pool))
-        misfits = [fit.misfit(list(islice(evaluations, len(batches)))) for fit, batches in fits]
+        evaluations = iter(evaluate_batches([batch for _, batches in work for batch in batches], self._fits[0].pool))
+        misfits = [fit.misfit(list(islice(evaluations, len(batches)))) for fit, batches in work]
         groups = [misfits[start : start + len(self._fits)] for start in range(0, len(misfits), len(self._fits))]
         return [
-            Misfit(float(np.mean([one.loss for one in group])), np.concatenate([one.residuals for one in group]))
+            Misfit(float(np.mean([fit.loss for fit in group])), np.concatenate([fit.residuals for fit in group]))
             for group in groups
         ]
 
@@ -190,19 +191,23 @@ class StudyFit:
         """The loss and the residuals, from the evaluations of all batches."""
         evaluations = Evaluations.concatenate(batches).take(self._row_of.ravel())
         original, *files = [evaluations.take(np.arange(start, end)) for start, end in pairwise(self._ends)]
-        own = original_misfit(original, self.study.published, self.study.fit)
-        fits = [reference_misfit(data, self.study, rows) for data, rows in zip(self._references, files, strict=True)]
-        loss = own.loss + sum(fit.loss for fit in fits) / max(len(fits), 1) if evaluations.valid.all() else MAX_LOSS
-        return Misfit(loss, np.concatenate([fit.residuals for fit in (own, *fits)]))
+        of_original = original_misfit(original, self.study.published, self.study.fit)
+        of_files = [
+            reference_misfit(data, self.study, rows) for data, rows in zip(self._references, files, strict=True)
+        ]
+        loss = MAX_LOSS
+        if evaluations.valid.all():
+            loss = of_original.loss + sum(misfit.loss for misfit in of_files) / max(len(of_files), 1)
+        return Misfit(loss, np.concatenate([misfit.residuals for misfit in (of_original, *of_files)]))
 
 
 def original_misfit(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> Misfit:
-    """Loss and residuals of the original vehicle's metrics, which deviate from the published values.
+    """Loss and residuals of the original vehicle's metrics in comparison with the published values.
 
-    The loss is a mean, weighted by metric, in halves of a tolerance beyond the tolerance. Deviations within the
-    tolerance cost nothing (Vapnik 1995): the published values come from a single simulation of the original vehicle,
-    and the many rows of similar vehicles are stronger evidence. The residuals are the deviations in tolerances; their
-    squares are weighted by metric.
+    The loss is the mean, weighted by metric, of twice the deviations beyond the tolerance, in tolerances. Deviations
+    within the tolerance cost nothing (Vapnik 1995): the published values come from a single simulation of the original
+    vehicle, and the many rows of similar vehicles are stronger evidence. The residuals are the deviations in
+    tolerances; their squares are weighted by metric.
     """
     names = [name for name in published if name in METRICS]
     if not names or not fit.original:

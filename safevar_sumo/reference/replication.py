@@ -46,18 +46,11 @@ def replicate(
     InputError
         If one side has two results of a study, or no study has results on both sides.
     """
-    cases_by_name = {
-        argument: {case.study.name: case for case in cases}
-        for argument, cases in (("directories", here), ("published", published))
-    }
-    for (argument, by_name), cases in zip(cases_by_name.items(), (here, published), strict=True):
-        if len(by_name) < len(cases):
-            raise InputError(
-                argument,
-                f"has two results of a study: {', '.join(case.study.name for case in cases)}",
-                "one of each study",
-            )
-    ours, theirs = cases_by_name.values()
+    for argument, cases in (("directories", here), ("published", published)):
+        names = [case.study.name for case in cases]
+        if len({*names}) < len(names):
+            raise InputError(argument, f"has two results of a study: {', '.join(names)}", "one of each study")
+    ours, theirs = ({case.study.name: case for case in cases} for cases in (here, published))
     pairs = [(case, theirs[name]) for name, case in ours.items() if name in theirs]
     if not pairs:
         raise InputError(
@@ -96,8 +89,8 @@ def replicate(
 
 def _lines_on_nearest_rows(cases: Sequence[Case], references: Mapping[str, Sequence[ReferenceData]]) -> list[str]:
     known = [case for case in cases if case.name in references]
-    near = [row for case in known for row in compare_with_nearest_rows(case, references[case.name])]
-    if not near:
+    rows = [row for case in known for row in compare_with_nearest_rows(case, references[case.name])]
+    if not rows:
         return []
     return [
         "## Does the search exploit the model?",
@@ -106,7 +99,7 @@ def _lines_on_nearest_rows(cases: Sequence[Case], references: Mapping[str, Seque
         "domains. If the search found holes in the model, the published rows next to its solutions would be as safe as "
         "others.",
         "",
-        _markdown_table(list(near[0]), [list(row.values()) for row in near]),
+        _markdown_table(list(rows[0]), [list(row.values()) for row in rows]),
         "",
     ]
 
@@ -115,26 +108,24 @@ def _head_lines(pairs: Sequence[tuple[Case, Case]], conclusions: Sequence[Conclu
     counts = Counter(conclusion.verdict for conclusion in conclusions)
     summary = ", ".join(f"{counts[verdict]} {words}" for verdict, words in VERDICT_PLURALS.items())
     lines = ["# Does the published study replicate?", "", f"Of {len(conclusions)} conclusions: {summary}.", ""]
-    for pair in pairs:
-        name, sizes = pair[0].study.name, [Counter(case.solutions["algorithm"]) for case in pair]
-        texts = (
-            " + ".join(f"{number} of {algorithm}" for algorithm, number in size.items()) or "no solution"
-            for size in sizes
-        )
-        lines.append(f"- {pair[0].study.title} ({name}): {' here, '.join(texts)} published.")
-        one_sided = set(pair[0].algorithms) ^ set(pair[1].algorithms)
+    for here, published in pairs:
+        name, texts = here.study.name, []
+        for case in (here, published):
+            sizes = Counter(case.solutions["algorithm"])
+            texts.append(" + ".join(f"{number} of {algorithm}" for algorithm, number in sizes.items()) or "no solution")
+        lines.append(f"- {here.study.title} ({name}): {texts[0]} here, {texts[1]} published.")
+        one_sided = {*here.algorithms} ^ {*published.algorithms}
         if one_sided:
             effect = "; RQ2, RQ3 and the weathers need them" if NSGA2 in one_sided else ""
             lines.append(
                 f"- {name}: solutions on one side only are not compared: {', '.join(sorted(one_sided))}{effect}."
             )
-        lines += [f"- {note}" for note in pair[0].remarks]
+        lines += [f"- {note}" for note in here.remarks]
     return lines
 
 
 def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -> list[JsonObject]:
-    """Compare the solutions of each algorithm with the nearest rows of the references, which must be data of the same
-    vehicle.
+    """Compare the solutions of each algorithm with the nearest rows of references of the same vehicle.
 
     Distances are Euclidean in widths of the domains, and medians. Safety degrees are means [m, -m/s]. The last column
     is the share of collisions among the published rows nearest to colliding solutions; NaN without such solutions.
@@ -144,9 +135,10 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
     scaled_rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
     tree, count = scipy.spatial.cKDTree(scaled_rows), min(NEAREST_ROWS, len(scaled_rows))
-    published_distances = (
-        tree.query(scaled_rows, count + 1)[0][:, 1:] if len(scaled_rows) > count else np.full((1, 1), np.nan)
-    )
+    published_distance = np.nan
+    if len(scaled_rows) > count:
+        distances, _ = tree.query(scaled_rows, count + 1)
+        published_distance = float(np.median(distances[:, 1:]))  # without a row's distance from itself
     results = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
@@ -156,20 +148,20 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
                 np.reshape(array, (len(scaled_solutions), count)) for array in tree.query(scaled_solutions, count)
             )
             is_collision = are_collisions(solutions).to_numpy()
+            collision_share = np.nan
+            if is_collision.any():
+                collision_share = 100 * float((safety[nearest_rows[is_collision]] <= 0).mean())
             results.append(
                 {
                     "setting": case.name,
                     "algorithm": algorithm,
                     "solutions": len(solutions),
                     "distance to published rows": float(np.median(distances)),
-                    "distance among published rows": float(np.median(published_distances)),
+                    "distance among published rows": published_distance,
                     "mean SD here": float(np.nanmean(solutions[SAFETY_DEGREE])),
                     "mean SD published": float(safety[nearest_rows].mean()),
                     "collisions here": int(is_collision.sum()),
-                    "published rows next to them that collide [%]": 100
-                    * float((safety[nearest_rows[is_collision]] <= 0).mean())
-                    if is_collision.any()
-                    else np.nan,
+                    "published rows next to them that collide [%]": collision_share,
                 }
             )
     return results

@@ -26,12 +26,16 @@ COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece":
 RANGES = {SAFETY_DEGREE: (-300.0, 1e4), "tet": (0.0, 1e4), "tit": (0.0, 1e5), "ave_dece": (-300.0, 300.0)}
 """Accepted values, wider than those of any road vehicle: m or -m/s; s; s^2; m/s^2 of either sign."""
 OPTIONAL_METRIC = "ave_dece"
+FIRST_ROW = 2
+"""Number of the row after the header in the file, as errors count."""
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
 """Names of characteristics in the files of the published package -> names in its paper; in lower case, without
 underscores."""
 SHARE_DECIMALS = 3
-"""Decimals to which the published package rounds the ratio of change to domain width before it compares the ratio with
+"""Decimals to which the published package rounds a change's share of the domain before it compares the share with
 beta."""
+ROUNDING_ERROR = 1e-12
+"""Largest rounding error of such a share."""
 
 
 class ReferenceData(NamedTuple):
@@ -128,7 +132,7 @@ def _parse_numbers(path: Path, column: pd.Series[str], lowest: float, highest: f
     for row, cell in invalid_cells.items():
         legal = "a finite number" if lowest == -np.inf else f"a number in [{lowest:g}, {highest:g}]"
         fault = "is empty" if pd.isna(cell) else f"= {cell!r}"
-        raise InputError(path, f"row {int(row) + 2}, column {column.name} {fault}", legal)
+        raise InputError(path, f"row {int(row) + FIRST_ROW}, column {column.name} {fault}", legal)
     return values.to_numpy(dtype=float)
 
 
@@ -138,7 +142,7 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
     """
     width = characteristics.upper - characteristics.lower
     share = np.round(np.abs(settings - characteristics.original) / width, SHARE_DECIMALS)
-    return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
+    return np.where(share >= characteristics.threshold / width - ROUNDING_ERROR, settings, characteristics.original)
 
 
 METRIC_NAMES = {

@@ -17,17 +17,17 @@ from safevar_sumo.records import FloatArray
 MAX_KEPT_RATIO = 1.25
 """A trial is kept, for profiles and the spread, if its loss is at most this multiple of the lowest loss."""
 MARGIN = 1e-4
-"""Distance that the places of an ensemble keep from the ends of the bounds, as a share of the bounds' width."""
+"""Distance that an ensemble's places keep from the bounds, as a share of the bounds' width."""
 PLACE_DECIMALS = 4
-"""Decimals of the places: last digits that depend on how residuals were computed do not reach the search that
-follows."""
+"""Decimals of an ensemble's places, so that last digits, which depend on how residuals were computed, do not reach the
+search that follows."""
 SPREAD = 0.08
-"""The axes are those of the step with the mean standard deviation of places next to this share of the bounds' width."""
+"""A search takes its axes from the step of an inversion at which the places' mean standard deviation is nearest to this
+share of the bounds' width."""
 LEAST_VARIANCE = 1e-5
 """Added to the variance of every parameter, so that the axes span the space."""
 STEP_SHARE = 0.5
-"""Share that a step uses of the weight that Iglesias and Yang (2021) allow: residuals are not linear in the
-parameters."""
+"""Share of the weight that Iglesias and Yang (2021) allow a step: residuals are not linear in the parameters."""
 
 
 class Misfit(NamedTuple):
@@ -81,12 +81,13 @@ class SearchRace:
         remaining trials.
         """
         competitors = list(searches)
-        rounds = 1 + (len(competitors) - 1).bit_length()
+        rounds = 1 + (len(competitors) - 1).bit_length()  # as often as half of them, rounded up, can go on
         trials_per_round = self.trials_left // rounds
         for _ in range(rounds):
             trials = trials_per_round // len(competitors)
             for search in competitors:
-                search.advance(trials - trials % search.population if trials > search.population else trials)
+                incomplete = trials % search.population if trials > search.population else 0
+                search.advance(trials - incomplete)
             competitors = sorted(competitors, key=lambda search: search.lowest_loss)[: (len(competitors) + 1) // 2]
         competitors[0].advance(self.trials_left)
 
@@ -94,8 +95,8 @@ class SearchRace:
 class CmaSearch:
     """One search by CMA-ES (Hansen 2016); `lowest_loss` is that of its trials so far.
 
-    Its first generation, by default of the race's population, has the covariance `deviation`**2 * `axes` @ `axes`.T,
-    where `axes` has the shape (n, n); by default they are the cube's.
+    The first generation has the covariance `deviation`**2 * `axes` @ `axes`.T, where `axes` has the shape (n, n); by
+    default they are the cube's. `population` is by default the race's.
     """
 
     def __init__(
@@ -122,12 +123,12 @@ class CmaSearch:
         race = self._race
         for trials_left in range(trials, 0, -self.population):
             coordinates = self._strategy.ask()
-            places = [np.asarray(self._bounds.repair(self._axes @ point)) for point in coordinates]
-            losses = [misfit.loss for misfit in race.try_places(places[:trials_left])]
+            places = [np.asarray(self._bounds.repair(self._axes @ point)) for point in coordinates[:trials_left]]
+            losses = [misfit.loss for misfit in race.try_places(places)]
             max_loss = MAX_KEPT_RATIO * race.lowest_loss
-            race.kept += [(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= max_loss]
+            race.kept += [(loss, place) for loss, place in zip(losses, places, strict=True) if loss <= max_loss]
             self.lowest_loss = min(self.lowest_loss, *losses)
-            if len(losses) == len(places):
+            if len(losses) == len(coordinates):
                 self._strategy.tell(coordinates, losses)
 
 
@@ -171,9 +172,9 @@ def _step_weight(residuals: FloatArray) -> float:
     """
     misfits, count = (residuals**2).sum(axis=1) / 2, residuals.shape[1]
     mean, variance = float(misfits.mean()), float(misfits.var())
-    return STEP_SHARE * max(
-        count / (2 * mean) if mean else 1.0, float(np.sqrt(count / (2 * variance))) if variance else 1.0
-    )
+    by_mean = count / (2 * mean) if mean else 1.0
+    by_variance = float(np.sqrt(count / (2 * variance))) if variance else 1.0
+    return STEP_SHARE * max(by_mean, by_variance)
 
 
 def _posterior_sample(places: FloatArray, residuals: FloatArray, weight: float, rng: np.random.Generator) -> FloatArray:

@@ -16,7 +16,7 @@ from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.sections import GENERAL_LIMITS
 from safevar_sumo.study import Study, unit_text, user_code_names
 
-FIRST = "Nothing here was compared with a real car."
+FIRST_SENTENCE = "Nothing here was compared with a real car."
 PURPOSE = (
     "Candidate evidence for a safety case: neither this page nor the program that made it says that a vehicle complies "
     "with anything. No regulation that was read defines a metric or a threshold for simulations."
@@ -26,7 +26,7 @@ OF_MODEL = "by a model that was compared with published simulator data; this num
 EXACT = "compared with a closed form or a second implementation"
 ASSUMED = "assumed: no data for this combination of vehicle, driving system and scenario"
 """Levels of evidence of a statement."""
-STRONGEST = 3
+SENSITIVITIES_SHOWN = 3
 """Number of characteristics that the section on sensitivity names."""
 STEPS = {"half_step": "half the time step", "double_step": "double the time step"}
 """The checks with another time step."""
@@ -56,8 +56,6 @@ STATE_WITH = {
     "repair": "State with it: the promise and who keeps it, the margin, the certified bound and confidence, the price.",
 }
 """What a safety case has to say beside an answer."""
-
-
 ROUNDINGS = {"ceil": ROUND_CEILING, "floor": ROUND_FLOOR}
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 
@@ -72,7 +70,7 @@ class Statement(NamedTuple):
 
 
 class _Reading(Formatter):
-    """Fills the fields of a text, which are paths in an answer's JSON below `at`, and keeps what stands there."""
+    """Fills the fields of a text, which are paths in an answer's JSON below `at`, and notes the values in `numbers`."""
 
     def __init__(self, answer: Any, at: str) -> None:
         self.answer, self.at, self.numbers = answer, at, dict[str, Any]()
@@ -115,20 +113,20 @@ def make_dossier(
         **answers,
     }
     files = [validation["file"] for validation in validations]
-    made = _Dossier(study, sources, list(answers), files, counts["runs"])
+    dossier = _Dossier(study, sources, list(answers), files, counts["runs"])
     sections = {
-        "Intended use and scope": made.scope(),
-        "Toolchain": made.toolchain(),
-        "Verification": made.verification(),
-        "Validation": made.validation(),
-        "Uncertainty": made.uncertainty(),
-        "Sensitivity": made.sensitivity(),
-        "Answers": made.results(),
-        "Open points": made.open_points(),
+        "Intended use and scope": dossier.scope(),
+        "Toolchain": dossier.toolchain(),
+        "Verification": dossier.verification(),
+        "Validation": dossier.validation(),
+        "Uncertainty": dossier.uncertainty(),
+        "Sensitivity": dossier.sensitivity(),
+        "Answers": dossier.results(),
+        "Open points": dossier.open_points(),
     }
     return {
         "title": f"Candidate evidence: {study.title}",
-        "first": FIRST,
+        "first": FIRST_SENTENCE,
         "purpose": PURPOSE,
         "sections": [
             {"title": f"{number}. {title}", "statements": [statement._asdict() for statement in statements]}
@@ -151,8 +149,9 @@ def dossier_page(dossier: JsonObject) -> str:
 
 @dataclass(frozen=True)
 class _Dossier:
-    """The statements of each section. `sources` are a command and its JSON by question, file of validation, or
-    "manifest", "status" and "checks".
+    """The statements of each section.
+
+    `sources` are commands and their JSON by question or file of validation, and of "manifest", "status" and "checks".
     """
 
     study: Study
@@ -166,18 +165,24 @@ class _Dossier:
         return OF_MODEL if self.study.calibration or self.study.spread else ASSUMED
 
     def _say(self, source: str, text: str, level: str = "", at: str = "") -> Statement:
-        """A statement whose text has as fields the paths of a source's JSON below `at`."""
+        """A statement whose text has fields, which are paths in a source's JSON below `at`."""
         command, answer = self.sources[source]
         reading = _Reading(answer, at)
-        shown = reading.format(text)
-        return Statement(shown, self.level if source in self.questions else level, command, reading.numbers)
+        if source in self.questions:
+            level = self.level
+        return Statement(reading.format(text), level, command, reading.numbers)
 
     def _answer(self, question: str, default: Any) -> Any:
         return self.sources[question][1] if question in self.sources else default
 
+    @property
+    def _failures(self) -> list[JsonObject]:
+        """The failures of `explain`, whose last record is the summary."""
+        return list(self._answer("explain", [])[:-1])
+
     def _causes(self) -> Iterator[tuple[str, JsonObject]]:
-        """Every minimal cause of the explained failures, and its path in the answer."""
-        for index, failure in enumerate(self._answer("explain", [None])[:-1]):
+        """Every minimal cause of the explained failures, after its path in the answer."""
+        for index, failure in enumerate(self._failures):
             for number, cause in enumerate(failure["minimal_causes"]):
                 yield f"{index}.minimal_causes.{number}", cause
 
@@ -251,11 +256,12 @@ class _Dossier:
 
     def _beside_threshold(self, name: str, value: float | None, side: str) -> str:
         """The user's threshold of a measure, in words; a full stop without one."""
+        # Not `get`: the keys' type is narrower than that of `name`.
         threshold = next((limit for key, limit in self.study.evidence.threshold.items() if key == name), None)
         if threshold is None:
             return "."
-        kept = value is not None and (value <= threshold if side == "at most" else value >= threshold)
-        return f"; declared by the user: {side} {threshold:g}, which it {'keeps' if kept else 'does not keep'}."
+        is_kept = value is not None and (value <= threshold if side == "at most" else value >= threshold)
+        return f"; declared by the user: {side} {threshold:g}, which it {'keeps' if is_kept else 'does not keep'}."
 
     def uncertainty(self) -> Iterator[Statement]:
         checks = self._answer("checks", {})
@@ -309,7 +315,7 @@ class _Dossier:
         totals = {index: row["total"] for index, row in enumerate(rows) if row["total"] is not None}
         if not totals:
             yield Statement("Not computed: `evidence --risk` adds it, unless characteristics are correlated.")
-        for index in sorted(totals, key=lambda index: -totals[index])[:STRONGEST]:
+        for index in sorted(totals, key=lambda index: -totals[index])[:SENSITIVITIES_SHOWN]:
             yield self._say(
                 "risk",
                 "{characteristic}: {first_order:.2f} of the variance alone, {total:.2f} in all "
@@ -353,7 +359,7 @@ class _Dossier:
         for question in STATE_WITH:
             if question not in self.questions and question not in ("rating", "repair"):
                 yield Statement(f"`{question}` was not asked.")
-        for index, failure in enumerate(self._answer("explain", [None])[:-1]):
+        for index, failure in enumerate(self._failures):
             if (failure["robustness"] or 0.0) < ROBUST:
                 changed = ", ".join(failure["changed"])
                 text = f"Borderline: {{robustness:.0%}} of the neighbours of the failure with {changed} are unsafe."

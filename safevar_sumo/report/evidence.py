@@ -1,5 +1,6 @@
-"""What a pack of evidence claims about results: each file is made from those before it, by `evidence` and again by
-`verify`.
+"""What a pack of evidence claims about results.
+
+`evidence` makes the files of a pack one after the other, each from those before it; `verify` makes them again.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ TEXT_COLUMNS = ("algorithm", "outcome", PLACE)
 WHOLE_COLUMNS = ("run", "f_num_diff")
 
 
-class Subject(NamedTuple):
-    """A study of a pack with the files of its folder; the case has the solutions as they were read from CSV."""
+class PackedSubject(NamedTuple):
+    """A study of a pack, with the files of its folder; its case has the solutions that the pack's CSV file holds."""
 
     packed: PackedStudy
     files: dict[str, bytes]
@@ -78,16 +79,16 @@ class Subject(NamedTuple):
     def study(self) -> Study:
         return self.case.study
 
-    def in_folder(self, *folders: str) -> list[str]:
-        """The names, without folder and ending, of the files in these folders; equal names in several count once."""
+    def names_in(self, *folders: str) -> list[str]:
+        """The distinct names, without folder and ending, of the files in some folders."""
         names = (PurePosixPath(name) for name in self.files)
         return sorted({name.stem for name in names if str(name.parent) in folders})
 
     @property
-    def made(self) -> list[str]:
+    def made_files(self) -> list[str]:
         """The files that `make` makes, in order."""
         answers = [f"{ANSWERS}/{answer.question}.json" for answer in self.packed.answers]
-        validations = [f"{VALIDATIONS}/{name}.json" for name in self.in_folder(REFERENCES, VALIDATIONS)]
+        validations = [f"{VALIDATIONS}/{name}.json" for name in self.names_in(REFERENCES, VALIDATIONS)]
         return [*validations, *answers, CHECKS, STUDY, DOSSIER, DOSSIER_PAGE]
 
     def make(self, name: str, pool: Pool, progress: Progress) -> bytes:
@@ -98,21 +99,21 @@ class Subject(NamedTuple):
         InputError
             If the published rows of a validation are missing.
         """
-        kind, stem = name.partition("/")[0], PurePosixPath(name).stem
+        folder, stem = name.partition("/")[0], PurePosixPath(name).stem
         if name == STUDY:
             return study_text(self.study)
         if name == CHECKS:
             return json_bytes(check_study(self.study, settings_of(self.case), pool, progress))
-        if kind == VALIDATIONS:
+        if folder == VALIDATIONS:
             references = (file for file in self.files if file.startswith(f"{REFERENCES}/"))
             reference = next((file for file in references if PurePosixPath(file).stem == stem), None)
             if reference is None:
                 raise InputError(name, "the pack has only the digest of its published rows")
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder, PurePosixPath(reference).name)
+            with tempfile.TemporaryDirectory() as unpacked:
+                path = Path(unpacked, PurePosixPath(reference).name)
                 path.write_bytes(self.files[reference])
                 return json_bytes(validate_with(self.study, path, pool, progress))
-        if kind == ANSWERS:
+        if folder == ANSWERS:
             (answer,) = (answer for answer in self.packed.answers if answer.question == stem)
             options, compute = QUESTIONS[stem]
             result = answer_question(compute, self.case, options(**answer.options), pool=pool, progress=progress)
@@ -125,7 +126,7 @@ class Subject(NamedTuple):
             answer.question: (answer.command, json.loads(self.files[f"{ANSWERS}/{answer.question}.json"]))
             for answer in self.packed.answers
         }
-        validations = [json.loads(self.files[f"{VALIDATIONS}/{name}.json"]) for name in self.in_folder(VALIDATIONS)]
+        validations = [json.loads(self.files[f"{VALIDATIONS}/{name}.json"]) for name in self.names_in(VALIDATIONS)]
         checks = json.loads(self.files[CHECKS])
         return make_dossier(self.manifest, self.study, self.packed.counts, answers, checks, validations)
 
@@ -141,8 +142,8 @@ class Subject(NamedTuple):
         return frame.drop(columns=["algorithm", "run"])
 
 
-def subject_of(packed: PackedStudy, files: dict[str, bytes], places: Sequence[str] = ()) -> Subject:
-    """The subject that the manifest and the solutions among the files describe; `places` are the folders of user code.
+def subject_of(packed: PackedStudy, files: dict[str, bytes], places: Sequence[str] = ()) -> PackedSubject:
+    """The subject that manifest and solutions among the files describe; user code is in the folders `places`.
 
     Raises
     ------
@@ -155,7 +156,7 @@ def subject_of(packed: PackedStudy, files: dict[str, bytes], places: Sequence[st
     scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     frame = read_table(files[SOLUTIONS])
     case = build_case(study, manifest["original"], frame, frame.iloc[:0], packed.runs, scoring=scoring)
-    return Subject(packed, files, manifest, case)
+    return PackedSubject(packed, files, manifest, case)
 
 
 def read_table(content: bytes) -> pd.DataFrame:
@@ -192,9 +193,9 @@ def command_of(question: str, options: JsonObject, study_name: str) -> str:
 
 
 def _named_settings(answer: Any, characteristics: CharacteristicSet, path: str) -> Iterator[tuple[str, FloatArray]]:
-    """The settings that an answer's JSON names as a whole or by their changes from the original, and their paths.
+    """The settings that an answer's JSON names, whole or by their changes from the original, each after its path.
 
-    Beside a setting stands its `outcome`; changes with an undefined value are none.
+    A setting stands beside its `outcome`; changes with an undefined value name no setting.
     """
     names = characteristics.names
     if isinstance(answer, list):
@@ -237,7 +238,7 @@ def make_pack(
     """
     if len({path.stem for path in references}) < len(references):
         raise InputError("references", "two files have the same name", "files of different names")
-    cases = list[tuple[Path, Case]]()
+    cases = []
     for directory in dict.fromkeys(map(Path, directories)):
         case = study_or_case(directory, results_only=True)
         assert isinstance(case, Case)
@@ -246,15 +247,17 @@ def make_pack(
         for path in references:
             read_reference(path, case.characteristics)  # raises errors with the user's path
         cases.append((directory, case))
-    studies, files = list[PackedStudy](), dict[str, bytes]()
+    studies, files = [], {}
     for number, (directory, case) in enumerate(cases, 1):
         code = {} if digests_only else _files_of_user(case.study, directory)
         subject = _subject_of_results(f"{number}-{case.study.name}", directory, case, questions, code)
         subject.files.update({f"{REFERENCES}/{path.name}": path.read_bytes() for path in references})
         with local_pool(jobs or available_cores(), case.study.search.time_limit) as pool:
-            for name in subject.made:
+            for name in subject.made_files:
                 subject.files[name] = subject.make(name, pool, progress)
-            settings = {at: row for one in subject.packed.answers for at, row in subject.named_settings(one.question)}
+            settings = dict[str, FloatArray]()
+            for answer in subject.packed.answers:
+                settings.update(subject.named_settings(answer.question))
             if settings:
                 frame = subject.evaluated(np.array([*settings.values()]), pool, progress, "named settings")
                 subject.files[SETTINGS] = csv_of(frame.assign(**{PLACE: [*settings]})[[PLACE, *frame]])
@@ -267,9 +270,9 @@ def make_pack(
 
 def _subject_of_results(
     folder: str, directory: Path, case: Case, questions: Collection[str], code: Mapping[str, bytes]
-) -> Subject:
-    """The subject that a directory of results becomes, with the files from which `make` makes all others."""
-    name, manifest, answers = case.study.name, read_manifest(directory), list[PackedAnswer]()
+) -> PackedSubject:
+    """The subject of a results directory, with the files from which `make` makes all others."""
+    name, manifest, answers = case.study.name, read_manifest(directory), []
     manifest.pop("folders", None)  # of this machine
     for question, (options, _) in QUESTIONS.items():
         if question in questions:

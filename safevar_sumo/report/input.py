@@ -82,7 +82,7 @@ class ReportInput:
         return bool(self.case.unsafe.rows(self.case.solutions).any())
 
     def select_handles(self, *choices: str) -> list[str]:
-        """The distinct handles of the solutions that choices select: the most severe one alone if none is unsafe."""
+        """The distinct handles of the solutions that choices select; if none is unsafe, of the most severe solution."""
         if self.case.solutions.empty:
             return []
         possible = choices if self.any_unsafe else ("most_severe",)
@@ -94,8 +94,8 @@ class ReportInput:
         return np.array([self.solutions[handle][name] for name in self.case.characteristics.names], dtype=float)
 
     def list_changes(self, setting: FloatArray) -> list[tuple[str, str, str]]:
-        """A setting's changes from the original: both values in a text, the characteristic's short name and its
-        description.
+        """A setting's changes from the original: for each a text with both values, the characteristic's short name and
+        its description.
         """
         characteristics = self.case.characteristics
         changed = [item for item, value in zip(characteristics, setting, strict=True) if value != item.original]
@@ -103,8 +103,9 @@ class ReportInput:
         return [(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
 
     def play(self, setting: FloatArray) -> tuple[Comparison, JsonObject]:
-        """Simulate a setting beside the original vehicle, in a matrix at its worst point; the second value is the
-        animation, in the form that the template `player` takes, with the point.
+        """Simulate a setting beside the original vehicle, in a matrix at its worst point.
+
+        Returns the comparison, and the animation with the point, in the form that the template `player` takes.
         """
         comparison = compare_setting(self.case.study, self.system, setting)
         return comparison, {**player_data(lay_out_scene(comparison)), "point": comparison.point}

@@ -42,11 +42,11 @@ def measure_validation(here: FloatArray, there: FloatArray) -> dict[str, float |
     Sprague and Geers: M = sqrt(sum h^2 / sum t^2) - 1, P = arccos(sum h t / sqrt(sum h^2 sum t^2)) / pi and the
     comprehensive error sqrt(M^2 + P^2).
     """
-    error, squares = here - there, (float(here @ here), float(there @ there))
+    error, square_here, square_there = here - there, here @ here, there @ there
     with np.errstate(all="ignore"):
-        magnitude = np.sqrt(np.divide(*squares)) - 1
-        phase = np.arccos(np.clip(here @ there / np.sqrt(squares[0] * squares[1]), -1, 1)) / np.pi
-        enough = len(here) > 2 and bool(np.ptp(here) > 0 < np.ptp(there))
+        magnitude = np.sqrt(square_here / square_there) - 1
+        phase = np.arccos(np.clip(here @ there / np.sqrt(square_here * square_there), -1, 1)) / np.pi
+        is_testable = len(here) > 2 and np.ptp(here) > 0 and np.ptp(there) > 0
         measures = {
             "relative_error": np.mean(np.abs(error)) / np.mean(np.abs(there)),
             "rmse": np.sqrt(np.mean(error * error)),
@@ -54,9 +54,9 @@ def measure_validation(here: FloatArray, there: FloatArray) -> dict[str, float |
             "sprague_geers_magnitude": magnitude,
             "sprague_geers_phase": phase,
             "sprague_geers": np.hypot(magnitude, phase),
-            "pearson": scipy.stats.pearsonr(here, there).statistic if enough else np.nan,
-            "t_test": scipy.stats.ttest_rel(here, there).pvalue if enough and np.ptp(error) > 0 else np.nan,
-            "anova": scipy.stats.f_oneway(here, there).pvalue if enough else np.nan,
+            "pearson": scipy.stats.pearsonr(here, there).statistic if is_testable else np.nan,
+            "t_test": scipy.stats.ttest_rel(here, there).pvalue if is_testable and np.ptp(error) > 0 else np.nan,
+            "anova": scipy.stats.f_oneway(here, there).pvalue if is_testable else np.nan,
             "kolmogorov_smirnov": scipy.stats.ks_2samp(here, there).statistic,
             "kolmogorov_smirnov_p": scipy.stats.ks_2samp(here, there).pvalue,
             "mean_absolute_error": np.mean(np.abs(error)),
@@ -93,8 +93,8 @@ def check_study(study: Study, solutions: FloatArray, pool: Pool, progress: Progr
     settings = np.concatenate([system.characteristics.original[np.newaxis], chosen])
     base = evaluator.evaluate(settings, "settings to check", ignore_constraints=True)
     in_sumo = evaluate(system, settings, Engine.LIBSUMO)
-    here = system.at(system.points[0]) if system.matrix else system
-    step = simulate(here, settings[:1]).trace.step
+    one_scene = system.at(system.points[0]) if system.matrix else system
+    step = simulate(one_scene, settings[:1]).trace.step
     return {
         "constants": constants,
         "settings": len(settings),
@@ -140,7 +140,8 @@ def count_constants(study: Study) -> dict[str, int]:
     """
     resolved = identity_of(study, assemble(study, study.source))["resolved"]
     tables = [resolved["weather"], *(resolved[name]["parameters"] for name in ("vehicle", "ads", "scenario"))]
-    published = 3 * len(study.vehicle.characteristics) + len(study.published) + len(study.repeatability)
+    ends = 3 * len(study.vehicle.characteristics)  # original, lower and upper
+    published = ends + len(study.published) + len(study.repeatability)
     fitted = len({*study.calibration, *study.spread})
     return {"published": published, "fitted": fitted, "assumed": max(_count_numbers(tables) - fitted, 0)}
 
@@ -155,11 +156,10 @@ def print_checks(directory: str, reference: str = "") -> None:
     """Print the JSON of `check_study` on results or, with a reference file, of `validate_with`."""
     case = load(directory).case
     with local_pool(available_cores(), case.study.search.time_limit) as pool:
-        answer = (
-            validate_with(case.study, Path(reference), pool)
-            if reference
-            else check_study(case.study, settings_of(case), pool)
-        )
+        if reference:
+            answer = validate_with(case.study, Path(reference), pool)
+        else:
+            answer = check_study(case.study, settings_of(case), pool)
     print(json.dumps(answer, indent=2, allow_nan=False))
 
 

@@ -26,6 +26,8 @@ DESCRIPTION = "pack.json"
 MAX_BYTES = 1_000_000_000
 """Largest size of a pack's files together, unpacked."""
 MAX_FILES = 10_000
+UNIX_MODE_SHIFT = 16
+"""Bits of a zip entry's attributes below the mode of its file."""
 PACK = "a file that the command `evidence` has written, unchanged"
 """What an error about a pack expects."""
 
@@ -39,8 +41,8 @@ class PackedAnswer(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
-    """One results directory in a pack: its folder there, what its search found, its answers, the runs that have ended,
-    and the names of the user's files.
+    """One results directory in a pack: its folder there, numbers of what its search found, its answers, the runs that
+    have ended, and the names of the user's files.
     """
 
     folder: str
@@ -79,8 +81,8 @@ def write_pack(path: Path, description: Description, files: Mapping[str, bytes])
     texts = {DESCRIPTION: msgspec.json.format(msgspec.json.encode(described), indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
-            entry = zipfile.ZipInfo(name)  # of 1980, on every day
-            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+            entry = zipfile.ZipInfo(name)  # with the same date on every day, in 1980
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << UNIX_MODE_SHIFT
             archive.writestr(entry, texts[name])
 
 
@@ -125,7 +127,7 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
         is_inside = name == str(path_of_entry) and not path_of_entry.is_absolute() and ".." not in path_of_entry.parts
         if not is_inside or "\\" in name or ":" in name:  # "a//b" is no path inside either: joined, it is "/b"
             _refuse(path, f"the path {name!r} leaves the pack")
-        if stat.S_ISLNK(entry.external_attr >> 16):
+        if stat.S_ISLNK(entry.external_attr >> UNIX_MODE_SHIFT):
             _refuse(path, f"{name!r} is a symbolic link")
     if len(names) > MAX_FILES or len(names) != len(set(names)):
         _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")

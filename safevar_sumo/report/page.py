@@ -88,10 +88,10 @@ def figure_data(figure: Figure, frame: pd.DataFrame) -> JsonObject:
 
 
 def limits_data(tolerance: Tolerance) -> JsonObject:
-    """The limits sheet as a table; without columns that say nothing here."""
+    """The limits sheet as a table, without columns that say nothing on the page."""
     sheet = tolerance.sheet.to_frame().set_index("characteristic")
-    without = ["part"] if tolerance.limits else ["part", "specified", "kept"]
-    return table_data(sheet.drop(columns=without), "Limits, rounded to the safe side")
+    hidden = ["part"] if tolerance.limits else ["part", "specified", "kept"]
+    return table_data(sheet.drop(columns=hidden), "Limits, rounded to the safe side")
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
@@ -104,7 +104,7 @@ def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
 
 
 def _picture(name: str, figure: Figure) -> dict[str, str]:
-    """A figure as Matplotlib's SVG, in a link that holds it; equal figures give equal bytes."""
+    """A figure for the page: Matplotlib's SVG in a link that holds it; equal figures give equal bytes."""
     import matplotlib
 
     axis, buffer = figure.axes[0], BytesIO()
@@ -120,7 +120,7 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
 
 
 def commands_to_reproduce(inputs: Sequence[ReportInput], sections: Collection[str]) -> list[tuple[str, str]]:
-    """What the commands reproduce, and the commands that give the numbers of the page."""
+    """The commands that give the numbers of the page, each after what it reproduces."""
     commands, options = [], page_options()
     for data in inputs:
         directory, flag = str(data.directory), " --as-it-is-now" if data.later_changes else ""
@@ -262,11 +262,11 @@ def _make_page(
     inputs: Sequence[ReportInput], only: Sequence[str], jobs: int | None, progress: Progress, *, paper: bool
 ) -> str:
     names = ", ".join(data.case.name for data in inputs)
-    are_rated = {is_rated(data.case.study) and not data.point for data in inputs}
-    if len(are_rated) > 1:
+    are_rated = [is_rated(data.case.study) and not data.point for data in inputs]
+    if any(are_rated) and not all(are_rated):
         problem = "some hold results of rated studies, others do not"
         raise InputError("directories", problem, "a report for each kind")
-    if True in are_rated:
+    if any(are_rated):
         rated_studies = [rated_study_data(data, jobs, progress) for data in inputs]
         return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=rated_studies)
     is_possible = {
@@ -298,7 +298,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
     """Make the data of one study that the templates of these sections need."""
     options = page_options()
     explained: Explained | None = None
-    if {"verdict", "causes"} & {*sections} and len(data.case.solutions):
+    if ("verdict" in sections or "causes" in sections) and len(data.case.solutions):
         explain = partial(explain_failures, statistics="causes" in sections)
         explained = answer_question(explain, data.case, options["explain"], jobs=jobs, progress=progress)
     choices = explained.choices if explained else []
@@ -314,6 +314,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
             f"{data.directory}: simulated again with different results: {', '.join(different)}; "
             "have versions or code changed since the study?"
         )
+    statistics = figure_data(explained.figure(), explained.necessity) if explained and explained.analysed else None
     makers: dict[str, Callable[[], Any]] = {
         "tested": lambda: describe_tested_system(data),
         "verdict": lambda: make_verdict(data, explained),
@@ -334,28 +335,25 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         "no_verdict": why_no_verdict(data.system),
         "later_changes": data.later_changes,
         "opinion_problem": reason_without_opinion(data),
-        "statistics": figure_data(explained.figure(), explained.necessity)
-        if explained and explained.analysed
-        else None,
+        "statistics": statistics,
         "answers": {
             name: [part for part in result.sentences() if isinstance(part, str)] for name, result in answers.items()
         },
         "figures": {
             name: figure_data(result.figure(), result.to_frame())
             for name, result in answers.items()
-            if name not in ("rules", "repair") and not result.to_frame().empty
+            if name not in ("rules", "repair") and not result.to_frame().empty  # whose rows are no characteristics
         },
         **{name: make() for name, make in makers.items() if name in sections},
     }
 
 
 def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: Progress) -> JsonObject:
-    """The page's data about two studies side by side; why they cannot be compared, if so."""
-    a, b = (data.case for data in inputs)
+    """The page's data about two studies side by side, or the reason why they cannot be compared."""
+    first, second = (data.case for data in inputs)
+    compare, options = partial(compare_systems, other=second), page_options()["compare"]
     try:
-        result = answer_question(
-            partial(compare_systems, other=b), a, page_options()["compare"], jobs=jobs, progress=progress
-        )
+        result = answer_question(compare, first, options, jobs=jobs, progress=progress)
     except InputError as error:
         return {"sentences": [f"{error.problem}."]}
     return {
@@ -368,8 +366,8 @@ def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: 
 
 
 def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) -> JsonObject:
-    """The page's data about one rated study: the original vehicle, and the solution with the fewest changes that loses
-    a point, simulated in all cells.
+    """The page's data about one rated study: the points of the original vehicle and of the solution with the fewest
+    changes that loses a point.
     """
     directory = str(data.directory)
     options = RatingOptions(solution=data.select_handles("fewest")[0] if data.any_unsafe else None)

@@ -40,8 +40,8 @@ FIRST_CHOICES = ("fewest", "smallest", "most_severe")
 
 
 def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> JsonObject:
-    """A frame as the template's table: the index as labels, the outer level of columns as headings over several
-    columns.
+    """A frame as the template's table: its index as labels, and the outer level of its columns, if there are two, as
+    headings over several columns.
     """
     columns, labels = frame.columns, frame.index.nlevels
     blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
@@ -150,7 +150,7 @@ def reason_without_opinion(data: ReportInput) -> str:
 def replay_solutions(data: ReportInput, explained: Explained | None, progress: Progress) -> list[JsonObject]:
     """Replay the solutions that `FIRST_CHOICES` select and the explained ones."""
     failures = [failure.name for failure in explained.explanations if failure.handle] if explained else []
-    handles, entries = list(dict.fromkeys([*data.select_handles(*FIRST_CHOICES), *failures])), list[JsonObject]()
+    handles, entries = list(dict.fromkeys([*data.select_handles(*FIRST_CHOICES), *failures])), []
     for index, handle in enumerate(handles):
         progress("replays", index, len(handles))
         row, setting = data.solutions[handle], data.setting_of(handle)
@@ -162,7 +162,7 @@ def replay_solutions(data: ReportInput, explained: Explained | None, progress: P
                 "changes": data.list_changes(setting),
                 "player_data": player,
                 "differences": list_differences(comparison.evaluations.take([-1]), row),
-                "is_open": not failures and not entries,
+                "is_open": not failures and index == 0,
             }
         )
     return sorted(entries, key=lambda entry: (entry["f_safe"], entry["handle"]))
@@ -263,7 +263,7 @@ def describe_limits(data: ReportInput, explained: Explained | None) -> JsonObjec
     """How far the findings of one study hold: remarks, the vehicle model's own uncertainty, and the original vehicle's
     published metrics beside those here.
     """
-    case, failures, tables = data.case, explained.explanations if explained else (), list[JsonObject]()
+    case, failures, tables = data.case, explained.explanations if explained else (), []
     remarks = [
         f"{count} of {len(case.evaluations)} settings {words}."
         for outcome, words in NO_RESULT.items()

@@ -115,8 +115,10 @@ def verify(
     """
     description, files = read_pack(path)
     folders = tuple(f"{packed.folder}/" for packed in description.studies)
-    if not folders or (stray := [name for name in files if not name.startswith(folders)]):
-        raise InputError(path, f"{stray[0]} belongs to no study" if folders else "holds no study", PACK)
+    if not folders:
+        raise InputError(path, "holds no study", PACK)
+    if stray := [name for name in files if not name.startswith(folders)]:
+        raise InputError(path, f"{stray[0]} belongs to no study", PACK)
     parts = []
     for packed in description.studies:
         try:
@@ -143,38 +145,39 @@ def verify(
 
 
 class _Part:
-    """One study of a pack; raises an error of Python's own if it is damaged."""
+    """One study of a pack, and its claims; its construction raises an error of Python's own if it is damaged."""
 
     def __init__(self, packed: PackedStudy, files: Mapping[str, bytes], progress: Progress) -> None:
         folder, self._progress = f"{packed.folder}/", progress
-        own = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
-        self.subject = subject = subject_of(packed, own)
-        if json_bytes(subject.manifest) != own[MANIFEST]:  # digits that no double has
+        own_files = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
+        self.subject = subject = subject_of(packed, own_files)
+        if json_bytes(subject.manifest) != own_files[MANIFEST]:  # such as by digits that no double has
             raise ValueError(f"{MANIFEST} was edited")
-        needed = {MANIFEST, SOLUTIONS, *subject.made, *(f"{CODE}/{name}" for name in packed.code)}
-        for name in sorted(needed ^ own.keys()):
+        needed = {MANIFEST, SOLUTIONS, *subject.made_files, *(f"{CODE}/{name}" for name in packed.code)}
+        for name in sorted(needed ^ own_files.keys()):
             if name in needed or not (name == SETTINGS or name.startswith(f"{REFERENCES}/")):
                 raise ValueError(f"{name} {'is missing' if name in needed else 'belongs to no claim'}")
         for answer in packed.answers:
-            command_of(answer.question, answer.options, packed.name)
-        subject.dossier()
-        places = read_table(own[SETTINGS])[PLACE] if SETTINGS in own else ()
+            command_of(answer.question, answer.options, packed.name)  # raises if the question or an option is none
+        subject.dossier()  # raises if an answer is damaged
+        places = read_table(own_files[SETTINGS])[PLACE] if SETTINGS in own_files else ()
         self._rows = {
             f"solution {handle}": (SOLUTIONS, row) for row, handle in enumerate(handles_of(subject.case.solutions))
         }
         self._rows |= {f"setting {place}": (SETTINGS, row) for row, place in enumerate(places)}
-        for file in {SOLUTIONS, SETTINGS} & own.keys():
+        for file in {SOLUTIONS, SETTINGS} & own_files.keys():
             self._read_rows(file)
 
     def _read_rows(self, file: str) -> tuple[pd.DataFrame, FloatArray]:
-        """A table of settings as texts, to compare the bytes, and its settings."""
+        """A table of settings as texts, whose bytes are compared, and the settings, shape (M, n)."""
         frame = _read_texts(self.subject.files[file])
         return frame, frame[list(self.subject.case.characteristics.names)].to_numpy(dtype=float)
 
     @property
     def code_in_words(self) -> list[str]:
-        """The user code that simulations would run: files of the pack, and what the study names. Networks count: the
-        options of SUMO beside them may name files to write.
+        """The user code that simulations would run: files of the pack, and what the study names.
+
+        Networks count, since SUMO's options beside them may name files to write.
         """
         study = self.subject.study
         algorithms = [name for name in study.search.algorithms if ":" in name]
@@ -200,7 +203,7 @@ class _Part:
     @property
     def names(self) -> list[str]:
         """The names of all claims but that of the search."""
-        validations = self.subject.in_folder(VALIDATIONS)
+        validations = self.subject.names_in(VALIDATIONS)
         return [
             "inputs",
             "study",
@@ -221,44 +224,45 @@ class _Part:
             yield from (Claim(packed.name, name, CANNOT, here=reason) for name in names)
             return
         for file in (SOLUTIONS, SETTINGS):
-            if rows := [name for name in names if self._rows.get(name, ("", 0))[0] == file]:
+            rows = [name for name in names if name in self._rows and self._rows[name][0] == file]
+            if rows:
                 yield from self._claims_of(rows, partial(self._row_differences, file, rows, pool))
         for name in names:
             if name not in self._rows:
                 yield from self._claims_of([name], partial(self._difference, name, pool))
 
     def _claims_of(self, names: Sequence[str], compare: Callable[[], Sequence[Difference]]) -> Iterator[Claim]:
-        """Claims that are made together."""
+        """The claims with these names, whose differences `compare` finds together."""
         study = self.subject.packed.name
         try:
-            found = compare()
+            differences_found = compare()
         except SafevarError as error:
             yield from (Claim(study, name, CANNOT, here=" ".join(str(error).split())) for name in names)
             return
-        for name, difference in zip(names, found, strict=True):
+        for name, difference in zip(names, differences_found, strict=True):
             yield Claim(study, name, DIFFERS if difference else SAME, *(difference or ()))
 
     def _row_differences(self, file: str, names: Sequence[str], pool: Pool) -> list[Difference]:
         """The first column at which each row of a table of settings differs from its new simulation."""
         rows = [self._rows[name][1] for name in names]
         frame, settings = self._read_rows(file)
-        made = self.subject.evaluated(settings[rows], pool, self._progress, f"{self.subject.packed.name}: {file}")
-        tables = (frame.iloc[rows].drop(columns=LABELS, errors="ignore"), _read_texts(csv_of(made)))
+        evaluated = self.subject.evaluated(settings[rows], pool, self._progress, f"{self.subject.packed.name}: {file}")
+        tables = (frame.iloc[rows].drop(columns=LABELS, errors="ignore"), _read_texts(csv_of(evaluated)))
         pairs = zip(*(table.to_dict("records") for table in tables), strict=True)
         return [_first_difference(json_bytes(packed), json_bytes(here)) for packed, here in pairs]
 
     def _difference(self, name: str, pool: Pool) -> list[Difference]:
-        """The first value of a claim other than a row that differs."""
+        """The first value that differs in a claim that is no row of a table; a list of this one."""
         pairs = (_first_difference(packed, here) for packed, here in self._pairs(name, pool))
         return [next(filter(None, pairs), None)]
 
     def _pairs(self, name: str, pool: Pool) -> Pairs:
         """What a claim says, in the pack and made again."""
         packed, files, manifest, case = self.subject
-        kind, _, of = name.partition(" ")
-        made = {"study": [STUDY], "checks": [CHECKS], "dossier": [DOSSIER, DOSSIER_PAGE]}
-        made |= {"answer": [f"{ANSWERS}/{of}.json"], "validation": [f"{VALIDATIONS}/{of}.json"]}
-        for file in made.get(kind, ()):
+        kind, _, stem = name.partition(" ")  # such as "answer risk"
+        files_of_claim = {"study": [STUDY], "checks": [CHECKS], "dossier": [DOSSIER, DOSSIER_PAGE]}
+        files_of_claim |= {"answer": [f"{ANSWERS}/{stem}.json"], "validation": [f"{VALIDATIONS}/{stem}.json"]}
+        for file in files_of_claim.get(kind, ()):
             yield files[file], self.subject.make(file, pool, self._progress)
         if name == "inputs":
             system = assemble(case.study, packed.name)
@@ -274,13 +278,13 @@ class _Part:
         elif name == "search":
             yield from self._search_again(pool)
         elif kind == "answer":
-            (answer,) = (answer for answer in packed.answers if answer.question == of)
-            yield answer.command.encode(), command_of(of, answer.options, packed.name).encode()
-            stored = [row.removeprefix("setting ") for row in self._rows if row.startswith(f"setting {of}.")]
-            yield json_bytes(stored), json_bytes([place for place, _ in self.subject.named_settings(of)])
+            (answer,) = (answer for answer in packed.answers if answer.question == stem)
+            yield answer.command.encode(), command_of(stem, answer.options, packed.name).encode()
+            stored = [row.removeprefix("setting ") for row in self._rows if row.startswith(f"setting {stem}.")]
+            yield json_bytes(stored), json_bytes([place for place, _ in self.subject.named_settings(stem)])
 
     def _search_again(self, pool: Pool) -> Pairs:
-        """The same runs find the same solutions, after as many evaluations and collisions."""
+        """What the search found, in the pack and by the same runs again: counts, and the solutions."""
         study, packed = self.subject.study, self.subject.packed
         keys = [key for key in all_runs(study) if (key.algorithm, key.run) in set(packed.runs)]
         with tempfile.TemporaryDirectory() as folder, open_observer(self._progress, study, keys) as observer:
@@ -296,7 +300,7 @@ def _read_texts(content: bytes) -> pd.DataFrame:
 
 
 def _first_difference(packed: bytes, here: bytes) -> Difference:
-    """The first value at which two JSON files differ, or else the first line of two texts; None if nothing does."""
+    """The first value at which two JSON files differ, or the first line at which other texts do; None if none does."""
     if packed == here:
         return None
     pairs = zip_longest(_list_values(packed), _list_values(here), fillvalue="nothing")

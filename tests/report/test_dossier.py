@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.analysis.tolerance import scans
-from safevar_sumo.report.dossier import FIRST, MEASURES, _Dossier, value_at
+from safevar_sumo.report.dossier import FIRST_SENTENCE, MEASURES, _Dossier, value_at
 from safevar_sumo.report.measurements import count_constants, measure_validation
 from safevar_sumo.report.pack import read_pack
 from safevar_sumo.results import handles_of
@@ -146,7 +146,7 @@ def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Packed:
 def test_every_number_is_made_by_its_command(packed: Packed, monkeypatch: pytest.MonkeyPatch) -> None:
     dossier, folder, _ = packed
     monkeypatch.chdir(folder)
-    assert dossier["first"] == FIRST
+    assert dossier["first"] == FIRST_SENTENCE
     outputs: dict[str, Any] = {}
     statements = [statement for section in dossier["sections"] for statement in section["statements"]]
     for statement in statements:
@@ -174,7 +174,7 @@ def test_the_dossier_has_its_sections_and_never_a_verdict(packed: Packed) -> Non
     text = json.dumps(dossier)
     assert "at most 0.5, which it" in text
     assert "at least 1.1, which it does not keep" in text
-    assert page.index(FIRST) < page.index("<h2>")
+    assert page.index(FIRST_SENTENCE) < page.index("<h2>")
     assert not re.search("compliant|https?://|<script|src=", page)
 
 

@@ -109,8 +109,8 @@ class Opinions(Answer):
         """One row for each cause: the keys of `to_dict`, with outcome and safety degree of `here` and `there`."""
         astuple = msgspec.structs.astuple
         rows = [
-            (one.solution, one.changes, *astuple(one.here), *astuple(one.there), one.opinion, one.because)
-            for one in self.opinions
+            (item.solution, item.changes, *astuple(item.here), *astuple(item.there), item.opinion, item.because)
+            for item in self.opinions
         ]
         ends = [f"{key}_{side}" for side in ("here", "there") for key in RunEnd.__struct_fields__]
         return pd.DataFrame(rows, columns=["solution", "changes", *ends, "opinion", "because"])
@@ -118,7 +118,7 @@ class Opinions(Answer):
     @property
     def counts(self) -> str:
         """The number of causes with each verdict."""
-        numbers = Counter(one.opinion for one in self.opinions)
+        numbers = Counter(item.opinion for item in self.opinions)
         counts = [
             f"{numbers[verdict]} {verdict}{' (no answer)' if verdict == 'outside' else ''}"
             for verdict in get_args(Verdict)
@@ -140,10 +140,10 @@ class Opinions(Answer):
             f"The original vehicle {self.original_here} with our model; it {self.original_there} with the second.",
             *(f"note: {note}" for note in self.notes),
         ]
-        for one in self.opinions:
+        for item in self.opinions:
             lines += [
-                f"{one.solution}: {one.opinion}: {list_of_changes(characteristics, one.changes)}",
-                f"  With our model it {one.here}; {one.because}.",
+                f"{item.solution}: {item.opinion}: {list_of_changes(characteristics, item.changes)}",
+                f"  With our model it {item.here}; {item.because}.",
             ]
         return lines
 
@@ -164,14 +164,15 @@ class Opinions(Answer):
 
 
 SIMULATION_LIMIT = 12_000
-"""Approximate number of simulations that search the minimal causes, the same as for a report."""
+"""Approximate number of simulations of the search for minimal causes, the same as for a report."""
 STAGE = "second vehicle model"
+SHARE_STEP = 0.1
 CHANGE_SHARES = np.arange(1, 10) / 10
 """Shares of a cause's changes that the second model simulates, to locate the share from which they are unsafe."""
 
 
 def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
-    """A study's system and the second vehicle; with that vehicle the system simulates with the second model.
+    """A study's system, and the second vehicle, which can replace the system's.
 
     The driving system stays the same, including its knowledge of our original vehicle.
 
@@ -243,10 +244,11 @@ def judge_causes(
         verdict: Verdict = "contradicted"
         because = f"safe with the second model: it {there[row]}; the original vehicle {there[0]}"
         if fails_there[row]:
-            verdict, safe_share = "confirmed", np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])
+            verdict = "confirmed"
+            safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])  # the largest that is still safe
             because = (
                 f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[0]}. "
-                f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
+                f"{safe_share:.0%} to {safe_share + SHARE_STEP:.0%} of the changes are enough with the second "
                 f"model, {cause.fraction:.1%} with ours"
             )
         reason = _why_borderline(second_system, settings[row], cause, fails_there[row], unsafe, study.search.seed)
@@ -269,7 +271,7 @@ def judge_causes(
 def _why_borderline(
     second_system: System, setting: FloatArray, cause: Cause, is_unsafe: bool, unsafe: Unsafe, seed: int
 ) -> str:
-    """In which model a cause is borderline; empty if in none."""
+    """Why a cause is borderline, by its neighbours in our model, else in the second; empty if it is not."""
     if cause.neighbours is None:  # in a rated study, whose neighbours take too long
         return ""
     if cause.neighbours.borderline:
@@ -278,9 +280,11 @@ def _why_borderline(
     runs = evaluate(second_system, neighbours[second_system.region.feasible(neighbours)])
     share = np.mean((unsafe.of(runs) == is_unsafe)[runs.valid]) if runs.valid.any() else 0.0
     result = "unsafe" if is_unsafe else "safe"
-    is_borderline = share < MIN_ROBUST_SHARE
-    return f"with the second model only {share:.0%} of the neighbours are {result}, too" if is_borderline else ""
+    if share >= MIN_ROBUST_SHARE:
+        return ""
+    return f"with the second model only {share:.0%} of the neighbours are {result}, too"
 
 
 def _run_ends(runs: Evaluations) -> list[RunEnd]:
-    return [RunEnd(str(end), finite_or_none(degree)) for end, degree in zip(runs.outcome, runs.f_safe, strict=True)]
+    pairs = zip(runs.outcome, runs.f_safe, strict=True)
+    return [RunEnd(str(outcome), finite_or_none(degree)) for outcome, degree in pairs]

@@ -66,8 +66,8 @@ ZERO, ONE, UNLIMITED = map(np.array, (0.0, 1.0, np.inf))
 
 
 class Plant(NamedTuple):
-    """Constants of N vehicles, SI, each with its name in the package; shape (N,) or (). Values per axle have the shape
-    (2, N) or (2, 1), front before rear.
+    """Constants of N vehicles in SI units, shape (N,) or (); comments give their names in the package. Values per axle
+    have the shape (2, N) or (2, 1), front before rear.
 
     The brake pedal follows its command after the dead time `brake_delay`, as a first-order lag with the time constant
     `brake_lag`, at most at the rates `brake_rise` and `brake_fall` [1/s]. `drag` [N s/m], `air_drag` [N s^2/m^2] and
@@ -115,12 +115,12 @@ def build_plant(
     height: float | None = None,
     **constants: Any,
 ) -> Plant:
-    """Vehicles with masses [kg] that differ from the package's vehicle.
+    """Scale the package's vehicle to vehicles of other masses [kg].
 
     Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the
-    package's; a load rests on the springs. `centre` is the distance from the front axle to the whole vehicle's centre
-    of mass [m], `height` its height above the road [m]; the package's values replace None. `constants` are
-    other fields of `Plant`.
+    package's; what is loaded rests on the springs. `centre` is the distance from the front axle to the whole vehicle's
+    centre of mass [m], `height` its height above the road [m]; the package's values replace None. `constants` are other
+    fields of `Plant`.
     """
     bmw = load_bmw_parameters()
     scale = unladen_mass / bmw.m
@@ -236,14 +236,14 @@ def advance(
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised), others explicitly, rates before heights.
     """
-    force, peak, slip, gradient = tyre_forces(plant, body)
+    force, peak, slip, force_by_wheel_speed = tyre_forces(plant, body)
     is_locking = (slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
     lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE_RATE * step, 0.0)
     pressure_shares = np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
     drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * peak)
     brakes = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
     acceleration, body_accelerations, wheel_accelerations = derivatives(plant, body, drive - brakes, force)
-    gradients = np.maximum(gradient, 0.0)
+    gradients = np.maximum(force_by_wheel_speed, 0.0)  # 0 beyond the peak of the tyre's force
     damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
     wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_accelerations / damping, 0.0)
     added_force = gradients * (wheel_speeds - body.wheel_speeds)

@@ -52,9 +52,9 @@ def _brakes_for(force: FloatArray, mass: float) -> JsonObject:
     }
 
 
-def _represent_worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
-    # Mass, grip and rear_load, the rear axle's share of the weight, do not depend on the step.
-    prepared = vehicle.prepare(c, road.friction, 1.0, road.slope, road.wet)
+def _represent_worn(vehicle: WornVehicle, values: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
+    # What is read here does not depend on the step of 1 s: mass, grip, and the rear axle's share of the weight.
+    prepared = vehicle.prepare(values, road.friction, 1.0, road.slope, road.wet)
     return build_plant(
         prepared.mass,
         vehicle.kerb_mass,
@@ -65,57 +65,57 @@ def _represent_worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[
         friction=prepared.grip,
         front_brake_share=vehicle.front_share,
         front_drive_share=load_bmw_parameters().T_se,
-        brake_delay=c["brakeResponse"],
-        **_brakes_for(c["brakeTorque"] * vehicle.brake_force, vehicle.kerb_mass + original["payload"]),
+        brake_delay=values["brakeResponse"],
+        **_brakes_for(values["brakeTorque"] * vehicle.brake_force, vehicle.kerb_mass + original["payload"]),
     )
 
 
-def _represent_carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
-    radius = METRES_PER_CM * c["radius"]
+def _represent_carla(vehicle: Carla, values: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
+    radius = METRES_PER_CM * values["radius"]
     return build_plant(
-        c["mass"],
+        values["mass"],
         original["mass"],
         road.slope,
         radius=radius,
         wheel_inertia=0.5 * WHEEL_MASS * radius**2,
-        friction=c["tireFric"] * vehicle.tyre_friction * road.friction,
-        brake_torque=WHEEL_COUNT * c["maxBrakeTorque"],
+        friction=values["tireFric"] * vehicle.tyre_friction * road.friction,
+        brake_torque=WHEEL_COUNT * values["maxBrakeTorque"],
         brake_rise=vehicle.brake_rise,
         brake_fall=vehicle.brake_fall,
-        air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * (c["dragCoeff"] - original["dragCoeff"]),
-        wheel_damping=WHEEL_COUNT * (c["dampRate"] - original["dampRate"]),
+        air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * (values["dragCoeff"] - original["dragCoeff"]),
+        wheel_damping=WHEEL_COUNT * (values["dampRate"] - original["dampRate"]),
     )
 
 
-def _represent_lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
+def _represent_lgsvl(vehicle: Lgsvl, values: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
     wheels = WHEEL_COUNT * vehicle.wheel_mass_share
     return build_plant(
-        c["mass"] + wheels * c["wheelMass"],
+        values["mass"] + wheels * values["wheelMass"],
         original["mass"] + wheels * original["wheelMass"],
         road.slope,
-        radius=c["radius"],
-        wheel_inertia=0.5 * c["wheelMass"] * c["radius"] ** 2,
+        radius=values["radius"],
+        wheel_inertia=0.5 * values["wheelMass"] * values["radius"] ** 2,
         friction=FRICTION * road.friction,
-        brake_torque=WHEEL_COUNT * c["maxBrakeTorque"],
+        brake_torque=WHEEL_COUNT * values["maxBrakeTorque"],
         brake_lag=vehicle.pedal_lag,
-        drag=c["tireDragCoeff"] - original["tireDragCoeff"],
-        wheel_damping=WHEEL_COUNT * vehicle.wheel_damping_share * (c["wheelDamping"] - original["wheelDamping"]),
+        drag=values["tireDragCoeff"] - original["tireDragCoeff"],
+        wheel_damping=WHEEL_COUNT * vehicle.wheel_damping_share * (values["wheelDamping"] - original["wheelDamping"]),
     )
 
 
-def _represent_sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
+def _represent_sumo(vehicle: SumoVehicle, values: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
     bmw = load_bmw_parameters()
     return build_plant(
-        c["mass"],
+        values["mass"],
         original["mass"],
         road.slope,
         friction=vehicle.tyre_friction * road.friction,
         front_brake_share=bmw.T_sb,
         front_drive_share=bmw.T_se,
-        brake_delay=c["brakeDelay"],
-        brake_lag=c["tau"],
-        drive_ratio=c["accel"] / original["accel"],
-        **_brakes_for(vehicle.reference_mass * c["decel"] * c["brakeGain"], original["mass"]),
+        brake_delay=values["brakeDelay"],
+        brake_lag=values["tau"],
+        drive_ratio=values["accel"] / original["accel"],
+        **_brakes_for(vehicle.reference_mass * values["decel"] * values["brakeGain"], original["mass"]),
     )
 
 
@@ -126,8 +126,8 @@ MAPPINGS: Mapping[str, tuple[str, Represent]] = {
     "lgsvl": ("lgsvl", _represent_lgsvl),
     "sumo": ("native", _represent_sumo),
 }
-"""By the name of a shipped vehicle: a shipped study with it, which has the original of every characteristic, and the
-equations, as docs/opinion.md has them.
+"""By the name of a shipped vehicle: a shipped study, which has the original value of each of its characteristics, and
+the equations of docs/opinion.md.
 """
 NO_ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
 CARLA_ENGINE = ("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength")
@@ -149,6 +149,7 @@ class Prepared(NamedTuple):
     """Constants of N vehicles: the study's vehicle, for its sensors; the original, for its engine; the second model.
 
     `engine_mass` is the mass that the original's engine moves, with its wheels [kg]; `engine_radius` their radius [m].
+    `settings`, shape (N, n), tell the vehicles apart.
     """
 
     vehicle: Any
@@ -224,13 +225,15 @@ class SecondVehicle(Vehicle):
         road, settings = Road(road_friction, slope, wet), np.stack([*characteristics.values()], axis=1)
         original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
-        plant, own = (self._represent(self._engine, c, self._original, road) for c in (represented, original))
+        plant, original_plant = (
+            self._represent(self._engine, values, self._original, road) for values in (represented, original)
+        )
         return Prepared(
             vehicle=self._vehicle.prepare(characteristics, road_friction, step, slope, wet),
             original=self._engine.prepare(original, road_friction, step, slope, wet),
             plant=plant,
-            engine_mass=own.mass + WHEEL_COUNT * own.wheel_inertia / own.radius**2,
-            engine_radius=own.radius,
+            engine_mass=original_plant.mass + WHEEL_COUNT * original_plant.wheel_inertia / original_plant.radius**2,
+            engine_radius=original_plant.radius,
             settings=settings,
             slope=slope,
             step=step,
@@ -277,14 +280,16 @@ class SecondVehicle(Vehicle):
 
     def _advance_engine(self, prepared: Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
         """The original vehicle one step later, and the torque of its engine and all drags on all wheels [N m]."""
-        plant, radius, own_radius, v = prepared.plant, prepared.plant.radius, prepared.engine_radius, state.speed
-        original, speed = state.original, v * own_radius / radius
+        plant, radius, speed, original = prepared.plant, prepared.plant.radius, state.speed, state.original
+        # The speed at which the original's wheels turn as fast as the second model's.
+        original_speed = speed * prepared.engine_radius / radius
         if hasattr(original, "wheel_speed"):
-            wheels = original.wheel_speed * speed / np.maximum(original.speed, CREEP_SPEED)
+            wheels = original.wheel_speed * original_speed / np.maximum(original.speed, CREEP_SPEED)
             wheels = np.where(original.speed > CREEP_SPEED, wheels, original.wheel_speed)
             original = original._replace(wheel_speed=wheels)
         command = Command(throttle, brake=np.zeros_like(throttle))
-        original = self._engine.advance(prepared.original, original._replace(speed=speed), command)
-        torque = prepared.engine_mass * ((original.speed - speed) / prepared.step + prepared.slope.back) * own_radius
-        resistance = radius * (plant.drag + plant.air_drag * v) * v + plant.wheel_damping * v / radius
+        original = self._engine.advance(prepared.original, original._replace(speed=original_speed), command)
+        acceleration = (original.speed - original_speed) / prepared.step
+        torque = prepared.engine_mass * (acceleration + prepared.slope.back) * prepared.engine_radius
+        resistance = radius * (plant.drag + plant.air_drag * speed) * speed + plant.wheel_damping * speed / radius
         return original, np.where(torque > 0, torque * plant.drive_ratio, torque) - resistance

@@ -65,19 +65,19 @@ class Rating(Answer):
     @property
     def losses(self) -> dict[str, float]:
         """Points that the variant loses in each test, the largest loss first; only tests with a loss."""
-        pairs = zip(self.original.tests, self.variant.tests if self.variant else (), strict=False)
-        losses = {
-            " by ".join(filter(None, (before.matrix.test_name, before.matrix.light))): round(
-                before.total - after.total, DECIMALS
-            )
-            for before, after in pairs
-        }
-        return {test: loss for test, loss in sorted(losses.items(), key=lambda item: -item[1]) if loss > 0}
+        if self.variant is None:
+            return {}
+        losses = {}
+        for original, variant in zip(self.original.tests, self.variant.tests, strict=True):
+            loss = round(original.total - variant.total, DECIMALS)
+            if loss > 0:
+                losses[" by ".join(filter(None, (original.matrix.test_name, original.matrix.light)))] = loss
+        return dict(sorted(losses.items(), key=lambda item: -item[1]))
 
     @property
     def points(self) -> list[tuple[str, FloatArray, float]]:
-        """The name of each test, the points of each vehicle, shape (vehicles, 3), and the possible points; last of all
-        tests.
+        """The name of each test, the points of each vehicle, shape (vehicles, 3), and the possible points; in the last
+        row the sums of all tests.
         """
         rows = [
             (tests[0].matrix.name, np.array([test.points for test in tests]), sum(tests[0].matrix.points))
@@ -123,13 +123,15 @@ class Rating(Answer):
             for item in CharacteristicSet.of(self.study)
             if self.variant.setting[item.name] != item.original
         ]
-        result = f"loses {self.lost:.2f}"
+        result, largest_loss = f"loses {self.lost:.2f}", ""
         if self.lost < 0:
             result = f"earns {-self.lost:.2f} points more, {self.variant.points:.2f} instead"
-        most = "".join(f", {loss:.2f} of them in {test}" for test, loss in list(self.losses.items())[:1])
+        elif self.losses:
+            test, loss = next(iter(self.losses.items()))
+            largest_loss = f", {loss:.2f} of them in {test}"
         return (
             f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned} points that "
-            f"the original earns (of {possible} that are simulated){most if self.lost >= 0 else ''}."
+            f"the original earns (of {possible} that are simulated){largest_loss}."
         )
 
     def _points_table(self) -> Table:
@@ -168,9 +170,10 @@ class Rating(Answer):
         """Sentences on the tests and robustness layers without points."""
         points_by_test = self.protocol.points_not_simulated
         tests = ", ".join(f"{test} {points:g}" for test, points in points_by_test.items())
-        open_points = sum(
-            matrix.points[2] * [*layers.values()].count(None) / len(layers) for matrix, _, layers in self.original.tests
-        )
+        open_points = 0.0
+        for matrix, _, layers in self.original.tests:
+            _, _, robustness = matrix.points
+            open_points += robustness * [*layers.values()].count(None) / len(layers)
         return (
             f"Not simulated, neither passed nor failed: {tests}; {sum(points_by_test.values()):g} points. "
             f"Robustness layers neither simulated nor claimed: {open_points:.2f} points of the simulated tests."
@@ -207,7 +210,7 @@ class Rating(Answer):
         points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in self.vehicles)
         arrangement = " (original left, variant right)" if self.variant else ""
         title = f"{self.study.name}: {points} of {max_points(self.protocol):g}{arrangement}"
-        figure, axes = new_panels(title, len(self.protocol.matrices), 4, (3.75, 2.6), 15.0, 0.0)
+        figure, axes = new_panels(title, len(self.protocol.matrices), 4, (3.75, 2.6), min_width=15.0, title_height=0.0)
         for axis, matrix in zip(axes, self.protocol.matrices, strict=True):
             draw_matrix(axis, self.vehicles, matrix)
         figure.supxlabel(
@@ -231,7 +234,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, evaluator: Evalu
         If a vehicle cannot be simulated.
     """
     study, characteristics = evaluator.study, evaluator.characteristics
-    values, name = dict[str, float](), "variant"
+    values, name = {}, "variant"
     if options.solution is not None:
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
@@ -246,8 +249,8 @@ def rate_variant(subject: Study | Case, options: RatingOptions, evaluator: Evalu
     return rate(evaluator, variants)
 
 
-def rate(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
-    """Rate a study's original vehicle and variants, given as settings of shape (n,) by name; the filter is not applied.
+def rate(evaluator: Evaluator, variants: Mapping[str, FloatArray]) -> Rating:
+    """Rate a study's original vehicle, and variants by name, settings of shape (n,) to which no filter is applied.
 
     Raises
     ------
@@ -261,7 +264,7 @@ def rate(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
     rater, rated = assemble(study, study.source).rater, evaluator.for_study(study)
     assert rater is not None
-    names, settings = rated.characteristics.names, {"original": rated.characteristics.original, **settings}
+    names, settings = rated.characteristics.names, {"original": rated.characteristics.original, **variants}
     cells = rated.simulate_cells(np.stack(list(settings.values())), "cells and robustness layers")
     vehicles = [
         RatedVehicle(

@@ -38,11 +38,10 @@ TERMINAL_STYLES = {
 
 
 class RatedTest(NamedTuple):
-    """One vehicle's result in a test (by day or by night if the test has both); `points` are in the order of
-    `POINT_KINDS`.
+    """One vehicle's result in a test, by day or by night if the test has both.
 
-    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; day and night have
-    the same layers.
+    `points` are in the order of `POINT_KINDS`. `layers` states whether each robustness layer holds, None if it is
+    neither simulated nor claimed; day and night have the same layers.
     """
 
     matrix: CellMatrix
@@ -81,9 +80,10 @@ class RatedVehicle:
         for matrix in self.protocol.matrices:
             test, layers = matrix.test_name, dict[str, bool | None]()
             for layer in self.protocol.layers_of(test):
-                held = self.scores.layers.get((test, layer.name))
-                claimed = layer.name in self.rater.claims.get(test, ()) or None
-                layers[layer.name] = claimed if held is None else bool(held[0])
+                if (holds := self.scores.layers.get((test, layer.name))) is not None:
+                    layers[layer.name] = bool(holds[0])
+                else:
+                    layers[layer.name] = layer.name in self.rater.claims.get(test, ()) or None
             standard, extended, robustness = self.scores.tests[matrix.name][0].round(DECIMALS).tolist()
             tests.append(RatedTest(matrix, (standard, extended, robustness), layers))
         return tests
@@ -105,7 +105,8 @@ class RatedVehicle:
 
     def measured(self, number: int) -> float | None:
         """The value by which a cell is judged: the time to collision at the warning, or the relative impact speed."""
-        return (self.warnings if self.protocol.cells[number].judged_by == WARNING else self.impacts)[number]
+        values = self.warnings if self.protocol.cells[number].judged_by == WARNING else self.impacts
+        return values[number]
 
     @cached_property
     def letters(self) -> npt.NDArray[np.str_]:
@@ -157,14 +158,14 @@ def max_points(protocol: Protocol) -> float:
     return round(sum(sum(matrix.points) for matrix in protocol.matrices), DECIMALS)
 
 
-def _layout(protocol: Protocol, matrix: CellMatrix) -> pd.DataFrame:
+def _cell_numbers(protocol: Protocol, matrix: CellMatrix) -> pd.DataFrame:
     """The numbers of a matrix's cells by speed of the vehicle under test and by column; -1 where there is no cell."""
     speeds = [
         f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}" for number, row in enumerate(matrix.rows)
     ]
-    numbers = protocol.matrix_cell_numbers
+    known = protocol.matrix_cell_numbers
     columns = {
-        f"{value:g}": [numbers.get((matrix.name, row, column), -1) for row in range(len(speeds))]
+        f"{value:g}": [known.get((matrix.name, row, column), -1) for row in range(len(speeds))]
         for column, value in enumerate(matrix.column_values)
     }
     return pd.DataFrame(columns, index=speeds)
@@ -174,10 +175,9 @@ def matrix_tables(vehicles: Sequence[RatedVehicle]) -> Iterator[str | Table]:
     """Every matrix of the last vehicle: for each cell a letter, a colour, and the impact speed [km/h] or the time to
     collision at the warning [s].
     """
-    *_, last = vehicles
-    letters = _marked_letters(last, vehicles[0])
+    last, letters = vehicles[-1], _marked_letters(vehicles[-1], vehicles[0])
     for matrix in last.protocol.matrices:
-        layout = _layout(last.protocol, matrix)
+        layout = _cell_numbers(last.protocol, matrix)
         meaning = "impact location [%]" if matrix.impact_locations else "speed of the target"
         table = WholeTable("VUT", "target", right=layout.columns, title=f"{matrix.name}: speeds [km/h], {meaning}")
         for row, (speed, *numbers) in zip(matrix.rows, layout.itertuples(), strict=True):
@@ -200,7 +200,9 @@ def _format_cell(vehicle: RatedVehicle, number: int, letter: str) -> Text:
     """The letter of a cell and what was measured there, unless the cell is green by its impact."""
     colour, value = vehicle.colours[number], vehicle.measured(number)
     is_shown = colour != "green" or vehicle.protocol.cells[number].judged_by == WARNING
-    digits = f"{value:.{int(value < 10)}f}" if value is not None and is_shown else ""
+    digits = ""
+    if value is not None and is_shown:
+        digits = f"{value:.1f}" if value < 10 else f"{value:.0f}"
     return Text(letter + digits, TERMINAL_STYLES.get(colour or "", ""))
 
 
@@ -212,7 +214,7 @@ def draw_matrix(axis: Axes, vehicles: Sequence[RatedVehicle], matrix: CellMatrix
     from matplotlib.colors import ListedColormap
 
     original = vehicles[0]
-    layout = _layout(original.protocol, matrix).assign(**{"": -1})  # a gap after each vehicle
+    layout = _cell_numbers(original.protocol, matrix).assign(**{"": -1})  # a gap after each vehicle
     numbers = layout.to_numpy()
     colours = [np.where(numbers < 0, np.nan, vehicle.scores.colours[0, numbers]) for vehicle in vehicles]
     letters = [np.where(numbers < 0, "", _marked_letters(vehicle, original)[numbers]) for vehicle in vehicles]
@@ -222,5 +224,5 @@ def draw_matrix(axis: Axes, vehicles: Sequence[RatedVehicle], matrix: CellMatrix
     sns.heatmap(frame, annot=np.hstack(letters), fmt="", cmap=palette, **limits, cbar=False, linewidths=0.6, ax=axis)
     axis.grid(False)
     axis.tick_params(labelsize=FONT_SIZE - 2, length=0, rotation=0)
-    totals = " / ".join(f"{test.total:.2f}" for one in vehicles for test in one.tests if test.matrix is matrix)
+    totals = " / ".join(f"{test.total:.2f}" for rated in vehicles for test in rated.tests if test.matrix is matrix)
     axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT_SIZE)

@@ -105,7 +105,7 @@ class Template(_Spreadsheet):
         for layer in self.protocol.layers:
             holds = layers[layer.test_name][layer.name]
             yield self._sheet(layer.sheet)[layer.claim_cell], "YES" if holds else "NO"
-        test = ""  # in the sheet's words "Scenario", in the first row of each test
+        test = ""  # the sheet names it, as "Scenario", in the first row of each test alone
         for *_, scenario, parameter, cell in self._sheet(PARAMETERS).iter_rows(min_row=2, max_col=7):
             test = str(scenario.value or test).strip()
             # "Heading correction", a lane departure parameter, does not accept N/A.
@@ -124,8 +124,10 @@ class PreprocessedFile(_Spreadsheet):
         self._drawn_cells = [drawn_cell for sheet in sheets for drawn_cell in self._read_drawn_cells(f"{sheet}verif.")]
 
     def _read_drawn_cells(self, name: str) -> Iterator[tuple[JsonObject, int]]:
-        """The spreadsheet's cells by heading, and the cell number, of every drawn cell of a simulated test."""
-        headings, matrices = list[str](), {matrix.name for matrix in self.protocol.matrices}
+        """For every drawn cell of a simulated test: the spreadsheet's cells by heading, and the number of the
+        protocol's cell.
+        """
+        headings, matrices = [], {matrix.name for matrix in self.protocol.matrices}
         for row in self._sheet(name).iter_rows():
             values = [str(cell.value or "").strip() for cell in row]
             if "Test point" in values:

@@ -145,16 +145,16 @@ class Repairs:
     def to_frame(self) -> pd.DataFrame:
         """One row for each repair: `parameters`, `changed`, `largest_change`, and the price [m, s, m/s^2, m/s^3]."""
         rows = [
-            {
-                "parameters": self._changes_in_words(repair),
-                "changed": len(repair.values),
-                "largest_change": repair.largest_change,
-                "metres_earlier_mean": repair.price.mean,
-                "metres_earlier_worst": repair.price.worst,
-                "seconds_earlier": repair.price.seconds,
-                "largest_deceleration": repair.price.deceleration,
-                "largest_jerk": repair.price.jerk,
-            }
+            (
+                self._changes_in_words(repair),
+                len(repair.values),
+                repair.largest_change,
+                repair.price.mean,
+                repair.price.worst,
+                repair.price.seconds,
+                repair.price.deceleration,
+                repair.price.jerk,
+            )
             for repair in self.repairs
         ]
         columns = ["parameters", "changed", "largest_change", "metres_earlier_mean", "metres_earlier_worst"]

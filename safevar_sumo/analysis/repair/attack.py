@@ -117,7 +117,7 @@ def _carry_out(
     failures = [np.zeros((0, 1 + len(problem.promise.worn))) for _ in shares]  # safety degree and vehicle
     answers: dict[Key, Evaluations | None] = dict.fromkeys(runs)
     while answers:
-        wanted = dict[Key, FloatArray]()
+        wanted = {}
         for key, answer in answers.items():
             change_number, _ = key
             if enough is None or len(failures[change_number]) < enough:

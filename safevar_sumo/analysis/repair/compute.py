@@ -220,7 +220,7 @@ class _Finder:
                     unbroken.clear()
                     continue
                 # 5. Proof on fresh wear.
-                repairs = list[tuple[FloatArray, Proof]]()
+                repairs = []
                 for change in changes:
                     proof, found = prove(self.problem, change, attempt)
                     if proof is None:

@@ -135,7 +135,7 @@ class Search:
         for number in range(MAX_BOXES):
             if not open_subsets:
                 break
-            boxes = list[FloatArray]()
+            boxes = []
             for subset in open_subsets:
                 box = self._box(subset, half_widths[subset], number)
                 boxes.append(box[self.largest_change(box) >= bounds[subset]])

@@ -64,9 +64,9 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
     names = QUESTION_NAMES if question is None else (question,)
     if question == "rq3.3":
         names = (question, SAFETY_TABLE)
-    answers, all_errors = list[TableAnswer](), list[UnanswerableError]()
+    answers, all_errors = [], []
     for name in names:
-        frames, notes, case_notes = list[pd.DataFrame](), list[str](), list[str]()
+        frames, notes, case_notes = [], [], []
         for group in [cases] if name == WEATHER else [[case] for case in cases]:
             try:
                 frame = FRAMES[name](*group)

@@ -72,7 +72,7 @@ def _means_by_change_count(
     of the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of values).
     """
     change_counts = count_changes(case)
-    rows = list[tuple[str | float, ...]]()
+    rows = []
     for (key, column), j in product(values, (*change_numbers(case), ANY)):
         sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
         rows.append((case.name, *key, j, np.mean(sample) if sample.size else np.nan, sample.size))

@@ -121,7 +121,7 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
     2006).
     """
     _require_algorithms(case, 3)
-    samples, frames = _samples(case, over_runs=True), list[pd.DataFrame]()
+    samples, frames = _samples(case, over_runs=True), []
     for metric, more_is_better in _directions(case).items():
         blocks = pd.DataFrame({name: samples.get((name, metric)) for name in case.algorithms}, dtype=float).dropna()
         ranks = blocks.rank(axis=1, ascending=not more_is_better)
@@ -230,7 +230,7 @@ def titles_of(cases: Iterable[Case]) -> dict[str, str]:
 
 def summary_lines(case: Case) -> list[str]:
     """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk."""
-    lines, titles = list[str](), titles_of([case])
+    lines, titles = [], titles_of([case])
     try:
         tests = compare_over_runs(case).replace(titles)
         for question, subject, heading, meaning in (

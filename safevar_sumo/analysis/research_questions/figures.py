@@ -34,6 +34,7 @@ from safevar_sumo.analysis.research_questions.fronts import (
     compute_convergence,
     nondominated_points,
     points_of,
+    reference_front,
 )
 from safevar_sumo.analysis.research_questions.statistics import ALPHA
 from safevar_sumo.analysis.words import number_of
@@ -70,14 +71,13 @@ def draw_pareto_fronts(case: Case) -> Figure:
     UnanswerableError
         If there is no solution.
     """
+    reference_front(case)  # raises if there is no solution
     objectives = case.scoring.objectives
     fronts = {
         algorithm: nondominated_points(points) * [objective.sign for objective in objectives]
         for algorithm in case.algorithms
         if len(points := points_of(case, case.solutions_of(algorithm)))
     }
-    if not fronts:
-        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     pairs = list(combinations(range(len(objectives)), 2))
     title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
     figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
@@ -326,7 +326,7 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     UnanswerableError
         If no figure can be drawn.
     """
-    figures, errors = dict[str, "Figure"](), list[UnanswerableError]()
+    figures, errors = {}, []
     drawings: dict[str, Callable[[], Figure]] = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
         if draw is not draw_critical_differences or len(case.algorithms) > 2:  # two are compared as a pair

@@ -111,7 +111,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs or no solutions.
     """
-    reference, search, frames = reference_front(case), case.study.search, list[pd.DataFrame]()
+    reference, search, frames = reference_front(case), case.study.search, []
     counts = np.unique(
         np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
     )
@@ -140,6 +140,7 @@ def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     UnanswerableError
         If there are no runs with solutions.
     """
+    reference_front(case)  # raises if there is no solution
     surfaces: dict[str, dict[float, FloatArray]] = {}
     signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
     for algorithm in case.algorithms:
@@ -156,6 +157,4 @@ def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
             surfaces[algorithm] = {
                 percentage: rows[rows[:, 2] == percentage, :2] * signs for percentage in np.unique(rows[:, 2]).tolist()
             }
-    if not surfaces:
-        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     return surfaces

@@ -184,7 +184,7 @@ def lay_out(answer: TableAnswer) -> list[Table]:
             continue
         for names, group in frame.groupby(list(layout.one_table_per), sort=False):
             tables.append(Table(f"{title}: {' against '.join(map(str, names))}", _arrange(group, layout)))
-    notes = list[str]()
+    notes = []
     if "method" in frame:
         for method in frame["method"].dropna().unique():
             p_value = "p with e" if method == EXACT_TEST and "p_holm" not in frame else "p"
@@ -304,7 +304,7 @@ def as_markdown(answers: Sequence[TableAnswer]) -> str:
     """Markdown tables; a heading over several columns is repeated in each column's heading."""
     texts = []
     for table in (table for answer in answers for table in lay_out(answer)):
-        frame, body = table.frame, list[str]()
+        frame, body = table.frame, []
         if not frame.empty:
             columns = frame.columns
             if columns.nlevels > 1:
@@ -385,7 +385,7 @@ def as_json(answers: Sequence[TableAnswer]) -> str:
 
     Undefined values are null, but a rank, which rq3.2 has for j = any alone, is left out where there is none.
     """
-    rows = list[JsonObject]()
+    rows = []
     for name, frame, *_ in answers:
         table_key = {"table": name} if len(answers) > 1 else {}
         for row in frame.astype(object).where(frame.notna(), None).to_dict("records"):
