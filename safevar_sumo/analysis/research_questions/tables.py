@@ -16,7 +16,6 @@ from safevar_sumo.analysis.research_questions.comparisons import titles_of
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import MetricFacts
-from safevar_sumo.records import JsonObject
 from safevar_sumo.study import unit_text
 
 UNDEFINED = "-"
