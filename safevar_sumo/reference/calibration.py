@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -97,10 +98,10 @@ class Profiles(NamedTuple):
         A trial fits as well as the best if its loss exceeds the lowest loss by at most the share `alike`. The best
         trials of all races that fit so well are among the sets.
         """
-        bests = sorted(((race.lowest_loss, race.best_place) for race in races), key=lambda trial: trial[0])
-        limit = bests[0][0] * (1 + alike)
-        rest = [trial for race in races for trial in race.kept if trial[0] > race.lowest_loss]
-        trials = [*bests, *sorted(rest, key=lambda trial: trial[0])]
+        loss_of = itemgetter(0)  # of a trial: its loss and place
+        bests = sorted(((race.lowest_loss, race.best_place) for race in races), key=loss_of)
+        others = [trial for race in races for trial in race.kept if loss_of(trial) > race.lowest_loss]
+        trials, limit = [*bests, *sorted(others, key=loss_of)], loss_of(bests[0]) * (1 + alike)
         losses, places = np.array([loss for loss, _ in trials]), np.array([place for _, place in trials])
         alike_trials = np.flatnonzero(losses <= limit)
         sets = alike_trials[_distant_trials(places[alike_trials], sum(loss <= limit for loss, _ in bests))].tolist()

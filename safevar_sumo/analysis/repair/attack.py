@@ -61,9 +61,9 @@ def attack(
     shares, worn, search = np.array(changes), problem.promise.worn, problem.study.search
     size = max(CHILDREN // max(len(points), 1), PARENTS)
     rngs = [np.random.default_rng((search.seed, number, row)) for row in range(len(changes))]
-    near: Runs = {(row, 0): _breed(problem, known, size, rng) for row, rng in enumerate(rngs)}
-    failures = _carry_out(problem, shares, near, points)
-    unbroken = [row for row, vehicles in enumerate(failures) if not len(vehicles)]
+    breeding: Runs = {(row, 0): _breed(problem, known, size, rng) for row, rng in enumerate(rngs)}
+    bred = _carry_out(problem, shares, breeding, points)
+    unbroken = [row for row, vehicles in enumerate(bred) if not len(vehicles)]
     originals = problem.evaluate(shares[unbroken], np.tile(worn.original, (len(unbroken), 1)), "attack", points)
     runs: Runs = {}
     for place, row in enumerate(unbroken):
@@ -76,11 +76,11 @@ def attack(
         for seed in range(ATTACKS):
             rng = np.random.default_rng((search.seed, number, place, seed))
             runs[row, seed] = algorithm_of(next(iter(search.labels)), problem.study).search(task, rng)
-    found = _carry_out(problem, shares, runs, points, MAX_NEW)
+    searched = _carry_out(problem, shares, runs, points, MAX_NEW)
     places = np.linspace(0.0, 1.0, MAX_NEW) ** 2  # from the worst to the mildest failure; squared: more of the worst
     chosen = []
-    for near_known, by_search in zip(failures, found, strict=True):
-        vehicles = near_known if len(near_known) else by_search
+    for bred_failures, searched_failures in zip(bred, searched, strict=True):
+        vehicles = bred_failures if len(bred_failures) else searched_failures
         rows = np.unique((places * max(len(vehicles) - 1, 0)).astype(int))
         chosen.append(vehicles[rows[: len(vehicles)]])
     return chosen

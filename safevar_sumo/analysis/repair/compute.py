@@ -194,9 +194,9 @@ class _Finder:
         self.search.add(failures)
         return proof
 
-    def _attack(self, sets: Sequence[FloatArray], points: Sequence[int]) -> list[FloatArray]:
-        self.attacks += len(sets)
-        return attack(self.problem, sets, self.search.vehicles, points, self.attacks) if sets else []
+    def _attack(self, changes: Sequence[FloatArray], points: Sequence[int]) -> list[FloatArray]:
+        self.attacks += len(changes)
+        return attack(self.problem, changes, self.search.vehicles, points, self.attacks) if changes else []
 
     def find(self) -> list[Repair]:
         """Search, attack and prove in turns until the smallest changes survive everything."""
@@ -266,7 +266,10 @@ class _Finder:
         for _ in range(HALVINGS):
             middle = (low + high) / 2
             search = Search(self.problem, original + middle * (vehicles - original), self.search.seen)
-            low, high = (middle, high) if search.pareto_set(lambda _: 0.0) else (low, middle)
+            if search.pareto_set(lambda _: 0.0):
+                low = middle
+            else:
+                high = middle
         return self.problem.promise.shrunk(low) if low else None
 
     def exchange_rate(self, name: str, repairs: Sequence[Repair]) -> list[Exchange]:

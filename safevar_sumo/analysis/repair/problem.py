@@ -317,8 +317,8 @@ class RepairProblem:
         """Which vehicles full braking at the first possible moment, or else the ADS of today, keeps safe."""
         stage = "full braking"
         is_safe = degrees_of(self.best_driver.evaluate(self.promise.settings(vehicles), stage)) >= self.margin
-        rest = np.flatnonzero(~is_safe)
-        is_safe[rest] = self.degrees_today(vehicles[rest], stage) >= self.margin
+        unsafe = np.flatnonzero(~is_safe)
+        is_safe[unsafe] = self.degrees_today(vehicles[unsafe], stage) >= self.margin
         return is_safe
 
 

@@ -93,8 +93,8 @@ def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
         return []
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     # RQ2 compares a baseline's runs with NSGA-II's: the smaller number counts.
-    most = runs.pop(NSGA2, 0) if question == "RQ2" else math.inf
-    return [name for name in case.algorithms if name in runs and min(runs[name], most) < FEWEST_RUNS[question]]
+    run_count = runs.pop(NSGA2, 0) if question == "RQ2" else math.inf
+    return [name for name in case.algorithms if name in runs and min(runs[name], run_count) < FEWEST_RUNS[question]]
 
 
 def _notes(question: str, case: Case) -> Iterator[str]:
