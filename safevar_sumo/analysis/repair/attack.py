@@ -77,11 +77,11 @@ def attack(
             rng = np.random.default_rng((search.seed, number, place, seed))
             runs[row, seed] = algorithm_of(next(iter(search.labels)), problem.study).search(task, rng)
     searched = _carry_out(problem, shares, runs, points, MAX_NEW)
-    places = np.linspace(0.0, 1.0, MAX_NEW) ** 2  # from the worst to the mildest failure; squared: more of the worst
+    shares_of_rows = np.linspace(0.0, 1.0, MAX_NEW) ** 2  # squared: more of the worst failures
     chosen = []
     for bred_failures, searched_failures in zip(bred, searched, strict=True):
         vehicles = bred_failures if len(bred_failures) else searched_failures
-        rows = np.unique((places * max(len(vehicles) - 1, 0)).astype(int))
+        rows = np.unique((shares_of_rows * max(len(vehicles) - 1, 0)).astype(int))
         chosen.append(vehicles[rows[: len(vehicles)]])
     return chosen
 

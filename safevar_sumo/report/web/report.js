@@ -7,7 +7,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
     button.append(...head.childNodes);
     head.append(button);
     const value = (row) => {
-      const cell = row.cells[column], text = cell.dataset.value ?? cell.textContent.trim(), number = parseFloat(text.replace("<", ""));
+      const cell = row.cells[column], text = cell.textContent.trim(), number = parseFloat(text.replace("<", ""));
       return Number.isNaN(number) ? text : number;
     };
     button.addEventListener("click", () => {
