@@ -29,7 +29,7 @@ from safevar_sumo.scenarios import VUT, Lane, Point, Scene
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
-from safevar_sumo.sumo.perception import Perception, encounter_of, observer_of
+from safevar_sumo.sumo.perception import Perception, encounter_of, observer_of, per_vehicle
 from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld
 from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System
@@ -53,29 +53,23 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
         if error.source == STUDY_SOURCE:
             raise InputError(system.source, error.problem, error.legal) from None
         raise
-    invalid = runs.outcome == Outcome.INVALID_TEST
-    if invalid.any():
-        metrics = {name: np.where(invalid, np.nan, values) for name, values in metrics.items()}
+    is_invalid = runs.outcome == Outcome.INVALID_TEST
+    if is_invalid.any():
+        metrics = {name: np.where(is_invalid, np.nan, values) for name, values in metrics.items()}
+    for name, change in system.measuring.changes.items():
+        metrics[name] = change.function(settings, system.characteristics)
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
-        metrics={
-            **metrics,
-            **{
-                name: change.function(settings, system.characteristics)
-                for name, change in system.measuring.changes.items()
-            },
-        },
+        metrics=metrics,
         f_diff=system.characteristics.largest_change(settings),
         f_num_diff=system.characteristics.number_changed(settings),
     )
 
 
 def reason_for_sumo(system: System) -> str:
-    """The reason why a system is simulated in SUMO, in one copy of the network per vehicle; "" if recorded scenes
-    suffice.
-    """
+    """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded scenes suffice."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     scenes_or_reasons = record_scenes([point.scenario for point in system.points], step_options(system))
@@ -92,9 +86,9 @@ def drive_all(
 ) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
-    `watch` is called with SUMO's world at every sample, `listen` with what the ADS observes.
-    Several points must share a network and have recorded scenes; SUMO simulates only one point at once. The result
-    holds the runs at the first point, then the runs at the second point, and so on.
+    The result holds the runs at the first point, then the runs at the second point, and so on. Several points must have
+    recorded scenes of one road; SUMO simulates only one point at once. `watch` is called with SUMO's world at every
+    sample, `listen` with what the ADS observes.
 
     Raises
     ------
@@ -109,8 +103,8 @@ def drive_all(
         world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
         return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
     (scenario,), n = scenarios, len(settings)
-    in_sumo = Engine.LIBSUMO if engine is Engine.RECORDED else engine
-    with open_world(copied_network(stage_network(scenario), n), n, in_sumo, options) as sumo_world:
+    sumo_engine = Engine.LIBSUMO if engine is Engine.RECORDED else engine
+    with open_world(copied_network(stage_network(scenario), n), n, sumo_engine, options) as sumo_world:
         return drive(system, settings, sumo_world, watch, listen)
 
 
@@ -160,7 +154,7 @@ def _simulate(
             watch(world)
         speed = world.speeds()
         scene = observer.observe(outcomes.is_open)
-        if system.sees_nobody:
+        if system.sees_nobody:  # the run ends at the place of the encounter
             scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
         collisions = contacts.record_collisions(world, outcomes.is_open, scene)
         active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_step)
@@ -173,8 +167,8 @@ def _simulate(
         command, ads_memory = system.ads.drive(observation, ads_memory)
         _note_warnings(warning_ttc, system.ads.warns(ads_memory), outcomes.is_open, speed, scene)
         command, state = robot.drive(command, state, outcomes.is_open)
-        values = {"speed": speed, "gear": state.gear, "active": active, "pedal": state.brake}
-        log.write(sample, world.vehicle_positions(VUT), scene, command, **values)
+        position = world.vehicle_positions(VUT)
+        log.write(sample, position, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
         if not np.count_nonzero(outcomes.is_open):
             break
         if watch is None:
@@ -222,23 +216,24 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
 
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
-    if np.count_nonzero(np.isfinite(speed)) < len(speed):
-        for copy in open_rows(~np.isfinite(speed))[:1]:
-            changes = [
-                f"{characteristic.name} = {value:g}"
-                for characteristic, value in zip(characteristics, settings[copy], strict=True)
-                if value != characteristic.original
-            ]
-            values = ", ".join(changes) or "the original's values"
-            raise InputError(
-                "vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with"
-            )
+    for copy in open_rows(~np.isfinite(speed))[:1]:
+        changes = [
+            f"{characteristic.name} = {value:g}"
+            for characteristic, value in zip(characteristics, settings[copy], strict=True)
+            if value != characteristic.original
+        ]
+        values = ", ".join(changes) or "the original's values"
+        raise InputError(
+            "vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with"
+        )
 
 
 def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, float, Slope, bool | BoolArray]:
-    """Factor on the tyres' friction (a number if all points share it), time step, slope and wetness, of n vehicles."""
-    frictions, size = [point.weather.road_friction for point in points], n // len(points)
-    friction = frictions[0] if len(set(frictions)) == 1 else np.repeat(frictions, size)
+    """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres' friction (a number if
+    all points share it), time step, slope and wetness.
+    """
+    size = n // len(points)
+    friction = per_vehicle([point.weather.road_friction for point in points], size)
     grades, wetness = [point.scenario.grade for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
     return friction, step, slope, np.repeat(wetness, size) if any(wetness) else False
@@ -248,8 +243,9 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
     """The vehicles' sensors: the weather adds its recognition delay and scales the range by its visibility."""
     (point,) = system.points  # SUMO simulates one point at once
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
-    reach = np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
-    return Sensors(latency + point.weather.recognition_delay, reach, scale)
+    # Nobody is within a negative range.
+    reach_in_weather = np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
+    return Sensors(latency + point.weather.recognition_delay, reach_in_weather, scale)
 
 
 class _Log:
@@ -279,10 +275,10 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies`
-    ended in this step.
+    """Outcomes of N runs (docs/method.md, section 4).
 
-    `is_checked` is true where user code is checked: in runs that were open when their vehicles last advanced.
+    `is_open` is true where an outcome can change; `ended_copies` are the runs that ended in this step. `is_checked` is
+    true where user code is checked: in runs that were open when their vehicles last advanced.
     """
 
     def __init__(self, n: int) -> None:

@@ -1,5 +1,5 @@
-"""Files of networks: kept in the user's cache folder; and N copies of the XML of a network and its
-traffic, in which each id starts with the number of its copy.
+"""N copies of the XML of a network and its traffic, in which each id starts with the number of its copy; and the user's
+cache folder, which keeps such files.
 """
 
 from __future__ import annotations
@@ -129,15 +129,15 @@ def parse_seconds(text: str) -> float | None:
     """
     try:
         total, fields = 0.0, text.split(":")
-        for factor, field in zip((86400, 3600, 60, 1)[-len(fields) :], fields, strict=True):
-            total += factor * float(field)
+        for seconds, field in zip((86400, 3600, 60, 1)[-len(fields) :], fields, strict=True):  # seconds are last
+            total += seconds * float(field)
     except ValueError:
         return None
     return total if math.isfinite(total) else None
 
 
 def _marked_xml(element: ElementTree.Element, ids: IdAttributes, source: Path) -> str:
-    """An element, which changes, as XML with a placeholder in every id."""
+    """An element as XML with a placeholder in every id; changes the element."""
     for part in element.iter():
         if part.tag not in ids:
             raise InputError(source, f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
@@ -147,6 +147,7 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes, source: Path) -
 
 
 def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None:
+    """Write a file with the root's tag and attributes, without those of a namespace, and `blocks` of XML in it."""
     attributes = {name: value for name, value in root.attrib.items() if not name.startswith("{")}
     empty_text = ElementTree.tostring(
         ElementTree.Element(root.tag, attributes), encoding="unicode", short_empty_elements=False

@@ -1,6 +1,4 @@
-"""The rule on whether a study can judge its ADS: with nobody in sight, the original vehicle drives to the place of the
-encounter.
-"""
+"""A study can judge its ADS only if the original vehicle, on an empty road, drives to the place of the encounter."""
 
 from __future__ import annotations
 
@@ -34,8 +32,9 @@ def why_no_verdict(system: System) -> str:
     if not problems:
         return ""
     point, problem = next(iter(problems.items()))
-    alike = sum(other.split()[0] == problem.split()[0] for other in problems.values())
-    where = f" at {alike} of {len(results)} points, such as {point}" if len(results) > 1 else ""
+    kind = problem.split()[0]  # the first word: distances differ from point to point
+    count = sum(other_problem.startswith(kind) for other_problem in problems.values())
+    where = f" at {count} of {len(results)} points, such as {point}" if len(results) > 1 else ""
     return f"The original vehicle {problem}{where}: no verdict."
 
 
@@ -50,15 +49,14 @@ def summary_entry(no_verdict: str) -> list[dict[str, dict[str, bool]]]:
 
 
 def _problem(runs: SimulationRuns) -> str:
+    """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing."""
     trace = runs.trace
-    until_end = slice(int(np.count_nonzero(trace.active)) + 1)  # the sample after the last active one ended the run
-    gap, speed, brake, position = (
-        values[until_end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
-    )
+    end = int(np.count_nonzero(trace.active)) + 1  # the sample after the last active one ended the run
+    gap, speed, brake, position = (values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return "brakes without an obstacle"
     if gap[-1] <= 0 or runs.outcome[0] == Outcome.COLLISION:
         return ""
     distance = position[-1] - position[0]
-    of_distance = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
-    return f"never reaches the encounter (it gets {distance:.1f}{of_distance} m)"
+    of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
+    return f"never reaches the encounter (it gets {distance:.1f}{of_needed} m)"

@@ -24,9 +24,10 @@ CONNECTION_ATTEMPTS = 15
 
 
 class Engine(StrEnum):
-    """What moves the vehicles: numpy in recorded scenes (RECORDED; the same as LIBSUMO if an actor may react to the
-    vehicles), or SUMO: in this process (LIBSUMO), in another process (TRACI), or in another process with a window
-    (GUI).
+    """What moves the vehicles: numpy in recorded scenes (RECORDED), or SUMO.
+
+    SUMO runs in this process (LIBSUMO), in another process (TRACI), or in another process with a window (GUI). If an
+    actor may react to the vehicles, RECORDED is the same as LIBSUMO.
     """
 
     RECORDED = "recorded"
@@ -58,7 +59,7 @@ def open_world(
 
 def engine_api(engine: Engine) -> Api:
     if engine is Engine.LIBSUMO:
-        with redirect_stdout(sys.stderr):  # it warns of a pyarrow of another version
+        with redirect_stdout(sys.stderr):  # libsumo warns of a pyarrow of another version
             import libsumo
 
         return libsumo
@@ -97,11 +98,8 @@ def start_engine(api: Api, engine: Engine, command: list[str]) -> None:
         except (api.TraCIException, api.FatalTraCIError) as error:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
         return
-    if (
-        engine is Engine.GUI
-        and sys.platform == "linux"
-        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    ):
+    has_display = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if engine is Engine.GUI and not has_display:
         raise InputError("gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment")
     with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
         warnings.simplefilter("ignore")

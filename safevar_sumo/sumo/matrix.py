@@ -1,4 +1,4 @@
-"""Settings at the points of a study: its only scenario, or all points of a matrix, of which the worst point counts."""
+"""Evaluates settings at the points of a study: its only scenario, or a matrix, of whose points the worst one counts."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_COPIES = 200
-"""Largest number of copies of a network in one simulation; beyond it, the processor's caches overflow and each copy
-costs more time.
+"""Largest number of copies of a network in one simulation; with more, the processor's caches overflow, and each copy
+takes longer.
 """
 MAX_VEHICLES = 4000
 """Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 200 MB."""
@@ -121,20 +121,22 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple
 
     Traces are dropped, as they would take gigabytes.
     """
-    groups = _simulate_groups(system, settings, engine)
-    results = {one.point.name: (one.evaluations, rated_quantities(one.runs)) for group in groups for one in group}
-    scored, quantities = zip(*(results[point.name] for point in system.points), strict=True)
-    cells, evaluations = join_cells(quantities), evaluations_at_worst_points(system, scored)
+    results = {
+        result.point.name: (result.evaluations, rated_quantities(result.runs))
+        for group in _simulate_groups(system, settings, engine)
+        for result in group
+    }
+    at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
+    cells, evaluations = join_cells(quantities), evaluations_at_worst_points(system, at_points)
     if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
-    return replace(
-        evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
-    ), cells
+    metrics = {**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
+    return replace(evaluations, metrics=metrics), cells
 
 
 def evaluate_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine) -> Evaluations:
-    """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part`
-    is (k, m).
+    """Evaluations of settings, shape (N, n), with their `cells`, in a part of a protocol's cells: `part` is (k, m) for
+    the k-th of m parts.
     """
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in cells_of_part(system.rater.protocol, *part))
@@ -163,9 +165,10 @@ def _batch_size(system: System, engine: Engine) -> int:
 
 
 def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]) -> Evaluations:
-    """The evaluations of N settings, each at its worst point, of those at each of the system's points."""
+    """The evaluation of each of N settings at its worst point; `at_points` are their evaluations at all points."""
     numbers, n = worst_points(system, at_points), len(at_points[0])
-    return replace(Evaluations.concatenate(at_points).take(numbers * n + np.arange(n)), worst_points=numbers)
+    rows = numbers * n + np.arange(n)
+    return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
 
 def simulate(
@@ -191,7 +194,7 @@ def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> It
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if is_recorded(system, engine):
-        groups = _group_points(system.points, largest_batch(system) // max(n, 1), step_options(system))
+        groups = _group_points(system.points, max(largest_batch(system) // max(n, 1), 1), step_options(system))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
@@ -258,22 +261,21 @@ def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) ->
     """
     groups: dict[Hashable, list[Point]] = {}
     for point, scene in zip(points, record_scenes([point.scenario for point in points], options), strict=True):
-        key: Hashable = point.name
-        if isinstance(scene, Recording) and isinstance(point.scenario, TargetTest):
-            key = scene.batch_key
+        has_target = isinstance(point.scenario, TargetTest)
+        key = scene.batch_key if has_target and isinstance(scene, Recording) else point.name
         groups.setdefault(key, []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
-        for start in range(0, len(group), max(size, 1)):
-            yield tuple(group[start : start + max(size, 1)])
+        for start in range(0, len(group), size):
+            yield tuple(group[start : start + size])
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:
-    """For every setting, the number of the point with the least safety degree; of equal points, the first by name.
-    `at_points` are the evaluations of the settings at each of the system's points.
+    """The number of each setting's worst point; `at_points` are the evaluations of the settings at all points.
 
-    A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst,
-    because such a test leaves open whether the setting is safe.
+    It is the point with the least safety degree; of equal points, the first by name. A collision in a valid test always
+    counts. Without a collision, a point with an invalid test counts as the worst, because such a test leaves open
+    whether the setting is safe.
     """
     order = np.argsort([point.name for point in system.points])
     in_order = [at_points[k] for k in order]

@@ -1,5 +1,4 @@
-"""SUMO networks: their folders, and N copies of a network and its traffic at the same coordinates, without connections
-between copies.
+"""SUMO networks: their folders, and N copies of a network and its traffic, at the same coordinates and unconnected.
 
 A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network (`.net.xml`); its
 traffic, and SUMO's options. The user's cache folder keeps the built network and the copies, in folders named by the
@@ -37,9 +36,8 @@ NETWORK_KEY = "scenario.parameters.network"
 """Key of a study that names the network, the source of errors about a network that does not exist."""
 SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon)-files")
 """Options of netconvert that name source files."""
-DIGEST_LENGTH = 16
-
-
+DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
+"""Numbers of characters of a digest, and of a program's message, that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
 """`XmlChanges` that can be hashed."""
 
@@ -112,8 +110,8 @@ def options_of(file: Path) -> dict[str, str]:
 
 def _roads_in(folder: Path) -> str:
     """The recipe in a folder or, without a recipe, its built network; of several the one that SUMO's options name."""
-    names = [file.name for ending in (RECIPE_ENDING, NETWORK_ENDING) for file in sorted(folder.glob(f"*{ending}"))]
-    names = [name for name in names if name.endswith(RECIPE_ENDING)] or names
+    recipes, built = (sorted(file.name for file in folder.glob(f"*{end}")) for end in (RECIPE_ENDING, NETWORK_ENDING))
+    names = recipes or built
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
         names = [name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")] or names
     if len(names) != 1:
@@ -198,7 +196,7 @@ def sumo_version() -> str:
 
 
 def cache_folder_name(network: Network, n: int, digests: Sequence[str]) -> str:
-    """Name of the folder in the cache for `n` copies that are made from files with these digests."""
+    """Name of the folder in the cache for `n` copies of a network whose files have these digests."""
     name = re.sub(r"[^a-zA-Z0-9_.-]", "_", network.folder.name)  # SUMO splits file names at commas
     return f"{name}-{n}-{_digest(' '.join([*digests, sumo_version(), _code_digest()]).encode())}"
 
@@ -217,7 +215,7 @@ def run_program(folder: Path, program: str, *arguments: str) -> tuple[int, str]:
         env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME},
     )
     lines = [line.strip() for line in process.stderr.splitlines() if line.strip() and not line.startswith("Quitting")]
-    return process.returncode, " ".join(lines).removeprefix("Error: ")[:500]
+    return process.returncode, " ".join(lines).removeprefix("Error: ")[:MESSAGE_LENGTH]
 
 
 def _digest(content: bytes) -> str:

@@ -1,6 +1,4 @@
-"""Checks of a user's network: SUMO judges it, and own checks refuse what SUMO accepts but a study would measure
-wrongly.
-"""
+"""Checks of a user's network: SUMO loads it, and further checks refuse what SUMO accepts but studies cannot use."""
 
 from __future__ import annotations
 
@@ -74,7 +72,7 @@ def network_remarks(name: str, *, sumo_drives: bool) -> list[str]:
     """Remarks on attributes of a user's traffic that the simulation does not use, and SUMO's warnings; none on shipped
     networks.
 
-    `sumo_drives`: SUMO's own driver influences the vehicle, as with a controller written for TraCI.
+    With `sumo_drives`, SUMO's own driver influences the vehicle, as with a controller written for TraCI.
     """
     if is_shipped(name):
         return []
@@ -132,7 +130,8 @@ def _check_lanes(file: Path, routes: Iterable[ElementTree.Element], roads: Eleme
     """Refuse a sloping or slippery road of the vehicle under test."""
     names = " ".join(route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")).split()
     for lane in (lane for edge in roads.iter("edge") if edge.get("id") in names for lane in edge.iter("lane")):
-        heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
+        coordinates = [(*point.split(","), "0") for point in lane.get("shape", "").split()]  # x,y or x,y,z
+        heights = [float(z) for _, _, z, *_ in coordinates]
         climb, friction = max(heights, default=0.0) - min(heights, default=0.0), float(lane.get("friction", 1))
         problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
         is_illegal = climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1
@@ -140,14 +139,12 @@ def _check_lanes(file: Path, routes: Iterable[ElementTree.Element], roads: Eleme
 
 
 def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
-    """Refuse types whose drivers are random, though traffic that reacts to the vehicle may show it in no copy at
-    first.
-    """
+    """Refuse types whose drivers are random: two copies of traffic that reacts to the vehicle may not show it yet."""
     names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {VUT}
-    for kind in (kind for kind in traffic.findall("vType") if kind.get("id") in names):
-        model, speed_dev = kind.get("carFollowModel", "Krauss"), kind.get("speedDev", "0.1")
-        sigma = kind.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
-        problem = f"vType {kind.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}"
+    for vtype in (vtype for vtype in traffic.findall("vType") if vtype.get("id") in names):
+        model, speed_dev = vtype.get("carFollowModel", "Krauss"), vtype.get("speedDev", "0.1")
+        sigma = vtype.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
+        problem = f"vType {vtype.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}"
         is_random = float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS)
         legal = f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}'
         _refuse(file, legal, {problem: bool(is_random)})
@@ -160,9 +157,7 @@ def _warnings_file(network: Network) -> Path:
 
 
 def _try_network(network: Network, into: Path) -> None:
-    """Load a network in a separate SUMO process, because some broken networks crash SUMO; then compare the traffic of
-    two copies.
-    """
+    """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of two copies."""
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
     only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")

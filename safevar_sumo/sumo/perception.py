@@ -24,12 +24,13 @@ class Perception:
     """Observations, step by step, of K groups of `size` vehicles; group k is in weather k."""
 
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
-        self._visibility = _per_vehicle([weather.visibility for weather in weathers], size)
+        self._visibility = per_vehicle([weather.visibility for weather in weathers], size)
         delays = np.repeat([weather.recognition_delay for weather in weathers], size)
-        distinct = np.unique(delays).tolist()
+        distinct_delays = np.unique(delays).tolist()
+        everybody: Any = slice(None)  # faster than indices
         self._lines = [
-            (slice(None) if len(distinct) == 1 else (delays == delay).nonzero()[0], DelayLine.by(delay, step))
-            for delay in distinct
+            (everybody if len(distinct_delays) == 1 else np.flatnonzero(delays == delay), DelayLine.by(delay, step))
+            for delay in distinct_delays
         ]
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
@@ -37,13 +38,8 @@ class Perception:
         far away.
         """
         values = np.empty((len(OCCLUDED_VALUES) + 1, len(speed)))
-        values[0], values[1], values[2], values[3], values[4] = (
-            scene.gap,
-            scene.lateral,
-            scene.lateral_speed,
-            scene.obstacle_speed,
-            speed,
-        )
+        for row, quantity in enumerate((scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed)):
+            values[row] = quantity
         if scene.visible is not ALL_TRUE:
             values[:-1] = np.where(scene.visible, values[:-1], OCCLUDED_VALUES)
         seen = np.empty_like(values)
@@ -69,9 +65,7 @@ class SceneObserver:
 
 
 class TargetObserver:
-    """Observes the targets of K recorded scenes with `size` vehicles each, in every step, from the targets' motion at
-    all samples.
-    """
+    """Observes the targets of K recorded scenes with `size` vehicles each, whose motion it computes once."""
 
     def __init__(self, scenarios: Sequence[TargetTest], world: RecordedWorld, size: int) -> None:
         self._world, self._size = world, size
@@ -82,11 +76,11 @@ class TargetObserver:
             ),
             strict=True,
         )
-        coordinates = np.array([motion.frame for motion in motions]).reshape(-1, 4).T.tolist()
-        x, y, along_x, along_y = (_per_vehicle(values, size) for values in coordinates)
+        coordinates = np.array([(*motion.frame.origin, *motion.frame.direction) for motion in motions]).T.tolist()
+        x, y, along_x, along_y = (per_vehicle(values, size) for values in coordinates)
         self._frame = Frame((x, y), (along_x, along_y))
         self._constants = EncounterConstants._make(
-            _per_vehicle(column, size) for column in zip(*(motion.constants for motion in motions), strict=True)
+            per_vehicle(column, size) for column in zip(*(motion.constants for motion in motions), strict=True)
         )
         length = max(map(len, absences))
         self._target = [_table(column, length) for column in zip(*targets, strict=True)]
@@ -120,7 +114,7 @@ def observer_of(points: Sequence[Point], world: DrivenWorld) -> SceneObserver | 
 
 
 def encounter_of(points: Sequence[Point], trace: Trace) -> Encounter:
-    """The geometry of all encounters, from which the metrics are computed."""
+    """The geometry of the encounters at all points, from which the metrics are computed."""
     if len(points) == 1:
         return points[0].scenario.encounter(trace)
     size = trace.speed.shape[1] // len(points)
@@ -128,8 +122,8 @@ def encounter_of(points: Sequence[Point], trace: Trace) -> Encounter:
     return Encounter(*(np.concatenate(columns, axis=1) for columns in zip(*encounters, strict=True)))
 
 
-def _per_vehicle(values: Sequence[Any], size: int) -> Any:
-    """The value of all scenes as a scalar if they agree, else the scene's value for each vehicle, shape (K * size,)."""
+def per_vehicle(values: Sequence[Any], size: int) -> Any:
+    """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value if all are equal."""
     return values[0] if all(value == values[0] for value in values) else np.repeat(values, size)
 
 

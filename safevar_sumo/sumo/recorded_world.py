@@ -24,9 +24,7 @@ NUMERICAL_EPS = 0.001
 EXTENT_MARGIN = 0.01
 """Margin of the extents [m]; an actor outside its extent is not checked for a collision."""
 PARALLEL_COSINE = 1 - 1e-9
-"""Smallest absolute cosine of the angle between two parallel vehicles; vehicles in opposite directions are parallel
-too.
-"""
+"""Smallest absolute cosine of the angle between two parallel vehicles, which may drive in opposite directions."""
 
 
 def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
@@ -38,25 +36,27 @@ def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) 
 
 
 class RecordedWorld:
-    """K recorded scenes of one road with `size` vehicles in each, and the methods of `SumoWorld` for these K * size
-    vehicles. Scenarios see the first scene; all its actors move as recorded, so that commands to them have no effect.
+    """K recorded scenes of one road with `size` vehicles in each, and the methods of `SumoWorld` for all vehicles.
+
+    Scenarios see the first scene. All actors move as recorded, so that commands to them have no effect.
     """
 
     def __init__(self, recordings: Sequence[Recording], size: int) -> None:
-        self.recordings, self._vut, self._size = recordings, recordings[0], size
-        self.n, self.step_length, self.sample = size * len(recordings), self._vut.step_length, 0
-        self.lane, self.lane_of, self.person_width = self._vut.lane, self._vut.lane_of, self._vut.person_width
-        self.vehicle_length = self._vut.vehicle_length
-        self.walk = self.drive = self.turn_back = self._vut.walk
+        self.recordings, self._size = recordings, size
+        self._scene = recordings[0]  # road and vehicle under test are the same in all
+        self.n, self.step_length, self.sample = size * len(recordings), self._scene.step_length, 0
+        self.lane, self.lane_of, self.person_width = self._scene.lane, self._scene.lane_of, self._scene.person_width
+        self.vehicle_length = self._scene.vehicle_length
+        self.walk = self.drive = self.turn_back = self._scene.walk  # do nothing
         self._speeds = np.repeat([recording.speed for recording in recordings], size)
         self._lane_number = np.zeros(self.n, dtype=np.intp)
         self._lane_position = np.repeat([recording.start for recording in recordings], size)
-        self._lanes, self._is_frozen = self._vut.way.at(self._lane_number), np.zeros(self.n, dtype=bool)
+        self._lanes, self._is_frozen = self._scene.way.at(self._lane_number), np.zeros(self.n, dtype=bool)
         self._fronts: FloatArray | None = None
         self._struck: dict[int, int] = {}
         """The bodies that vehicles strike in this step, by vehicle: numbers among `_others`, all bodies beside them."""
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
-        self._last_coordinates = self._last_fronts @ self._vut.along
+        self._last_coordinates = self._last_fronts @ self._scene.along
         self._motion, self._sizes = _joined_tracks(recordings)
         self._starts, self._ends = self._extents()
 
@@ -87,18 +87,18 @@ class RecordedWorld:
         self._lane_position = self._lane_position + distances
         self._speeds, self._fronts, self.sample = speeds, None, self.sample + 1
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
-            if (self._lane_number[is_beyond] == len(self._vut.way.end) - 1).any():
+            if (self._lane_number[is_beyond] == len(self._scene.way.end) - 1).any():
                 raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
             self._lane_position = np.where(is_beyond, self._lane_position - self._lanes.end, self._lane_position)
             self._lane_number = self._lane_number + is_beyond
-            self._lanes = self._vut.way.at(self._lane_number)
+            self._lanes = self._scene.way.at(self._lane_number)
 
     def speeds(self) -> FloatArray:
         return self._speeds
 
     def vehicle_positions(self, actor: str) -> FloatArray:
         if actor != VUT:
-            return np.full((self.n, 2), self._vut.tracks[actor].motion[self.sample, :2])
+            return np.full((self.n, 2), self._scene.tracks[actor].motion[self.sample, :2])
         if self._fronts is None:
             self._fronts = self._lanes.positions(self._lane_position)
         return self._fronts
@@ -118,28 +118,27 @@ class RecordedWorld:
         motion, (length, width, is_person) = self._motion[self.sample, scenes, actors], self._sizes[scenes, actors].T
         others = self._others = Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
         is_open = is_open.reshape(-1, self._size)[scenes]
-        checks = (
-            (self._last_fronts, self._last_speeds, is_open & (is_person != 0)[:, np.newaxis]),
-            (self.vehicle_positions(VUT), self._speeds, is_open),
-        )
-        hits = [self._overlap(fronts, candidates, scenes, others, is_person) for fronts, _, candidates in checks]
-        bodies, numbers, vehicles_in_scene = np.argwhere(np.stack(hits, axis=1)).T
+        beside_person = is_open & (is_person != 0)[:, np.newaxis]
+        first_hits = self._overlap(self._last_fronts, beside_person, scenes, others, is_person)
+        second_hits = self._overlap(self.vehicle_positions(VUT), is_open, scenes, others, is_person)
+        # In the order of the bodies, and for each body of the checks, of which `first` takes a vehicle's first hit:
+        bodies, checks, vehicles_in_scene = np.argwhere(np.stack([first_hits, second_hits], axis=1)).T
         vehicles, first = np.unique(scenes[bodies] * self._size + vehicles_in_scene, return_index=True)
-        speeds = np.where(numbers[first] == 0, checks[0][1][vehicles], checks[1][1][vehicles])
+        speeds = np.where(checks[first] == 0, self._last_speeds[vehicles], self._speeds[vehicles])
         self._struck = dict(zip(vehicles.tolist(), bodies[first].tolist(), strict=True))
         return dict(zip(vehicles.tolist(), speeds.tolist(), strict=True))
 
     def _overlap(
         self, fronts: FloatArray, candidates: BoolArray, scenes: IntArray, others: Body, is_person: FloatArray
     ) -> BoolArray:
-        """Which of the candidates, shape (M, size), overlap the M bodies `others` in these scenes: no edge of either
-        rectangle separates them.
+        """Which of the candidates, shape (M, size), overlap the M bodies `others`, which are in these scenes.
 
-        Two parallel vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+        Two rectangles overlap if no edge of either separates them. Two parallel vehicles must overlap by more than a
+        millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         if not np.count_nonzero(candidates):
             return candidates
-        direction, length, width = self._vut.along, self._vut.length, self._vut.width
+        direction, length, width = self._scene.along, self._scene.length, self._scene.width
         normal, other_normals = _left_of(direction), _left_of(others.along)
         cosine, sine = np.abs(others.along @ direction), np.abs(other_normals @ direction)
         min_overlap = np.where((is_person != 0) | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
@@ -158,23 +157,28 @@ class RecordedWorld:
         return candidates
 
     def _extents(self) -> FloatArray:
-        """First and last coordinate of a vehicle's front while the vehicle is beside an actor, with a margin; shape
-        (2, T, K, A) [m].
+        """First and last coordinate, along the way, of a vehicle's front while the vehicle is beside an actor, with a
+        margin; shape (2, T, K, A) [m].
         """
-        (x, y, east, north, _), (length, width, _), (along_x, along_y) = self._motion.T, self._sizes.T, self._vut.along
+        (x, y, east, north, _), (length, width, _), (along_x, along_y) = (
+            self._motion.T,
+            self._sizes.T,
+            self._scene.along,
+        )
         cosine, sine = along_x * east + along_y * north, along_x * north - along_y * east
         middle = along_x * x + along_y * y - cosine * (length[..., np.newaxis] / 2)
         half = (np.abs(cosine) * length[..., np.newaxis] + np.abs(sine) * width[..., np.newaxis]) / 2 + EXTENT_MARGIN
-        return np.array([(middle - half).T, (middle + half + self._vut.length).T])
+        return np.array([(middle - half).T, (middle + half + self._scene.length).T])
 
     def _adjacent_pairs(self, is_open: BoolArray) -> IntArray:
         """Numbers (scene, actor) of the M actors that vehicles of open runs are beside, now or one step ago; shape (M,
         2).
         """
-        coordinates, last_coordinates = self.vehicle_positions(VUT) @ self._vut.along, self._last_coordinates
+        coordinates, last_coordinates = self.vehicle_positions(VUT) @ self._scene.along, self._last_coordinates
         self._last_coordinates = coordinates
         sample = min(self.sample, len(self._starts) - 1)
         starts, ends = self._starts[sample], self._ends[sample]
+        # In most steps no vehicle has come as far as an actor, which is found faster than below.
         if not np.count_nonzero(starts < np.maximum.reduce(coordinates.reshape(-1, self._size), axis=1)[:, np.newaxis]):
             return np.empty((0, 2), dtype=np.intp)
         foremost = np.where(is_open, coordinates, -np.inf).reshape(-1, self._size).max(axis=1)
@@ -185,22 +189,18 @@ class RecordedWorld:
         """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in
         columns.
         """
-        vut, n = self._vut, len(copies)
-        return (
-            Body.behind(
-                self.vehicle_positions(VUT)[copies],
-                np.tile(vut.along, (n, 1)),
-                np.full(n, vut.length),
-                np.full(n, vut.width),
-                self._speeds[copies],
-            ),
-            Body._make(column[[self._struck[copy] for copy in copies]] for column in self._others),
-        )
+        scene, n = self._scene, len(copies)
+        along, length, width = np.tile(scene.along, (n, 1)), np.full(n, scene.length), np.full(n, scene.width)
+        own = Body.behind(self.vehicle_positions(VUT)[copies], along, length, width, self._speeds[copies])
+        struck = [self._struck[copy] for copy in copies]
+        return own, Body._make(column[struck] for column in self._others)
 
 
 def _joined_tracks(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:
-    """The motion of A actors in K scenes, shape (T, K, A, 5), and their lengths, widths and whether they are persons,
-    shape (K, A, 3); NaN after a scene's end, and where a scene has no actor.
+    """The motion of A actors in K scenes, shape (T, K, A, 5); and their lengths, widths and whether they are persons,
+    shape (K, A, 3).
+
+    Both are NaN where a scene has fewer actors; the motion also after a scene's end.
     """
     n_actors = max(len(recording.tracks) for recording in recordings)
     n_samples = max((len(track.motion) for recording in recordings for track in recording.tracks.values()), default=1)

@@ -1,8 +1,7 @@
-"""Scenes that SUMO plays once: if nobody reacts to the vehicle under test, all other actors move identically in every
-simulation.
+"""Scenes that SUMO plays once, as all other actors move identically in every simulation if nobody reacts to the vehicle
+under test.
 
-While SUMO plays a scene, the vehicle under test stays at its start; `recorded_world.py` moves vehicles in the recorded
-scene.
+While SUMO plays a scene, this vehicle stays at its start; `recorded_world.py` moves vehicles in the recorded scene.
 """
 
 from __future__ import annotations
@@ -31,8 +30,10 @@ MAX_RECORDINGS = 4000
 SCENES_FILE = "scenes.msgpack"
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
-
-
+STRAIGHTNESS = 1e-6
+"""Largest difference, on a straight line, between directions of lanes [-] or between an end and the next start [m]."""
+NEXT_LANE, INTERNAL_LANE = 0, 4
+"""Positions in a link of `getLinks`: the lane that it leads to, and the lane on the junction, "" if there is none."""
 NOT_STRAIGHT = "the vehicle under test does not depart in the middle of a lane and drive straight on"
 
 
@@ -49,11 +50,10 @@ class Track(NamedTuple):
 
 
 class LaneSequence(NamedTuple):
-    """The L lanes that the vehicle under test follows, in order, which form a straight line; columns of shape (L,) or
-    (L, 2) [m].
+    """The L lanes of a straight line that the vehicle under test follows, in order; shape (L,) or (L, 2) [m].
 
-    A lane leads from `first` along `vector`. SUMO counts positions on a lane from 0 to `end`; `stretch` is
-    `shape_length` / `end`.
+    A lane's shape leads from `first` along `vector`, over `shape_length`. SUMO counts positions on the lane from 0 to
+    `end`; `stretch` is `shape_length` / `end`.
     """
 
     first: FloatArray
@@ -76,12 +76,14 @@ class LaneSequence(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A recorded scene, in which the vehicle under test departs at position `start` on the first lane of its `way` [m],
-    at `speed` [m/s].
+    """A recorded scene of T samples.
 
-    `length` and `width` are the vehicle's [m], `along` the direction of its way, `lanes` the shapes of all lanes,
-    `first_lanes` each vehicle's first lane. The methods are those of a world of T copies, one for each sample, in which
-    the vehicle under test stands and all other actors move as recorded, so that commands to them have no effect.
+    The vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s]; `length`
+    and `width` are its size [m], `along` is the direction of its way. `lanes` are the shapes of all lanes,
+    `first_lanes` each vehicle's first lane.
+
+    The methods are those of a world of T copies, one for each sample: the vehicle under test stands, and all other
+    actors move as recorded, so that commands to them have no effect.
     """
 
     step_length: float
@@ -157,9 +159,8 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
 def _reason_against_recording(scenario: Scenario) -> str:
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(
-        scenario.network
-    ):  # shipped scenarios know only shipped networks
+    # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 
@@ -213,24 +214,22 @@ def _play(scenario: Scenario, network: Network, options: tuple[str, ...]) -> Rec
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, Engine.LIBSUMO, options) as world:
         world.insert_at_any_speed()
-        api, vut, step = world.api, copied_id(0, VUT), world.step_length
+        api, vehicle, vut = world.api, world.api.vehicle, copied_id(0, VUT)
         way = _way_of(api, vut)
         if way is None:
             return NOT_STRAIGHT
-        start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
-        length, vut_width = world.vehicle_length(VUT), float(api.vehicle.getWidth(vut))
-        vehicles, along = api.vehicle.getIDList(), direction_of(api.vehicle.getAngle(vut))
+        lane_of = {copy_and_name(id_)[1]: copy_and_name(vehicle.getLaneID(id_))[1] for id_ in vehicle.getIDList()}
         return Recording(
-            step_length=step,
-            start=start,
-            speed=speed,
-            length=length,
-            width=vut_width,
+            step_length=world.step_length,
+            start=float(vehicle.getLanePosition(vut)),
+            speed=float(vehicle.getSpeed(vut)),
+            length=world.vehicle_length(VUT),
+            width=float(vehicle.getWidth(vut)),
             way=way,
-            along=along,
+            along=direction_of(vehicle.getAngle(vut)),
             lanes={copy_and_name(id_)[1]: tuple(api.lane.getShape(id_)) for id_ in api.lane.getIDList()},
-            first_lanes={copy_and_name(id_)[1]: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_ in vehicles},
-            tracks=_tracks(scenario, world),
+            first_lanes=lane_of,
+            tracks=_tracks(scenario, world),  # last: it advances the world
         )
 
 
@@ -245,11 +244,10 @@ def _tracks(scenario: Scenario, world: SumoWorld) -> dict[str, Track]:
             if name not in tracks:
                 tracks[name] = Track(np.full((length, 5), np.nan), *world.actor_size(id_))
             tracks[name].motion[sample] = x, y, *direction_of(angle), world.actor_speed(id_)
-        memory = (
-            scenario.move(world, world.step_length, memory)
-            if isinstance(scenario, TargetTest)
-            else scenario.observe(world, world.step_length, memory)[1]
-        )
+        if isinstance(scenario, TargetTest):
+            memory = scenario.move(world, world.step_length, memory)
+        else:
+            _, memory = scenario.observe(world, world.step_length, memory)
         if sample < length - 1:
             world.advance(np.zeros(1))
     return tracks
@@ -261,13 +259,13 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     """
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
-        links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[0]) == edge]
+        links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[NEXT_LANE]) == edge]
         if len(links) != 1:
             return None
-        next_lane, internal_lane = links[0][0], links[0][4]
-        while internal_lane:
-            lanes.append(internal_lane)
-            internal_lane = next(iter(api.lane.getLinks(internal_lane)), ("", "", "", "", ""))[4]
+        next_lane = links[0][NEXT_LANE]
+        while links and links[0][INTERNAL_LANE]:
+            lanes.append(links[0][INTERNAL_LANE])
+            links = api.lane.getLinks(lanes[-1])
         lanes.append(next_lane)
     shapes = [api.lane.getShape(lane) for lane in lanes]
     if api.vehicle.getLateralLanePosition(vut) or any(len(shape) != 2 for shape in shapes):
@@ -276,6 +274,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     vector, lengths = ends - starts, np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
-    if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(starts[1:] - ends[:-1]).max(initial=0.0) > 1e-6:
+    largest_turn, largest_gap = np.abs(direction - direction[0]).max(), np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
+    if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:
         return None
     return LaneSequence(starts, vector, lengths, np.maximum(shape_length, POSITION_EPS) / lengths, shape_length)

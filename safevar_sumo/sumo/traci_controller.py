@@ -92,7 +92,9 @@ class TraciController(Ads):
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the sensed traffic, each vehicle's view, commands and step function, and the first trim."""
+    """The original vehicle, the sensed traffic, each vehicle's view, commands and step function, and the initial trim;
+    the trim is None before the first step.
+    """
 
     nominal: Nominal
     traffic: SensedTraffic
@@ -112,7 +114,11 @@ LEGAL_NUMBERS = (
 
 
 class CommandedSpeed:
-    """A controller's commands, and the acceleration that results from them under SUMO's speed modes."""
+    """A controller's commands, and the acceleration that results from them under SUMO's speed modes.
+
+    A command holds until the next one. `setAcceleration` and `slowDown` change the speed evenly until `_end_time`;
+    then SUMO's own driver takes over.
+    """
 
     LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
 
@@ -124,38 +130,35 @@ class CommandedSpeed:
 
     def command(self, name: str, time: float, speed: float, values: Arguments) -> None:
         """Process a command of the vehicle domain; raises `InputError` if an argument is no legal number."""
-        for argument, value in zip(COMMANDS[name], values, strict=True):
-            may_be_negative = argument == "acceleration" or (
-                value == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-            )
-            if (
-                not math.isfinite(value)
-                or (value < 0 and not may_be_negative)
-                or (argument == "mode" and value not in range(-1, 128))
-            ):
-                raise InputError(f"traci.vehicle.{name}", f"{argument} = {value!r}", LEGAL_NUMBERS)
-        first, *duration = map(float, values)
+        for argument, number in zip(COMMANDS[name], values, strict=True):
+            returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
+            is_legal = math.isfinite(number) and (number >= 0 or argument == "acceleration" or returns_control)
+            if not is_legal or (argument == "mode" and number not in range(-1, 128)):
+                raise InputError(f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS)
+        value, *durations = map(float, values)
         if name == "setSpeedMode":
-            self._mode = self.DEFAULT_MODE if first == SUMO_CONTROL else int(first)
+            self._mode = self.DEFAULT_MODE if value == SUMO_CONTROL else int(value)
         elif name in self._limits:
-            self._limits[name] = first
+            self._limits[name] = value
         elif name == "setSpeed":
-            self._speed, self._end_time = first, time
+            self._speed, self._end_time = value, time
         else:
-            span = max(duration[0], self._step) if name == "slowDown" else duration[0]
-            self._speed, self._end_time = SUMO_CONTROL, time + span
-            self._speed_rate = (first - speed) / span if name == "slowDown" else first
+            is_slowing = name == "slowDown"
+            duration = max(durations[0], self._step) if is_slowing else durations[0]
+            self._speed, self._end_time = SUMO_CONTROL, time + duration
+            self._speed_rate = (value - speed) / duration if is_slowing else value
 
     def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
         """The acceleration by the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
-        accel, decel, max_speed = self._limits.values()
+        decel = self._limits["setDecel"]
         next_speed = sumo_speed if self._speed == SUMO_CONTROL else self._speed
         if time < self._end_time:
             next_speed = speed + self._speed_rate * self._step
         if self._mode & self.LIMIT_TO_SAFE_SPEED and next_speed > sumo_speed:
             next_speed = min(next_speed, max(sumo_speed, speed - decel * self._step))
-        acceleration = (min(next_speed, max_speed) - speed) / self._step
-        acceleration = min(acceleration, accel) if self._mode & self.LIMIT_ACCELERATION else acceleration
+        acceleration = (min(next_speed, self._limits["setMaxSpeed"]) - speed) / self._step
+        if self._mode & self.LIMIT_ACCELERATION:
+            acceleration = min(acceleration, self._limits["setAccel"])
         return max(acceleration, -decel) if self._mode & self.LIMIT_DECELERATION else acceleration
 
 
@@ -182,8 +185,8 @@ def traci_module() -> ModuleType:
 
 
 class _Substitute(ModuleType):
-    """A substitute for traci, or for a domain of it: original constants and classes, functions of the driven
-    vehicle.
+    """A substitute for traci, or for a domain of it: traci's constants and classes, and functions that answer for the
+    driven vehicle.
     """
 
     def __init__(self, real: Value, domain: str = "") -> None:

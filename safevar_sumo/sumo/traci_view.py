@@ -23,7 +23,7 @@ Arguments = tuple[Value, ...]
 Command = Callable[[str, float, float, Arguments], None]
 """Processes a command of the vehicle domain: its name, the time [s], the vehicle's speed [m/s], and its arguments."""
 Values = dict[str, Value]
-"""An actor's values, by function; its length, too."""
+"""What TraCI's functions return of an actor, by function; its length, too."""
 Variables = dict[int, tuple[str, Arguments]]
 """Requested variables, each with its function and that function's arguments after the actor's id."""
 
@@ -38,14 +38,14 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
 }
 """The commands that a controller may give, each with its numeric arguments."""
 LISTS = ("getIDList", "getIDCount")
-MOTION = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
+POSITIONS = ("getPosition", "getPosition3D")
+MOTION = (*POSITIONS, "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
 SENSED: Mapping[str, tuple[str, ...]] = {
     "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
     "person": MOTION,
 }
 """Functions, by domain, that return values of other actors that sensors can measure."""
-CONSTANT = (
-    "getTypeID",
+TYPE_PROPERTIES = (
     "getLength",
     "getWidth",
     "getHeight",
@@ -58,6 +58,7 @@ CONSTANT = (
     "getTau",
     "getMass",
 )
+CONSTANT = ("getTypeID", *TYPE_PROPERTIES)
 """Functions that return properties of actors that are visible at once or follow from the actor's type."""
 OWN = (
     "getLeader",
@@ -113,7 +114,7 @@ CALLS: Mapping[str, tuple[str, ...]] = {
         "getControlledLanes",
         "getControlledLinks",
     ),
-    "vehicletype": (*LISTS, *CONSTANT[1:]),
+    "vehicletype": (*LISTS, *TYPE_PROPERTIES),
     "route": (*LISTS, "getEdges"),
 }
 """The functions that a controller may call, by domain."""
@@ -160,8 +161,10 @@ def refused(domain: str, name: str, problem: str) -> InputError:
 
 
 class Snapshot(NamedTuple):
-    """The traffic at one time: values by function of the vehicle itself, and of other actors by domain and name; the
-    leader with its gap [m].
+    """The traffic at one time.
+
+    `own` are the values of the vehicle under test, empty once it has left the road; `actors` those of other actors, by
+    domain and name; `leader` is the leader with its gap [m].
     """
 
     own: Values
@@ -170,24 +173,26 @@ class Snapshot(NamedTuple):
 
 
 class SensedTraffic:
-    """The traffic around N vehicles in their copies of the network, delayed and limited by the vehicles' sensors."""
+    """The traffic around N vehicles in their copies of the network, delayed and limited by the vehicles' sensors.
+
+    `seen` is what the sensors of each vehicle report now: the first snapshot until the latency is over.
+    """
 
     def __init__(self, world: SumoWorld, step: float) -> None:
         self._world = world
         ages = (world.sensors.latency / step).tolist()
+        # Rounded twice, so that the last bits of a quotient do not decide about half a step:
         self._past = [deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS))) for age in ages]
         self.record_step()
 
     def record_step(self) -> None:
-        """Record the traffic of this step; must be called in every later step. `seen` is what the sensors of each
-        vehicle report now: the first snapshot until the latency is over.
-        """
+        """Record the traffic of this step; must be called in every later step."""
         names: dict[tuple[int, str], list[str]] = defaultdict(list)
         for domain in SENSED:
             for copy, name in map(copy_and_name, getattr(self._world.api, domain).getIDList()):
                 names[copy, domain].append(name)
-        self.seen = []
-        for copy, (past, reach, scale) in enumerate(zip(self._past, *self._world.sensors[1:], strict=True)):
+        self.seen, sensors = list[Snapshot](), self._world.sensors
+        for copy, (past, reach, scale) in enumerate(zip(self._past, sensors.reach, sensors.scale, strict=True)):
             past.append(self._snapshot(copy, names))
             self.seen.append(_limit_to_range(past[0], float(reach), float(scale)))
 
@@ -218,7 +223,8 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     for domain, members in snapshot.actors.items():
         actors[domain] = {}
         for name, values in members.items():
-            length, heading = values["getLength"] * (domain == "vehicle"), math.radians(values["getAngle"])
+            # TraCI's position of a vehicle is that of its front, of a person that of the middle.
+            length, heading = values["getLength"] if domain == "vehicle" else 0.0, math.radians(values["getAngle"])
             front, position = values["getPosition"], own["getPosition"]
             rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
             if min(math.dist(position, front), math.dist(position, rear)) <= reach:
@@ -231,7 +237,7 @@ def _scaled(own: Values, values: Values, scale: float) -> Values:
     """The positions of an actor, with distances from the vehicle itself multiplied by the sensors' scale."""
     return {
         name: tuple(here + scale * (there - here) for here, there in zip(own[name], values[name], strict=True))
-        for name in MOTION[:2]
+        for name in POSITIONS
     }
 
 
@@ -329,14 +335,13 @@ class TraciView:
     def _subscription(self, domain: str, name: str, actor: str = "", *details: Value) -> Value:
         """Subscribe to variables, or return their values, as the sensors report them."""
         if name != "subscribe":
-            subscribed = {key[1]: value for key, value in self._subscriptions.items() if key[0] == domain}
             results = {
-                one: {number: self._query(domain, function, one, *more) for number, (function, more) in values.items()}
-                for one, values in subscribed.items()
-                if one in self._ids(domain)
+                id_: {number: self._query(domain, function, id_, *more) for number, (function, more) in values.items()}
+                for (of_domain, id_), values in self._subscriptions.items()
+                if of_domain == domain and id_ in self._ids(domain)
             }
             return results if name == "getAllSubscriptionResults" else results.get(actor, {})
-        requested, *_, parameters = details
+        requested, *_, parameters = details  # between them: begin and end
         functions = {_constant(name): function for name, function in VARIABLES.items()}
         variables: Variables = {}
         for number in map(_constant, DEFAULT_VARIABLES) if requested is None else requested:

@@ -33,9 +33,7 @@ Api = Any
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along`, the direction, is a unit
-    vector.
-    """
+    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its direction, a unit vector."""
 
     middle: FloatArray
     along: FloatArray
@@ -45,7 +43,7 @@ class Body(NamedTuple):
 
     @classmethod
     def behind(cls, front: FloatArray, along: FloatArray, length: Any, width: Any, speed: FloatArray | float) -> Body:
-        """The body whose front has its middle at `front`, or M of them."""
+        """The body whose front's middle is at `front`, or M such bodies."""
         return cls(front - along * (np.asarray(length)[..., np.newaxis] / 2), along, length, width, speed)
 
     @classmethod
@@ -210,9 +208,7 @@ class SumoWorld:
         return np.array([self.api.person.getPosition(id_) for id_ in self.ids(actor)])
 
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
-        """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the
-        road, by id.
-        """
+        """All actors on the road, by id: x and y of front or person [m], heading clockwise from north [degrees]."""
         domains = (self.api.vehicle, self.api.person)
         return {
             id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
@@ -285,8 +281,9 @@ FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 
 
 class Contacts:
-    """First contacts of N vehicles, `first`; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are
-    collisions.
+    """First contacts of N vehicles, `first`.
+
+    In a Euro NCAP test, where `is_tested`, only contacts of the vehicle's front are collisions.
     """
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
@@ -312,11 +309,13 @@ class Contacts:
 
 
 def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:
-    """The first touches of M pairs of overlapping bodies, if their velocities were constant: the side of the first
-    body, the time since then [s], and how far the other's middle was behind the first one's front [m].
+    """The first touches of M overlapping pairs, a vehicle's own body and another, if their velocities were constant.
+
+    Returns the touched side of the own body, the time since the touch [s], and how far the other body's middle was then
+    behind the own front [m].
 
     Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin
-    a|) / 2 along the first one and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
+    a|) / 2 along the own body and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
     direction and approach each other at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the
     direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
     smaller overlap.
@@ -334,8 +333,9 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     overlap, closing_speed = extent - np.abs(distance), np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
     ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)
-    is_lengthwise = np.where(is_closing.any(axis=0), ages[0] < ages[1], overlap[0] < overlap[1])
-    age = np.where(is_closing.any(axis=0), np.where(is_lengthwise, *ages), 0.0)
+    approaches = is_closing.any(axis=0)
+    is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
+    age = np.where(approaches, np.min(ages, axis=0), 0.0)
     ahead, left = distance > 0
     side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
     return side, age, own.length / 2 - (distance[0] + age * speed[0])
