@@ -9,7 +9,6 @@ import importlib.util
 import json
 import re
 import shlex
-import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,22 +111,6 @@ def test_the_map_of_the_code_names_every_package_and_no_drawing_a_folder_that_is
     assert {path.parent.name for path in package.glob("*/**/__init__.py")} <= set(re.findall(r"\w+", tree))
     there = {path.name for path in (*ROOT.iterdir(), *(ROOT / "tests").iterdir(), *package.rglob("*")) if path.is_dir()}
     assert set(re.findall(r"(?<![\w/])(\w+)/(?=[\s,;`])", tree + drawing)) <= there
-
-
-def test_the_map_for_contributors_has_the_rows_that_import_linter_checks() -> None:
-    (contract,) = (
-        contract
-        for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-        if contract["type"] == "layers"
-    )
-    rows: list[set[str]] = []
-    for line in (ROOT / "CONTRIBUTING.md").read_text().split("```")[1].split("\nsafevar_sumo/\n")[1].splitlines():
-        if re.match(r"  \S", line):
-            shares_row, names = line.startswith("  | "), re.split(r"\s{2,}", line.strip().removeprefix("| "))[0]
-            rows[len(rows) - shares_row :] = [
-                {*(rows[-1] if shares_row else ()), *(name.rstrip("/") for name in names.split(" | "))}
-            ]
-    assert rows == [set(layer.split(" | ")) for layer in contract["layers"]]
 
 
 MENTION = re.compile(r"((?:`[\w.]+`(?:,|\s+and)\s+)*`[\w.]+`)\s+(?:in\s+|of\s+|\()`([\w/]+\.py)`")

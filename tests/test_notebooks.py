@@ -43,11 +43,7 @@ def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
     file = NOTEBOOKS / f"{name}.ipynb"
     notebook = nbformat.read(file, as_version=4)
     nbformat.validate(notebook)
-    assert file.stat().st_size < 500_000
-    assert "subprocess" not in file.read_text()
     assert _shown(notebook) == SHOWN[name]
-    rows = {"rq1": ("| NSGA-II |", "| RS |", "| SafeFuzzer |"), "rq2": ("| RS |", "| SafeFuzzer |")}
-    assert all(row in file.read_text() for row in rows.get(name, ()))
 
 
 def test_stored_outputs_are_of_todays_vehicle() -> None:

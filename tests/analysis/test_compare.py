@@ -114,6 +114,7 @@ def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Pat
     assert f"{counts['only_b_unsafe']} in B only and {counts['both']} in both." in page
     assert f"python -m safevar_sumo compare {dry} {wet}" in page
     refused("report", dry, "--only", "compare", "--out", "it.html", message=("--only: compare needs two results",))
+    refused("report", dry, dry, "--out", "it.html", message=("twice",))
 
 
 def test_systems_that_cannot_be_compared_are_refused(in_tmp: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import errno
 import importlib
 import os
@@ -81,14 +80,6 @@ def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     }
 
 
-def test_errors_of_the_library_speak_of_arguments_and_not_of_flags() -> None:
-    for file in (ROOT / "safevar_sumo").rglob("*.py"):
-        if "cli" not in file.parts:
-            for node in ast.walk(ast.parse(file.read_text())):
-                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id.endswith("Error"):
-                    assert not re.search(r"--[a-z]", re.sub(r"`[^`]*`", "", ast.unparse(node))), f"{file}:{node.lineno}"
-
-
 SUN = CharacteristicSet.of(load_study("sun"))
 
 
@@ -133,9 +124,7 @@ def test_a_gate_refuses_what_is_no_number_of_the_answer(condition: str) -> None:
         ("safety_degree < 99", 3, "failed: safety_degree = "),
         ("safety_degree < 0.1", 0, ""),
         ("safty_degree < 1", 2, "did you mean 'safety_degree'?"),
-        ("safety_degree = 1", 2, "with <, <=, > or >= and a number"),
         ("safety_degree < nan", 2, "with <, <=, > or >= and a number"),
-        ("safety_degree < one", 2, "with <, <=, > or >= and a number"),
     ],
 )
 def test_a_gate_ends_with_code_3(condition: str, code: int, words: str, capfd: pytest.CaptureFixture[str]) -> None:

@@ -127,6 +127,7 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
     frame = pd.read_csv("imported/solutions.csv")
     assert frame["algorithm"].value_counts().to_dict() == {"nsga2": 40, "rs": 40}
     assert "run" not in frame
+    assert "### RQ1" in run("replicate", "imported", "--published", "imported").stdout
     original = CharacteristicSet.of(load_study("sun")).original
     changed = frame.iloc[:, 1:13].to_numpy() != original
     assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, "changes below the threshold are put back"

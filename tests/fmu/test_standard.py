@@ -11,7 +11,6 @@ import numpy as np
 import psutil
 import pytest
 
-import safevar_sumo as sv
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Command
 from safevar_sumo.study import load_study
@@ -250,12 +249,6 @@ def test_an_exported_model_drives_as_the_original(made: Path, name: str) -> None
     np.testing.assert_array_equal(results.outcome, expected.outcome)
     for metric, values in expected.metrics.items():
         np.testing.assert_allclose(results.metrics[metric], values, rtol=0, atol=1e-9, err_msg=metric)
-    traces = [
-        sv.simulate(str(made / f"{one}.toml"), {"mass": 1900.0, "reactionTime": 0.2}).trace
-        for one in ("native_aeb", name)
-    ]
-    assert list(traces[0]) == list(traces[1])
-    np.testing.assert_allclose(traces[1].to_numpy(), traces[0].to_numpy(), rtol=0, atol=1e-9)
 
 
 def growth_of_memory(path: str) -> int:

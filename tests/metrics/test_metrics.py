@@ -38,6 +38,13 @@ def braking_run(speed: float, deceleration: float, gap: float, collision_speed: 
 
 
 RUN = braking_run(10, 5, 12)
+
+
+def meeting(**encounter: np.ndarray) -> SimulationRuns:
+    """The same run with parts of another encounter."""
+    return dataclasses.replace(RUN, encounter=RUN.encounter._replace(**encounter))
+
+
 FIRST_SECOND = RUN.trace.time[:, np.newaxis] < 1.0
 COARSE = MetricsTable(ttc_threshold=2.0, sampling_interval=0.2)
 
@@ -58,12 +65,8 @@ def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
     """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is
     undefined.
     """
-    while_it_lasts = RUN.encounter._replace(in_conflict=FIRST_SECOND)
-    assert value("safety_degree", dataclasses.replace(RUN, encounter=while_it_lasts)) == pytest.approx(
-        4.5, abs=10 * STEP
-    )
-    never = RUN.encounter._replace(in_conflict=RUN.trace.gap < 0)
-    assert np.isnan(value("safety_degree", dataclasses.replace(RUN, encounter=never)))
+    assert value("safety_degree", meeting(in_conflict=FIRST_SECOND)) == pytest.approx(4.5, abs=10 * STEP)
+    assert np.isnan(value("safety_degree", meeting(in_conflict=RUN.trace.gap < 0)))
 
 
 def test_exposed_and_integrated_time_of_even_approach() -> None:
@@ -91,15 +94,7 @@ def test_exposure_is_undefined_on_a_collision() -> None:
 
 
 def test_time_to_collision_ends_with_the_first_standstill() -> None:
-    still = Encounter(
-        RUN.encounter.separation,
-        RUN.encounter.distance,
-        np.ones_like(RUN.encounter.distance),
-        RUN.encounter.in_conflict,
-    )
-    ttc = time_to_collision(
-        SimulationRuns(trace=RUN.trace, encounter=still, outcome=RUN.outcome, collision_speed=RUN.collision_speed)
-    )
+    ttc = time_to_collision(meeting(closing_speed=np.ones_like(RUN.encounter.distance)))
     assert np.all(np.isinf(ttc[RUN.trace.time > 2.0]))
 
 
@@ -132,7 +127,7 @@ def test_samples_that_are_not_active_do_not_count(name: str) -> None:
 
 
 def test_a_distance_below_zero_is_no_time_to_collision() -> None:
-    behind = dataclasses.replace(RUN, encounter=RUN.encounter._replace(distance=RUN.encounter.distance - 20))
+    behind = meeting(distance=RUN.encounter.distance - 20)
     assert np.isinf(time_to_collision(behind)).all()
     assert value("tit", behind) == 0
 
@@ -145,13 +140,13 @@ def test_a_sampling_interval_between_steps_is_refused(interval: float) -> None:
 
 def test_time_to_collision_is_distance_over_closing_speed_and_infinite_while_opening() -> None:
     assert time_to_collision(RUN)[0, 0] == pytest.approx(1.2)
-    opening = dataclasses.replace(RUN, encounter=RUN.encounter._replace(closing_speed=-RUN.encounter.closing_speed))
+    opening = meeting(closing_speed=-RUN.encounter.closing_speed)
     assert np.isinf(time_to_collision(opening)).all()
     assert value("tet", opening) == 0
 
 
 def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
-    level = dataclasses.replace(RUN, encounter=RUN.encounter._replace(distance=2.0 * RUN.encounter.closing_speed))
+    level = meeting(distance=2.0 * RUN.encounter.closing_speed)
     moving = np.count_nonzero(RUN.encounter.closing_speed[:, 0] > 0)
     assert value("tet", level) == pytest.approx(moving * STEP, abs=2 * STEP)
     assert value("tit", level) == pytest.approx(0.0, abs=1e-12)

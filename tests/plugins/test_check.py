@@ -244,14 +244,12 @@ def test_what_is_shipped_passes(study: str) -> None:
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(DEFECTS["out of range"].module)
     (in_tmp / "mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "mine:Mine"\n')
-    for subject, kind in (("mine:Mine", "ads"), ("mine.toml", "study")):
-        report = json.loads(run("check", subject, "--json", expect=1).stdout)
-        assert list(report) == ["subject", "kind", "passed", "findings", "seconds"]
-        assert (report["subject"], report["kind"], report["passed"]) == (subject, kind, False)
-        assert list(report["findings"][0]) == ["check", "file", "line", "expected", "got", "advice"]
-    assert "mine.py:11: contract: returned brake = 100.0 from drive" in run(
-        "check", "mine:Mine", expect=1
-    ).stdout.replace("\n", "")
+    report = json.loads(run("check", "mine.toml", "--json", expect=1).stdout)
+    assert list(report) == ["subject", "kind", "passed", "findings", "seconds"]
+    assert (report["subject"], report["kind"], report["passed"]) == ("mine.toml", "study", False)
+    assert list(report["findings"][0]) == ["check", "file", "line", "expected", "got", "advice"]
+    text = run("check", "mine:Mine", expect=1).stdout.replace("\n", "")
+    assert "mine.py:11: contract: returned brake = 100.0 from drive" in text
     (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
     assert json.loads(run("check", "mine:Mine", "--study", "mine.toml", "--json").stdout)["findings"] == []
 

@@ -170,14 +170,6 @@ def test_ctrl_c_passes(mine: Mine) -> None:
         signal.signal(signal.SIGINT, handler)
 
 
-def test_a_wrong_parameter_is_named_with_the_study_s_file(mine: Mine, folder: Path) -> None:
-    with pytest.raises(InputError, match="nothing"):
-        mine("", "[ads.parameters]\nnothing = 3\n")
-    with pytest.raises(InputError) as caught:
-        assemble(load_study(folder / "mine.toml"))
-    assert str(caught.value).startswith(f"{folder / 'mine.toml'}: ads.parameters.nothing: there is no such key")
-
-
 ARRAYS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
 
 

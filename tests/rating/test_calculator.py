@@ -10,15 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.evaluator import open_evaluator
-from safevar_sumo.analysis.rating.compute import Rating, rate
 from safevar_sumo.analysis.rating.vehicles import RatedVehicle
 from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Rater
-from safevar_sumo.records import CellResults, FloatArray
-from safevar_sumo.study import Study, load_study
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.records import CellResults
 from tests.rating.calculator import Calculator
 
 pytestmark = pytest.mark.slow
@@ -35,11 +31,6 @@ def calculator(tmp_path_factory: pytest.TempPathFactory) -> Calculator:
 @pytest.fixture(scope="module")
 def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return calculator.template(tmp_path_factory.mktemp("template"))
-
-
-def rating_of(study: Study, settings: dict[str, FloatArray]) -> Rating:
-    with open_evaluator(study) as evaluator:
-        return rate(evaluator, settings)
 
 
 def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: Path) -> None:
@@ -109,29 +100,3 @@ def test_the_pages_commands_run_as_typed(
         done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     assert list(tmp_path.glob("scored/*_report.xlsx"))
-
-
-STUDY = load_study("euro_ncap_rating")
-MEMBERS = CharacteristicSet.of(STUDY)
-GAIN = {
-    "treadDepth": 4.2,
-    "brakeTorque": 0.87,
-    "brakeResponse": 0.16,
-    "payload": 200.0,
-    "sensorRange": 56.0,
-    "sensorLatency": 0.16,
-}
-"""The vehicle of docs/rating.md, which has gained a layer since its tread was 5.1 mm deep."""
-
-
-def test_a_layer_may_be_gained_where_its_cell_is_lost() -> None:
-    """The case that docs/rating.md explains, with its numbers."""
-    rating = rating_of(
-        STUDY, {str(tread): MEMBERS.setting({**GAIN, "treadDepth": tread}, "it") for tread in (5.1, 4.2)}
-    )
-    newer, older = rating.vehicles[1:]
-    before, after = (next(test for test in one.tests if test.matrix.name == "CPNCO day") for one in (newer, older))
-    assert [round(one.points, 2) for one in (newer, older)] == [33.64, 32.64]
-    assert [round(one.points[0], 3) for one in (before, after)] == [0.792, 0.667]
-    assert [round(one.points[2], 3) for one in (before, after)] == [0.025, 0.05]
-    assert [one.layers["Trajectory/Heading"] for one in (before, after)] == [False, True]

@@ -17,6 +17,7 @@ from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
 
+STUDY = load_study("euro_ncap_rating")
 PROTOCOL = protocol_of(EURO_NCAP_2026)
 CELLS = PROTOCOL.cells
 N = len(CELLS)
@@ -51,8 +52,9 @@ def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
     ]
 
 
-def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> RatedVehicle:
-    return RatedVehicle(name=name, setting={}, rater=Rater(protocol=PROTOCOL, claims=claims or {}), cells=cells)
+def rated(cells: CellResults, claims: dict[str, list[str]] | None = None, **changes: float) -> RatedVehicle:
+    setting = {name: row.original for name, row in STUDY.vehicle.characteristics.items()} | changes
+    return RatedVehicle(name="it", setting=setting, rater=Rater(protocol=PROTOCOL, claims=claims or {}), cells=cells)
 
 
 def points_of(cells: CellResults, claims: dict[str, list[str]] | None = None) -> Points:
@@ -125,20 +127,14 @@ def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() ->
 
 def test_a_claim_is_shown_as_a_claim() -> None:
     claimed = rated(results(), claims={"CPNA": ["Type"]})
-    sentences = Rating(study=load_study("euro_ncap_rating"), vehicles=[claimed]).failed_layers
+    sentences = Rating(study=STUDY, vehicles=[claimed]).failed_layers
     assert sentences[0] == "Robustness layers claimed, not simulated: CPNA: Type."
 
 
 def test_the_verdict_names_what_is_lost_and_where() -> None:
     impact = np.full(N, np.nan)
     impact[numbers("CPNCO", "standard", "night")] = 40.0
-    result = Rating(
-        study=load_study("euro_ncap_rating"), vehicles=[rated(results()), rated(results(impact), "variant")]
-    )
-    result.vehicles[0].__dict__["setting"] = {
-        name: row.original for name, row in result.study.vehicle.characteristics.items()
-    }
-    result.vehicles[1].__dict__["setting"] = {**result.vehicles[0].setting, "treadDepth": 3.0}
+    result = Rating(study=STUDY, vehicles=[rated(results()), rated(results(impact), treadDepth=3.0)])
     assert result.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
     assert result.verdict.endswith(" of them in CPNCO by night.")
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))

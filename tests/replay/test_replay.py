@@ -93,12 +93,10 @@ def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -
     figure = draw_comparison(comparison)
     trace = comparison.runs.trace
     for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
-        for row, line in zip(
-            comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False
-        ):
+        drives = [line.get_xydata().tolist() for line in axis.lines if len(line.get_xdata()) > 9]
+        for row in comparison.rows:
             end = comparison.moments[row].end + 1
-            assert list(line.get_xdata()) == list(trace.time[:end])
-            assert list(line.get_ydata()) == list(values[:end, row])
+            assert np.column_stack([trace.time, values[:, row]])[:end].tolist() in drives
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert all(any(comparison.verdict(row) in text for text in words) for row in (0, 1))
     assert all(change in figure.get_suptitle() for change in comparison.changes)
@@ -191,13 +189,9 @@ def test_the_same_bytes_twice(
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
     assert (tmp_path / f"a.{kind}").stat().st_size < 1_000_000
     if kind == "gif":
-        with Image.open(tmp_path / "a.gif") as image:
-            durations = []
-            for frame in range(image.n_frames):
-                image.seek(frame)
-                durations.append(image.info["duration"])
         seconds = lay_out_scene(comparison).sample_count * comparison.runs.trace.step
-        assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
+        with Image.open(tmp_path / "a.gif") as image:
+            assert image.n_frames == pytest.approx(seconds / 0.25, abs=2), "it lasts as long as the drive"
     if kind == "mp4":
         assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 

@@ -42,6 +42,14 @@ class Drive(NamedTuple):
         return round(time / self.step)
 
 
+def prepare(
+    model: str, settings: np.ndarray, road: float = 1.0, step: float = STEP, grade: float = 0.0, wet: bool = False
+) -> Any:
+    """The constants of vehicles with these settings, shape (N, n)."""
+    values = dict(zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    return SYSTEMS[model].vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)
+
+
 def drive(
     model: str,
     settings: np.ndarray,
@@ -56,14 +64,13 @@ def drive(
     """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the
     initial speed [m/s].
     """
-    system = SYSTEMS[model]
-    values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = system.vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)
-    states = [_rolling(system.vehicle.at_rest(prepared), prepared, rolling)]
+    vehicle = SYSTEMS[model].vehicle
+    prepared = prepare(model, settings, road, step, grade, wet)
+    states = [_rolling(vehicle.at_rest(prepared), prepared, rolling)]
     for k in range(round(duration / step)):
         throttle, brake = pedals(round(k * step, 9))
         command = Command(np.zeros(len(settings)) + throttle, np.zeros(len(settings)) + brake)
-        states.append(system.vehicle.advance(prepared, states[-1], command))
+        states.append(vehicle.advance(prepared, states[-1], command))
     return Drive(prepared, states, step)
 
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from safevar_sumo.records import GRAVITY, Command, Observation
 from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, Carla
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
-from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original
+from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original, prepare
 
 
 def prepared(model: str, **changes: float) -> object:
@@ -38,9 +38,7 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
     # The values of sun are fitted.
     vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
-    p = vehicle.prepare(
-        {member.name: np.full(1, float(member.original)) for member in SYSTEMS["carla"].characteristics}, 1.0, STEP
-    )
+    p = prepare("carla", original("carla"))  # of which shifting reads the engine's maximum alone
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
@@ -242,12 +240,11 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
 
 
 def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
-    vehicle, population = carla(), ends("carla", "radius")
-    values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(population.T), strict=True))
-    prepared = vehicle.prepare(values, 1.0, STEP)
-    nothing = np.zeros(5)
-    seen, _ = vehicle.sense(
-        prepared, vehicle.at_rest(prepared), Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0)
+    vehicle, population, nothing = carla(), ends("carla", "radius"), np.zeros(5)
+    scene, constants = (
+        Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0),
+        prepare("carla", population),
     )
+    seen, _ = vehicle.sense(constants, vehicle.at_rest(constants), scene)
     assert np.all(np.diff(seen.gap) < 0)
     assert np.interp(35.5, population[:, 10], seen.gap) == pytest.approx(8.0, rel=1e-3)

@@ -8,9 +8,7 @@ import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -34,6 +32,7 @@ from tests.vehicles.runs import (
     full_throttle,
     half_throttle,
     original,
+    prepare,
 )
 
 MODELS = sorted(VEHICLES)
@@ -178,15 +177,15 @@ def sensed_gaps(model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Five values of a characteristic, and the gaps that such vehicles report while an obstacle comes nearer at 10 m/s;
     shape (T, 5).
     """
-    vehicle, population, names = SYSTEMS[model].vehicle, ends(model, name), SYSTEMS[model].characteristics.names
-    prepared = vehicle.prepare(dict(zip(names, np.ascontiguousarray(population.T), strict=True)), 1.0, STEP)
+    vehicle, population = SYSTEMS[model].vehicle, ends(model, name)
+    prepared = prepare(model, population)
     state, gaps, nothing = vehicle.at_rest(prepared), [], np.zeros(5)
     for k in range(240):
         gap = np.full(5, 130.0 - 10 * k * STEP)
         observation = Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0)
         seen, state = vehicle.sense(prepared, state, observation)
         gaps.append(seen.gap)
-    return population[:, names.index(name)], np.stack(gaps)
+    return population[:, SYSTEMS[model].characteristics.names.index(name)], np.stack(gaps)
 
 
 @pytest.mark.parametrize("model", ["sumo", "worn"])
@@ -210,21 +209,14 @@ def test_a_drive_that_reaches_two_speeds_of_the_tables_has_an_acceleration() -> 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 
 
-def moving(model: str, settings: np.ndarray, speed: float, grade: float = 0.0, road: float = 1.0) -> tuple[object, Any]:
-    system = SYSTEMS[model]
-    values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = system.vehicle.prepare(values, road, STEP, slope_of(np.full(len(settings), grade)))
-    return prepared, system.vehicle.at_start(prepared, np.full(len(settings), speed))
-
-
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize(("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)])
 def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: float) -> None:
-    prepared, state = moving(model, original(model), kmh / 3.6, grade)
-    before, pedals = state, Command(state.throttle, state.brake)
+    vehicle, prepared = SYSTEMS[model].vehicle, prepare(model, original(model), grade=grade)
+    before = state = vehicle.at_start(prepared, np.full(1, kmh / 3.6))
     assert state.speed == pytest.approx(kmh / 3.6)
     for _ in range(200):
-        state = SYSTEMS[model].vehicle.advance(prepared, state, pedals)
+        state = vehicle.advance(prepared, state, Command(before.throttle, before.brake))
     for name in ("speed", "wheel_speed", "engine_speed", "engine_rpm", "gear", "traction_torque"):
         if hasattr(state, name):
             assert getattr(state, name) == pytest.approx(getattr(before, name), rel=1e-12), name
@@ -232,22 +224,18 @@ def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: fl
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(model: str) -> None:
-    prepared, state = moving(model, original(model), 10.0, grade=12.0, road=0.03)
-    assert SYSTEMS[model].vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1))).speed < 10
+    vehicle, prepared = SYSTEMS[model].vehicle, prepare(model, original(model), grade=12.0, road=0.03)
+    state = vehicle.at_start(prepared, np.full(1, 10.0))
+    assert vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1))).speed < 10
 
 
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path) -> None:
-    chosen = load_study(study)
-    folder = tmp_path / "net"
-    shutil.copytree(NETWORKS / chosen.scenario.model, folder)
-    traffic = folder / "traffic.rou.xml"
+    traffic = tmp_path / "net" / "traffic.rou.xml"
+    shutil.copytree(NETWORKS / load_study(study).scenario.model, traffic.parent)
     head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
     traffic.write_text(head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1))
-    scenario = msgspec.structs.replace(
-        chosen.scenario, parameters={**chosen.scenario.parameters, "network": str(folder)}
-    )
-    system = assemble(msgspec.structs.replace(chosen, scenario=scenario))
+    system = assemble(load_study(study, scenario={"parameters": {"network": str(traffic.parent)}}))
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, "no jump in the first step, whatever the system commands"
