@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -43,12 +44,28 @@ MAX_PAIRS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far characteristics may go: each by itself (`alone`), two together (`pairs`, None if not requested), and all
-    (`joint`).
+    """How far characteristics may go: each by itself, two together, and all together.
 
-    `limits` are those that the user specified, `together` the box with them, None without limits or without a box;
-    `first_failures` are evaluations of what fails first beyond the limit of a characteristic, by name. `trade` is the
-    curve of two characteristics, None if not requested.
+    Attributes
+    ----------
+    original
+        The evaluation of the original vehicle.
+    alone
+        A scan of each characteristic.
+    pairs
+        The planes of two characteristics; None if not requested.
+    joint
+        The largest safe box that is the same share of every domain.
+    no_verdict
+        Why simulations tell nothing about the driving system; "" if they do.
+    limits
+        The limits that the user specified, by characteristic.
+    together
+        The largest safe box in which the limits are reached; None without limits, and if no box is sought.
+    first_failures
+        Evaluations of what fails first beyond the limit of a characteristic, by name.
+    trade
+        The trade-off of two characteristics; None if not requested.
     """
 
     study: Study
@@ -65,17 +82,22 @@ class Tolerance:
 
     @property
     def sheet(self) -> LimitsSheet:
-        """The limits sheet."""
+        """The limits sheet: all together are in the box with the specified limits, else in the proportional box."""
         rows, factor, points = [], self.joint.factor, assemble(self.study).points
-        for scan, one in ((scan, scan.characteristic) for scan in self.alone):
-            widths = one.original - one.lower, one.upper - one.original
-            run = self.first_failures.get(one.name)
-            together = (one.original - factor * widths[0], one.original + factor * widths[1]) if factor else None
+        for scan in self.alone:
+            item = scan.characteristic
+            run = self.first_failures.get(item.name)
+            interval = None
+            if self.together is not None:
+                interval = self.together.box[item.name]
+            elif factor:
+                below, above = item.original - item.lower, item.upper - item.original
+                interval = item.original - factor * below, item.original + factor * above
             rows.append(
                 LimitRow(
                     scan=scan,
-                    together=together if self.together is None else self.together.box[one.name],
-                    specified=self.limits.get(one.name),
+                    together=interval,
+                    specified=self.limits.get(item.name),
                     together_is_safe=self.together is None or self.together.kept,
                     first_failure=None if run is None else describe_failure(run, points, self.unsafe),
                 )
@@ -115,15 +137,17 @@ class Tolerance:
         columns += ["safe_from", "safe_to", "margin_from", "margin_to", "unsafe", "not_simulated"]
         rows = [
             (
-                *(one.name, one.unit, one.original, one.lower, one.upper),
+                *attrgetter("name", "unit", "original", "lower", "upper")(scan.characteristic),
                 *(*(scan.safe or (None, None)), *scan.margins, scan.unsafe, scan.intervals("not_simulated")),
             )
-            for scan, one in ((scan, scan.characteristic) for scan in self.alone)
+            for scan in self.alone
         ]
         return pd.DataFrame(rows, columns=columns)
 
     def to_dict(self) -> JsonObject | list[JsonObject]:
-        """The JSON of `tolerance`; with limits a list that ends with the limits' records, and at last the trade-off."""
+        """The JSON of `tolerance`: a record; with limits, a list of it, the limits' records, the box with the limits,
+        and the trade-off.
+        """
         record = {
             "study": self.study.name,
             **driven_entry(self.no_verdict),
@@ -168,8 +192,8 @@ class Tolerance:
         table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"), title=title)
         for pair in worst[:MAX_PAIRS]:
             nearest = ", ".join(f"{name} {value:.5g}" for name, value in (pair.nearest or {}).items())
-            lost = pair.not_simulated_share
-            failed = f" ({100 * lost:.1f} % could not be simulated)" if lost else ""
+            share = pair.not_simulated_share
+            failed = f" ({100 * share:.1f} % could not be simulated)" if share else ""
             table.add_row(" with ".join(pair.characteristics), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
         yield table
         if len(worst) > MAX_PAIRS:
@@ -181,13 +205,15 @@ class Tolerance:
             subject = f"{', '.join(box.characteristics)} together, the others as in the original"
         if not box.factor:
             return f"{subject}: no box around the original is safe."
-        failed = f", and {box.failed} could not be simulated" if box.failed else ""
-        which = f"settings in the box{' that satisfy the constraints' if self.study.constraints else ''} are unsafe"
+        failed, or_failed = "", ""
+        if box.failed:
+            failed, or_failed = f", and {box.failed} could not be simulated", " or cannot be simulated"
+        feasible = " that satisfy the constraints" if self.study.constraints else ""
         return (
             f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its "
             f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
-            f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of all {which}"
-            f"{' or cannot be simulated' if failed else ''}."
+            f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of all settings in the "
+            f"box{feasible} are unsafe{or_failed}."
         )
 
     def figure(self) -> Figure:
@@ -214,58 +240,58 @@ def _scan_table(scans: Sequence[OneAtATimeScan]) -> WholeTable:
     shown = [state for state in states if state == "unsafe" or any(scan.intervals(state) for scan in scans)]
     heads = ("original", "safe from", "to", "SD at the ends", *(states[state] for state in shown))
     table = WholeTable("characteristic", title="Each alone, all others as in the original", right=heads)
-    for scan, one in ((scan, scan.characteristic) for scan in scans):
+    for scan in scans:
+        item = scan.characteristic
         cells = ["nowhere", "nowhere", "-"]
         if scan.safe is not None:
             cells = [
-                f"{value:.5g} ({(value - one.original) / abs(one.original):+.1%})"
-                f"{'*' if value in (one.lower, one.upper) else ''}"
+                f"{value:.5g} ({(value - item.original) / abs(item.original):+.1%})"
+                f"{'*' if value in (item.lower, item.upper) else ''}"
                 for value in scan.safe
             ]
             cells.append(" / ".join(map(two_decimals, scan.margins)))
         cells += [", ".join(f"{low:.5g} to {high:.5g}" for low, high in scan.intervals(state)) for state in shown]
-        table.add_row(f"{one.name} [{one.unit}]", f"{one.original:g}", *(cell or "nowhere" for cell in cells))
+        table.add_row(f"{item.name} [{item.unit}]", f"{item.original:g}", *(cell or "nowhere" for cell in cells))
     return table
 
 
 def _across_fits_in_words(scans: Sequence[OneAtATimeScan]) -> Iterator[str]:
     """How far the ends of the safe intervals depend on the fit; nothing without fits."""
-    moving, sets = [], max((scan.across_fits.sets for scan in scans if scan.across_fits), default=0)
-    for one, across in ((scan.characteristic, scan.across_fits) for scan in scans):
-        moving += [
-            f"the safe interval of {one.name} {word} {one.text(low)} to {one.text(high)}{one.suffix}"
-            for word, (low, high) in zip(("begins at", "ends at"), across.range if across else (), strict=False)
-            if one.text(low) != one.text(high)
-        ]
-    if sets:
+    across_fits = {scan.characteristic: scan.across_fits for scan in scans if scan.across_fits}
+    differences = [
+        f"the safe interval of {item.name} {verb} {item.text(low)} to {item.text(high)}{item.suffix}"
+        for item, ends in across_fits.items()
+        for verb, (low, high) in zip(("begins at", "ends at"), ends.range, strict=True)
+        if item.text(low) != item.text(high)
+    ]
+    if across_fits:
+        sets = max(ends.sets for ends in across_fits.values())
         fits = f"With {sets} vehicle models that fit the published data about as well,"
-        yield f"{fits} {'; '.join(moving) or 'all safe intervals are the same'}."
+        yield f"{fits} {'; '.join(differences) or 'all safe intervals are the same'}."
 
 
 def _losses_in_words(scan: OneAtATimeScan) -> str:
-    """A sentence on the values at which a characteristic alone costs points."""
+    """A sentence on the values from which on a characteristic alone costs points."""
     name, suffix = scan.characteristic.name, scan.characteristic.suffix
     any_loss, whole_point = scan.first_loss(), scan.first_loss(WHOLE_POINT_LOSS)
     if any_loss is None:
         return f"{name}: costs no points anywhere in its domain."
-    first = (
-        f"the first point is lost at {whole_point:.5g}{suffix}"
-        if whole_point is not None
-        else "it never costs a whole point"
-    )
+    first = "it never costs a whole point"
+    if whole_point is not None:
+        first = f"the first point is lost at {whole_point:.5g}{suffix}"
     least = f"the minimum is {min((scan.points or {}).values()):.2f} points"
     return f"{name}: points are lost from {any_loss:.5g}{suffix} on; {first}; {least}."
 
 
 def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
-    characteristic, profile = scan.characteristic, scan.profile.set_index("value")[column]
+    item, profile = scan.characteristic, scan.profile.set_index("value")[column]
     axis.plot(profile, color=BLUE, linewidth=1.2)
     for low, high in scan.unsafe:
         axis.axvspan(low, high, facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
-    axis.plot(characteristic.original, profile[characteristic.original], marker="o", color="black", markersize=4)
+    axis.plot(item.original, profile[item.original], marker="o", color="black", markersize=4)
     if column == SAFETY_DEGREE and profile.min() <= 0:
         axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
-    axis.set_xlim(characteristic.lower, characteristic.upper)
-    axis.set_title(escape_dollars(characteristic.name), fontsize=FONT_SIZE)
-    axis.set_xlabel(f"[{as_formula(characteristic.unit)}]")
+    axis.set_xlim(item.lower, item.upper)
+    axis.set_title(escape_dollars(item.name), fontsize=FONT_SIZE)
+    axis.set_xlabel(f"[{as_formula(item.unit)}]")
     axis.locator_params(axis="x", nbins=4)

@@ -33,12 +33,22 @@ MIN_FACTOR = 1e-6
 
 
 class SafeBox(NamedTuple):
-    """A box around the original, `factor` times as wide as the domain; no setting of a random sample in it is unsafe.
+    """A box around the original that is the same share of every domain; no setting of a random sample in it is unsafe.
 
-    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed`
-    of the `samples` settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested.
-    Only `characteristics` vary; the others keep their original values. If no box is safe, because the original or a
-    setting arbitrarily near to it is unsafe, `factor` is 0 and the bound is 1.
+    Attributes
+    ----------
+    factor
+        The box's share of the way from the original to either end of the domain; 0 if no box is safe, because the
+        original or a setting arbitrarily near to it is unsafe.
+    confidence, unsafe_at_most
+        With this confidence, at most this share of all settings in the box is unsafe or cannot be simulated; 1 if no
+        box is safe.
+    samples, failed
+        Number of settings in the sample, and of those that could not be simulated, which count as unsafe in the bound.
+    attempts
+        Number of boxes tested.
+    characteristics
+        The characteristics that vary; the others keep their original values.
     """
 
     factor: float = 0.0
@@ -55,8 +65,9 @@ def find_safe_box(
 ) -> SafeBox:
     """The largest safe box, in which `columns` vary, around an original vehicle that is safe itself.
 
-    The box ends before all of `unsafe_settings`, shape (K, n), each the nearest of its line. From the unsafe solutions
-    of a search, `known`, shape (L, n), it shrinks as from unsafe settings that it finds itself.
+    The box ends before all of `unsafe_settings`, shape (K, n), each of which is the nearest unsafe one in its
+    direction. Then it shrinks before the unsafe solutions of a search, `known`, shape (L, n), as before unsafe settings
+    that it finds itself.
 
     Notes
     -----
@@ -75,15 +86,15 @@ def find_safe_box(
         shares = np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0)
         return np.asarray(np.max(shares, axis=1, initial=0.0))
 
-    def shrunk(found: FloatArray) -> float:
-        """The factor of a box that ends before all unsafe settings found on the straight ways from the original to some
-        of these.
+    def shrunk(settings: FloatArray) -> float:
+        """The factor of a box that ends before the first unsafe settings on the lines from the original to the nearest
+        of these unsafe settings.
         """
-        nearest = found[np.argsort(factors_of(found), kind="stable")[:MAX_LINES]]
+        nearest = settings[np.argsort(factors_of(settings), kind="stable")[:MAX_LINES]]
         starts = np.tile(original, (len(nearest), 1))
         shares, _ = find_boundary_shares(evaluator, starts, nearest, unsafe, stage="nearest unsafe settings")
-        edges = settings_on_lines(starts, nearest, shares[:, np.newaxis])[:, 0]
-        return min(factor, float(np.min(factors_of(edges)))) * STEP_BACK
+        first_unsafe = settings_on_lines(starts, nearest, shares[:, np.newaxis])[:, 0]
+        return min(factor, float(np.min(factors_of(first_unsafe)))) * STEP_BACK
 
     if len(unsafe_settings):
         factor = min(factor, STEP_BACK * float(np.min(factors_of(unsafe_settings))))
@@ -94,17 +105,17 @@ def find_safe_box(
         ends, stage = (original - factor * below, original + factor * above), f"all within {factor:.0%} of the domain"
         for point_count in (FIRST_SEARCH_POINTS, SECOND_SEARCH_POINTS):
             settings = sobol_and_corners(evaluator, columns, ends, point_count, seed + search)
-            found = settings[unsafe.of(evaluator.evaluate(settings, stage))]
-            if len(found):
+            unsafe_inside = settings[unsafe.of(evaluator.evaluate(settings, stage))]
+            if len(unsafe_inside):
                 break
-        else:
+        else:  # no search found anything
             attempt += 1
-            found, samples, failed, at_most = sample_box(
+            unsafe_inside, samples, failed, at_most = sample_box(
                 evaluator, columns, unsafe, ends, attempt, (seed, attempt), stage
             )
-            if not len(found):
+            if not len(unsafe_inside):
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, at_most)
-        factor, search = shrunk(found), search + 1
+        factor, search = shrunk(unsafe_inside), search + 1
     return SafeBox(attempts=attempt)
 
 
@@ -124,7 +135,8 @@ def sobol_and_corners(
 ) -> FloatArray:
     """Settings at Sobol points of a box, and at as many of its corners, where all changes add up."""
     sobol = sobol_points(number, len(columns), seed)
-    return settings_in_box(evaluator, columns, *ends, np.concatenate([sobol, np.round(sobol)]))
+    corners = np.round(sobol)
+    return settings_in_box(evaluator, columns, *ends, np.concatenate([sobol, corners]))
 
 
 def random_settings(
@@ -135,8 +147,12 @@ def random_settings(
     number: int,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Feasible settings drawn uniformly in a box; fewer than `number` where few are feasible, an error where none
-    is.
+    """Feasible settings drawn uniformly in a box; fewer than `number` if few are feasible.
+
+    Raises
+    ------
+    InputError
+        If none of the drawn settings is feasible.
     """
     settings = evaluator.region.draw_feasible(
         lambda count: settings_in_box(evaluator, columns, lower, upper, rng.random((count, len(columns)))), number
@@ -160,7 +176,9 @@ def sample_box(
     seed: Sequence[int],
     stage: str,
 ) -> tuple[FloatArray, int, int, float]:
-    """The unsafe ones of random settings in a box, the numbers of all and of those that could not be simulated, and the
+    """Test a box with random settings.
+
+    Returns the unsafe settings, the number of all settings, the number of those that could not be simulated, and a
     bound: at most this share of all settings in the box is unsafe or cannot be simulated.
 
     Notes
@@ -175,8 +193,9 @@ def sample_box(
     number = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
     settings = random_settings(evaluator, columns, *ends, number, np.random.default_rng(seed))
     evaluations = evaluator.evaluate(settings, stage)
-    found = settings[unsafe.of(evaluations)]
+    unsafe_settings = settings[unsafe.of(evaluations)]
     failed = int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
-    bad, number = len(found) + failed, len(settings)
-    at_most = float(scipy.stats.beta.ppf(1 - error_probability, bad + 1, number - bad)) if bad < number else 1.0
-    return found, number, failed, at_most
+    at_most, not_safe, safe = 1.0, len(unsafe_settings) + failed, len(settings) - len(unsafe_settings) - failed
+    if safe:
+        at_most = float(scipy.stats.beta.ppf(1 - error_probability, not_safe + 1, safe))
+    return unsafe_settings, len(settings), failed, at_most

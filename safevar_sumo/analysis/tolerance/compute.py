@@ -24,10 +24,10 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 
 def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: Evaluator) -> Tolerance:
-    """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the
-    vehicle.
+    """Find how far the characteristics of a study may go.
 
-    The joint box holds none of the unsafe solutions of results.
+    The filter is not applied, as the question is about the vehicle. The joint box holds none of the unsafe solutions of
+    results.
 
     Raises
     ------
@@ -45,22 +45,22 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
         _check_names("trade", options.trade, list(study.vehicle.characteristics))
     original = evaluator.evaluate_original()
     unsafe = evaluator.choose_criterion(options.unsafe, source, original)
-    # A box of a rated study would take thousands of whole test matrices. Characteristics that constraints tie so
-    # closely that hardly any setting in a box is feasible are refused first.
+    # A box of a rated study would take thousands of whole test matrices.
     needs_box = not unsafe.of(original)[0] and not is_rated(study)
-    if needs_box:
+    if needs_box:  # drawing a setting raises the error if hardly any is feasible, before the long scans
         bounds = evaluator.characteristics.lower, evaluator.characteristics.upper
         random_settings(evaluator, columns, *bounds, 1, np.random.default_rng(study.search.seed))
     scans = scan_with_sets(evaluator, columns, unsafe, 0 if is_rated(study) else options.fits)
     pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
     box, together = SafeBox(), None
     if needs_box:
-        changes = [{one.characteristic.name: end} for one in scans for interval in one.unsafe for end in interval]
+        changes = [{scan.characteristic.name: end} for scan in scans for interval in scan.unsafe for end in interval]
         changes += [pair.nearest for pair in pairs or [] if pair.nearest]
-        found, known = settings_of(evaluator.characteristics, changes), _known_settings(source, columns, unsafe)
-        box = find_safe_box(evaluator, columns, unsafe, found, known)
+        unsafe_settings = settings_of(evaluator.characteristics, changes)
+        known = _known_settings(source, columns, unsafe)
+        box = find_safe_box(evaluator, columns, unsafe, unsafe_settings, known)
         if limits:
-            together = find_joint_limits(evaluator, columns, unsafe, limits, scans, found, known)
+            together = find_joint_limits(evaluator, columns, unsafe, limits, scans, unsafe_settings, known)
     return Tolerance(
         study=study,
         unsafe=unsafe,
@@ -92,10 +92,10 @@ def _check_names(source: str, chosen: Sequence[str], names: Sequence[str]) -> No
 
 
 def _limits_of(study: Study, options: ToleranceOptions, columns: Sequence[int]) -> dict[str, Limit]:
-    """The limits of the characteristics that vary."""
+    """The limits of the study and of the options for the characteristics that vary."""
     rows = study.vehicle.characteristics
-    varied, typed = [list(rows)[column] for column in columns], limits_of(options.limits, rows)
-    for name in typed:
+    varied = [list(rows)[column] for column in columns]
+    for name in limits_of(options.limits, rows):
         if name not in varied:
             raise unknown_name("limits", f"{name} does not vary with these --characteristics", name, varied)
     return {name: limit for name, limit in limits_of(options.limits, rows, study.limits).items() if name in varied}
@@ -110,14 +110,15 @@ def settings_of(characteristics: CharacteristicSet, changes: Sequence[Mapping[st
 def _first_failures(
     evaluator: Evaluator, scans: Sequence[OneAtATimeScan], together: JointLimits | None
 ) -> dict[str, Evaluations]:
-    """What fails first beyond the limits of each characteristic: alone or, where nothing does, with the others at their
-    limits.
+    """What fails first beyond the limits of each characteristic: alone or, if it is safe alone, with the others at
+    their limits.
     """
     beyond = {} if together is None else dict(together.beyond)
-    for one in (scan for scan in scans if scan.unsafe):
-        name, original = one.characteristic.name, one.characteristic.original
-        nearest = min(np.ravel(one.unsafe).tolist(), key=lambda end: (abs(end - original), end))
-        (beyond[name],) = settings_of(evaluator.characteristics, [{name: nearest}])
+    for scan in scans:
+        if scan.unsafe:
+            name, original = scan.characteristic.name, scan.characteristic.original
+            nearest = min(np.ravel(scan.unsafe).tolist(), key=lambda end: (abs(end - original), end))
+            (beyond[name],) = settings_of(evaluator.characteristics, [{name: nearest}])
     if not beyond:
         return {}
     evaluations = evaluator.evaluate(np.array(list(beyond.values())), "what fails first")
@@ -125,10 +126,10 @@ def _first_failures(
 
 
 def _known_settings(source: Study | Case, columns: Sequence[int], unsafe: Unsafe) -> FloatArray:
-    """The distinct unsafe solutions of results that change no other characteristics than these, shape (K, n)."""
+    """The distinct unsafe solutions of results that change no other characteristics than `columns`, shape (K, n)."""
     if isinstance(source, Study):
         return np.zeros((0, len(source.vehicle.characteristics)))
     names, original = list(source.characteristics.names), source.characteristics.original
     settings = source.solutions[unsafe.rows(source.solutions)][names].to_numpy(dtype=float)
-    others = np.setdiff1d(np.arange(len(names)), columns)
-    return np.unique(settings[(settings == original)[:, others].all(axis=1)], axis=0)
+    other_columns = np.setdiff1d(np.arange(len(names)), columns)
+    return np.unique(settings[(settings == original)[:, other_columns].all(axis=1)], axis=0)

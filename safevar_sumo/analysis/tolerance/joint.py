@@ -15,32 +15,54 @@ from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
 PARTS, ROUNDS = 8, 3
-"""Parts into which each round divides the share of a box that is safe."""
-WIDER = 0.04
+"""Number of parts into which each of so many rounds divides the interval from a safe to an unsafe size of a box."""
+WIDENING = 0.04
 """Share of its domain by which a side of the box is widened in search of something unsafe."""
+MAX_GAP = 0.05
+"""Something unsafe, or the end of the domain, is at most this share of the domain beyond a free side: one widening, and
+a little more.
+"""
 SLAB_POINTS = 64
 """Number of Sobol points, and of corners, at which the room beside a box is searched."""
 MAX_ROUNDS = 40
 """Maximum number of boxes that are searched for something unsafe, and of tests."""
 DEVIATIONS = tuple(0.35 * 0.8**k for k in range(14))
 """Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
-PROPOSALS, SIMULATED_CORNERS, LEAST_GAIN = 4096, 64, 0.01
-"""Boxes proposed in a round, the number of corners simulated, and the gain in volume (logarithm) that is worth it."""
+PROPOSALS = 4096
+"""Number of boxes that a round of the random search proposes."""
+SIMULATED_CORNERS = 64
+"""Approximate number of corners that such a round simulates; each box is simulated at all known corners."""
+LEAST_GAIN = 0.01
+"""Least gain in the logarithm of the volume for which a proposed box is simulated."""
 CAUSES_PER_ROUND = 4
 """Approximate number of unsafe settings of a search whose causes are sought."""
 ROUNDING = 1e-9
 """Rounding errors of a setting, as a share of the domain."""
+LEAST_SHARE = 1e-9
+"""Share of the domain as which a smaller width counts, so that its logarithm is finite."""
 STAGE = "limits together"
 
 
 class JointLimits(NamedTuple):
-    """The largest box found by relative volume in which the characteristics of `fixed` reach their limits.
+    """The largest box that was found, by relative volume, in which the characteristics of `fixed` reach their limits.
 
-    Of `samples` settings drawn at random in it, `unsafe` are unsafe, and `failed` could not be simulated; at most the
-    share `at_most` of all settings in it are unsafe or cannot be simulated, with 95 % confidence. `kept` is false if
-    settings within the limits are unsafe, all other characteristics as in the original; the box then leaves those no
-    room. It holds `known_unsafe_inside` unsafe solutions of results. `beyond` are unsafe settings, by the
-    characteristic that is just beyond the box, while all others are in it.
+    Attributes
+    ----------
+    fixed
+        The limits.
+    box
+        The interval of each characteristic.
+    samples, unsafe, failed
+        Number of settings drawn at random in the box, of the unsafe ones, and of those that could not be simulated.
+    at_most
+        With 95 % confidence, at most this share of all settings in the box is unsafe or cannot be simulated.
+    known_unsafe_inside
+        Number of unsafe solutions of results in the box.
+    kept
+        False if settings within the limits are unsafe, all other characteristics as in the original. In the box, the
+        other characteristics then keep their original values.
+    beyond
+        An unsafe setting by the name of a characteristic: this one is just beyond the box, all others are in it.
     """
 
     fixed: Mapping[str, Limit]
@@ -75,11 +97,25 @@ class JointLimits(NamedTuple):
         )
 
 
-class _Search:
-    """The search for a box: its sides are extents below and above the original, shape (2, n), in the table's units.
+class _BoxSearch:
+    """The search for a box, which is given by its sides: the extents below and above the original, shape (2, n), in the
+    units of the characteristics.
 
-    `room` are the extents of the domain, `free` the sides that may move. `found` are unsafe settings, which no box may
-    hold. `corners` were unsafe in some box, as -1, 0 or 1 for each characteristic.
+    Attributes
+    ----------
+    width
+        Widths of the domains; 0 for a characteristic that does not vary.
+    is_free
+        Which sides may move; the others are at their limits.
+    longest
+        The longest that each side may be: a free one to the end of its domain, a fixed one to its limit.
+    fixed
+        The box whose free sides are 0.
+    unsafe_settings
+        Settings that no box may hold.
+    corners
+        Corners that were unsafe in some box: for each characteristic -1, the lower end of the box, 0, the original, or
+        1, the upper end.
     """
 
     def __init__(
@@ -88,19 +124,21 @@ class _Search:
         columns: Sequence[int],
         unsafe: Unsafe,
         limits: Mapping[str, Limit],
-        found: FloatArray,
+        unsafe_settings: FloatArray,
     ) -> None:
-        self.evaluator, self.columns, self.unsafe, self.found = evaluator, columns, unsafe, found
-        one = evaluator.characteristics
-        self.original, varied = one.original, np.isin(range(len(one)), columns)
-        self.room = np.stack([one.original - one.lower, one.upper - one.original]) * varied
-        self.width, self.free = self.room.sum(axis=0), self.room > 0
-        for column, limit in ((one.names.index(name), limit) for name, limit in limits.items()):
+        self.evaluator, self.columns, self.unsafe, self.unsafe_settings = evaluator, columns, unsafe, unsafe_settings
+        members = evaluator.characteristics
+        self.original, is_varied = members.original, np.isin(range(len(members)), columns)
+        self.longest = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
+        self.width, self.is_free = self.longest.sum(axis=0), self.longest > 0
+        for name, limit in limits.items():
+            column = members.names.index(name)
             for side, value in enumerate((limit.at_least, limit.at_most)):
                 if value is not None:
-                    self.free[side, column], self.room[side, column] = False, abs(value - one.original[column])
-        self.fixed = np.where(self.free, 0.0, self.room)
-        self.corners, self.searches = list[FloatArray](), 0
+                    self.is_free[side, column] = False
+                    self.longest[side, column] = abs(value - self.original[column])
+        self.fixed = np.where(self.is_free, 0.0, self.longest)
+        self.corners, self.search_count = list[FloatArray](), 0
 
     def ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.original - sides[0], self.original + sides[1]
@@ -111,119 +149,128 @@ class _Search:
         extents = np.stack([-change, change], axis=1) - ROUNDING * self.width
         return np.array([(extents <= sides).all(axis=(1, 2)) for sides in boxes]).reshape(len(boxes), len(settings))
 
+    def known_inside(self, sides: FloatArray) -> FloatArray:
+        """The known unsafe settings that a box holds."""
+        inside: FloatArray = self.unsafe_settings[self.hold(sides[np.newaxis], self.unsafe_settings)[0]]
+        return inside
+
     def find_unsafe(self, settings: FloatArray) -> FloatArray:
-        """Those of the settings that are unsafe; no later box holds one of them."""
-        found = settings[self.unsafe.of(self.evaluator.evaluate(settings, STAGE))]
-        self.found = np.concatenate([self.found, found])
-        return found
+        """Simulate settings and return the unsafe ones; no later box holds one of them."""
+        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, settings[is_unsafe]])
+        return settings[is_unsafe]
 
     def corner_settings(self, boxes: FloatArray) -> FloatArray:
         """Settings at the C known corners of B boxes, shape (B, C, n)."""
-        corners = np.array(self.corners)
-        return self.original + np.where(corners > 0, boxes[:, 1:], corners * boxes[:, :1])
+        corners, below, above = np.array(self.corners), boxes[:, :1], boxes[:, 1:]
+        return self.original + np.where(corners > 0, above, corners * below)  # a corner of 0 is the original
 
     def points(self, sides: FloatArray, number: int) -> FloatArray:
         """New Sobol points and corners of a box."""
-        self.searches += 1
-        seed = self.evaluator.study.search.seed + self.searches
+        self.search_count += 1
+        seed = self.evaluator.study.search.seed + self.search_count
         return sobol_and_corners(self.evaluator, self.columns, self.ends(sides), number, seed)
 
     def attack(self, sides: FloatArray) -> FloatArray:
-        """Unsafe settings of a box: known ones, else those of a search."""
-        known = self.found[self.hold(sides[np.newaxis], self.found)[0]]
+        """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
+        known = self.known_inside(sides)
         return known if len(known) else self.find_unsafe(self.points(sides, FIRST_SEARCH_POINTS))
 
-    def learn(self, found: FloatArray) -> None:
-        """Add the corners at which some unsafe settings lie: as few changes as possible, all others as in the
-        original.
+    def learn(self, settings: FloatArray) -> None:
+        """Add corners that are unsafe, from some of these unsafe settings.
+
+        As many changes of a setting as possible are undone while it stays unsafe; the directions of the remaining
+        changes are the corner. Unsafe settings on the way become known, too.
         """
-        for setting in found[:: max(len(found) // CAUSES_PER_ROUND, 1)]:
+        for setting in settings[:: max(len(settings) // CAUSES_PER_ROUND, 1)]:
             cause = setting
-            for column in np.flatnonzero((setting != self.original) & self.free.any(axis=0)):
-                less = cause.copy()
-                less[column] = self.original[column]
-                cause = less if len(self.find_unsafe(less[np.newaxis])) else cause
+            for column in np.flatnonzero((setting != self.original) & self.is_free.any(axis=0)):
+                smaller = cause.copy()
+                smaller[column] = self.original[column]
+                cause = smaller if len(self.find_unsafe(smaller[np.newaxis])) else cause
             corner = np.sign(cause - self.original)
             if not any((corner == known).all() for known in self.corners):
                 self.corners.append(corner)
 
     def are_safe(self, boxes: FloatArray) -> BoolArray:
-        """Which of B boxes, shape (B, 2, n), are safe at the known corners and hold no unsafe setting found so far."""
-        are_open: BoolArray = ~np.any(self.hold(boxes, self.found), axis=1)
-        settings = self.corner_settings(boxes[are_open])
-        is_unsafe = self.unsafe.of(self.evaluator.evaluate(np.concatenate([self.found[:0], *settings]), STAGE))
+        """Which of B boxes, shape (B, 2, n), are safe at the known corners and hold no known unsafe setting."""
+        is_safe: BoolArray = ~np.any(self.hold(boxes, self.unsafe_settings), axis=1)
+        settings = self.corner_settings(boxes[is_safe])
+        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings.reshape(-1, len(self.original)), STAGE))
         is_unsafe = is_unsafe.reshape(settings.shape[:2])
-        self.found = np.concatenate([self.found, settings[is_unsafe]])
-        are_open[are_open] = ~is_unsafe.any(axis=1)
-        return are_open
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, settings[is_unsafe]])
+        is_safe[is_safe] = ~is_unsafe.any(axis=1)
+        return is_safe
 
     def largest(self, start: FloatArray) -> FloatArray:
         """A box within `start` that is safe at the known corners, as large as a random search makes it.
 
-        The box first shrinks as a whole. Boxes nearby that are larger and hold no unsafe setting known so far are then
-        simulated at their corners.
+        `start` first shrinks as a whole until it is safe. Larger boxes nearby are then simulated at their corners.
         """
         rng = np.random.default_rng((self.evaluator.study.search.seed, 2))
         low, high = 0.0, 1.0
         for _ in range(ROUNDS):
-            shares = low + (high - low) * np.arange(1, PARTS + 1) / PARTS
-            is_safe = self.are_safe(np.where(self.free, shares[:, np.newaxis, np.newaxis] * start, start))
-            first = PARTS if is_safe.all() else int(np.argmin(is_safe))
-            low, high = (float(shares[first - 1]) if first else low), float(shares[min(first, PARTS - 1)])
-        best = np.where(self.free, low * start, start)
+            shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
+            boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * start, start)
+            safe_count = int(np.argmin([*self.are_safe(boxes), False]))  # of the smallest boxes
+            low, high = shares[safe_count], shares[min(safe_count + 1, PARTS)]
+        best = np.where(self.is_free, low * start, start)
         for deviation in DEVIATIONS:
             shape = (PROPOSALS, *start.shape)
-            steps = rng.normal(0.0, deviation, shape) * (rng.random(shape) < 0.5)
-            boxes = np.where(self.free, np.clip(best + steps * self.width, 0.0, start), start)
+            steps = rng.normal(0.0, deviation, shape) * (rng.random(shape) < 0.5)  # about half of the sides move
+            boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
             boxes = boxes[self._log_volume(boxes) > self._log_volume(best) + LEAST_GAIN]
-            boxes = boxes[~np.any(self.hold(boxes, self.found), axis=1)]
+            boxes = boxes[~np.any(self.hold(boxes, self.unsafe_settings), axis=1)]
             boxes = boxes[: max(SIMULATED_CORNERS // len(self.corners), 1)]
-            safe = boxes[self.are_safe(boxes)]
-            if len(safe):
-                best = safe[int(np.argmax(self._log_volume(safe)))]
+            boxes = boxes[self.are_safe(boxes)]
+            if len(boxes):
+                best = boxes[int(np.argmax(self._log_volume(boxes)))]
         return best
 
     def _log_volume(self, boxes: FloatArray) -> FloatArray:
         """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
         shares = np.divide(boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0)
-        return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))
+        return np.asarray(np.sum(np.log(np.maximum(shares, LEAST_SHARE)), axis=-1))
 
     def widened(self, sides: FloatArray) -> FloatArray:
-        """The box with each free side as wide as it can be: something unsafe or the domain's end is at most 5 % of the
-        domain away.
+        """Move each free side of a box outwards in steps, until something unsafe is in the next step or the domain
+        ends.
         """
-        for side in zip(*np.nonzero(self.free & (sides < self.room)), strict=True):
-            while sides[side] < self.room[side]:
+        for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
+            while sides[side, column] < self.longest[side, column]:
                 wider = sides.copy()
-                wider[side] = min(sides[side] + WIDER * self.width[side[1]], self.room[side])
+                length = sides[side, column] + WIDENING * self.width[column]
+                wider[side, column] = min(length, self.longest[side, column])
                 slab = np.concatenate([self.corner_settings(wider[np.newaxis])[0], self.points(wider, SLAB_POINTS)])
-                slab[:, side[1]] = self.ends(wider)[side[0]][side[1]]
-                if self.hold(wider[np.newaxis], self.found).any() or len(self.find_unsafe(slab)):
+                slab[:, column] = self.ends(wider)[side][column]
+                if len(self.known_inside(wider)) or len(self.find_unsafe(slab)):
                     break
                 sides = wider
         return sides
 
     def best(self, start: FloatArray) -> FloatArray:
-        """The largest box within `start` in which no search finds anything unsafe, and that cannot be widened; without
-        room beside the limits if searches go on finding something.
+        """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be.
+
+        If every search finds something, the box keeps all but the fixed sides at the original.
         """
         for _ in range(MAX_ROUNDS):
             sides = self.largest(start)
-            if not len(found := self.attack(sides)):
+            unsafe_inside = self.attack(sides)
+            if not len(unsafe_inside):
                 sides = self.widened(sides)
-                found = self.attack(sides)
-            if not len(found):
+                unsafe_inside = self.attack(sides)
+            if not len(unsafe_inside):
                 return sides
-            self.learn(found)
+            self.learn(unsafe_inside)
         return self.fixed
 
     def beyond(self, sides: FloatArray) -> dict[str, FloatArray]:
-        """An unsafe setting for each characteristic that alone is beyond a box, by at most 5 % of its domain."""
+        """For each characteristic, an unsafe setting in which it alone is beyond a box, by at most `MAX_GAP`."""
         beyond = dict[str, FloatArray]()
-        for side, column in zip(*np.nonzero(self.free & (sides < self.room)), strict=True):
+        for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
             wider = sides.copy()
-            wider[side, column] += 0.05 * self.width[column]
-            for setting in self.found[self.hold(wider[np.newaxis], self.found)[0]][:1]:
+            wider[side, column] += MAX_GAP * self.width[column]
+            for setting in self.known_inside(wider)[:1]:
                 beyond.setdefault(self.evaluator.characteristics.names[column], setting)
         return beyond
 
@@ -244,35 +291,41 @@ def find_joint_limits(
 
     Notes
     -----
-    The largest box is sought by a random search among those that are safe at known corners, within what is safe alone;
-    at first, only the corner of the sides with the smallest margins is known. A search then attacks the box, at Sobol
-    points and at other corners. The causes of what is unsafe, as few changes as possible, are further corners, and the
-    largest box is sought anew, until no search finds anything. Sides that could go further are widened, and the box is
-    tested with independent settings (`sample_box`).
+    A random search seeks the largest box that is safe at known corners, within what is safe alone. At first only one
+    corner is known, which joins the sides with the smaller margins. A search then attacks the box, at Sobol points and
+    at other corners. The causes of what is unsafe, as few changes as possible, are further corners, and the largest box
+    is sought anew, until no search finds anything. Sides that could go further are widened. At last independent
+    settings test the box (`sample_box`).
     """
     unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
-    search = _Search(unverified, columns, unsafe, limits, np.concatenate([unsafe_settings, known]))
-    start, corner = search.room.copy(), np.zeros(len(search.original))
+    search = _BoxSearch(unverified, columns, unsafe, limits, np.concatenate([unsafe_settings, known]))
+    start, corner = search.longest.copy(), np.zeros(len(search.original))
     for column, scan in zip(columns, scans, strict=True):
-        (low, high), (low_margin, high_margin) = scan.safe or search.original[[column, column]], scan.margins
-        alone = search.original[column] - low, high - search.original[column]
-        start[:, column] = np.where(search.free[:, column], np.minimum(start[:, column], alone), start[:, column])
-        corner[column] = -1.0 if low_margin is not None and (high_margin is None or low_margin < high_margin) else 1.0
+        original = search.original[column]
+        (low, high), (low_margin, high_margin) = scan.safe or (original, original), scan.margins
+        safe_alone = np.minimum(start[:, column], (original - low, high - original))
+        start[:, column] = np.where(search.is_free[:, column], safe_alone, start[:, column])
+        corner[column] = 1.0
+        if low_margin is not None and (high_margin is None or low_margin < high_margin):
+            corner[column] = -1.0
     search.corners.append(corner)
     for attempt in range(1, MAX_ROUNDS + 1):
+        # The last attempt tests the limits without room for the others, and counts them as not kept.
         kept = attempt < MAX_ROUNDS and not len(search.attack(search.fixed))
         sides = search.best(start) if kept else search.fixed
         ends, stream = search.ends(sides), (evaluator.study.search.seed, 1, attempt)
         stage = "test of the limits together"
-        found, samples, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
-        if not (kept and len(found)):
+        unsafe_samples, samples, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
+        if not kept or not len(unsafe_samples):
             break
-        search.found = np.concatenate([search.found, found])
-        search.learn(found[:1])
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_samples])
+        search.learn(unsafe_samples[:1])
     # Ends of the domain are stated exactly, not through their distance from the original.
     box = {
-        one.name: (max(low, one.lower), min(high, one.upper))
-        for one, low, high in zip(evaluator.characteristics, *(end.tolist() for end in ends), strict=True)
+        item.name: (max(low, item.lower), min(high, item.upper))
+        for item, low, high in zip(evaluator.characteristics, *(end.tolist() for end in ends), strict=True)
     }
-    inside = int(search.hold(sides[np.newaxis], known).sum())
-    return JointLimits(limits, box, samples, len(found), failed, at_most, inside, kept, search.beyond(sides))
+    known_inside = int(search.hold(sides[np.newaxis], known).sum())
+    return JointLimits(
+        limits, box, samples, len(unsafe_samples), failed, at_most, known_inside, kept, search.beyond(sides)
+    )

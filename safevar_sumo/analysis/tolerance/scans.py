@@ -5,7 +5,7 @@ values.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -22,21 +22,34 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
 """Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
-PARTS_PER_ROUND, ROUNDS, RATED_ROUNDS = 8, 4, 1
-"""Parts into which a round divides each interval with a change of state; rounds, and rounds in a rated study."""
+PARTS_PER_ROUND = 8
+"""Number of parts into which a round divides each interval with a change of state."""
+ROUNDS, RATED_ROUNDS = 4, 1
+"""Number of such rounds; fewer in a rated study."""
 WHOLE_POINT_LOSS = 1 - 1e-6
 """A loss of more rating points than this counts as a whole point."""
 POINT_ROUNDING = 1e-9
 """A loss of at most so many rating points is a rounding error."""
 GRID_VALUES = 21
 """Number of values of each of two characteristics, evenly spaced over its domain, ends included."""
-PARTS_PER_SIDE, PLANE_ROUNDS, MAX_SQUARES = 4, 4, 12
-"""Search for the nearest unsafe setting of a plane: number of parts of a divided square's side, of rounds (down to a
-5120th of the domain), and maximum number of squares divided in each round."""
+PLANE_ROUNDS = 4
+"""Number of rounds of the search for a plane's nearest unsafe setting (down to a 5120th of the domain)."""
+MAX_SQUARES = 12
+"""Maximum number of squares that such a round divides."""
+PARTS_PER_SIDE = 4
+"""Number of parts into which it divides the side of a square."""
 
 
 class EndsAcrossFits(NamedTuple):
-    """Ranges of the two ends of a safe interval over `sets` parameter sets of [spread], the study's own among them."""
+    """How the ends of a safe interval move with the parameter sets of a study's table [spread].
+
+    Attributes
+    ----------
+    sets
+        Number of sets in which the interval exists, the study's own among them.
+    range
+        The least and the greatest lower end, and the least and the greatest upper end.
+    """
 
     sets: int
     range: tuple[Interval, Interval]
@@ -63,8 +76,9 @@ class OneAtATimeScan:
     def intervals(self, state: str) -> list[Interval]:
         """All intervals of a state, each from its first to its last value."""
         states = self.profile["state"]
-        sections = self.profile["value"][states == state].groupby((states != states.shift()).cumsum())
-        return list(zip(sections.min().tolist(), sections.max().tolist(), strict=True))
+        interval_numbers = (states != states.shift()).cumsum()  # the number rises where the state changes
+        intervals = self.profile["value"][states == state].groupby(interval_numbers)
+        return list(zip(intervals.min().tolist(), intervals.max().tolist(), strict=True))
 
     @property
     def safe(self) -> Interval | None:
@@ -90,16 +104,17 @@ class OneAtATimeScan:
             return None
         return dict(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
 
-    def first_loss(self, points: float = 0.0) -> float | None:
-        """The value nearest to the original that loses more than `points` rating points; None if no value does."""
-        kept, original = self.points or {}, self.characteristic.original
-        limit = kept.get(original, math.nan) - points - POINT_ROUNDING
-        return min(
-            (value for value in kept if kept[value] < limit), key=lambda value: abs(value - original), default=None
-        )
+    def first_loss(self, loss: float = 0.0) -> float | None:
+        """The value nearest to the original that loses more than `loss` rating points; None if no value does."""
+        points, original = self.points or {}, self.characteristic.original
+        allowed = points.get(original, math.nan) - loss - POINT_ROUNDING
+        values = [value for value in points if points[value] < allowed]
+        return min(values, key=lambda value: abs(value - original), default=None)
 
     def to_dict(self) -> JsonObject:
-        """An entry of `alone` in `tolerance --json`; in a rated study with points, and where points are first lost."""
+        """An entry for a characteristic in `alone` of `tolerance --json`; in a rated study with points, and where they
+        are first lost.
+        """
         rating_entries = (
             {}
             if self.points is None
@@ -126,43 +141,49 @@ class OneAtATimeScan:
 def scan(
     evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, others: FloatArray | None = None
 ) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, one at a time; each with the other values of its row of `others`, shape
-    (K, n), by default as in the original.
+    """Scan the domains of some characteristics, one at a time.
+
+    While one varies, all other characteristics have the values in its row of `others`, shape (K, n), by default those
+    of the original.
     """
     if others is None:
         others = np.tile(evaluator.characteristics.original, (len(columns), 1))
-    scanned, rated = [evaluator.characteristics.members[column] for column in columns], is_rated(evaluator.study)
-    number = RATED_SCAN_VALUES if rated else SCAN_VALUES
-    values = [np.union1d(np.linspace(one.lower, one.upper, number), one.original) for one in scanned]
+    scanned = [evaluator.characteristics.members[column] for column in columns]
+    number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    values = [np.union1d(np.linspace(item.lower, item.upper, number), item.original) for item in scanned]
     profiles = _evaluate_profiles(evaluator, columns, others, values, unsafe)
-    for _ in range(RATED_ROUNDS if rated else ROUNDS):
+    for _ in range(rounds):
         values = [_values_between_states(profile) for profile in profiles]
         if not any(map(len, values)):
             break
         finer_profiles = _evaluate_profiles(evaluator, columns, others, values, unsafe)
         profiles = [
-            pd.concat(both, ignore_index=True).sort_values("value", ignore_index=True)
-            for both in zip(profiles, finer_profiles, strict=True)
+            pd.concat(coarse_and_fine, ignore_index=True).sort_values("value", ignore_index=True)
+            for coarse_and_fine in zip(profiles, finer_profiles, strict=True)
         ]
-    return [OneAtATimeScan(characteristic=one, profile=profile) for one, profile in zip(scanned, profiles, strict=True)]
+    return [
+        OneAtATimeScan(characteristic=item, profile=profile) for item, profile in zip(scanned, profiles, strict=True)
+    ]
 
 
 def scan_with_sets(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, fits: int) -> list[OneAtATimeScan]:
-    """Scan with the study's own parameters, and with its other sets, whose safe intervals give ranges of the ends."""
-    own, *others = [scan(one, columns, unsafe) for one in evaluator.for_sets(fits) or [evaluator]]
+    """Scan with the study's own parameters, and state how far the ends of the safe intervals move with its other
+    parameter sets.
+    """
+    evaluators = evaluator.for_sets(fits) or [evaluator]
     scans = []
-    for one, *same in zip(own, *others, strict=True):
-        ends = [each.safe for each in (one, *same) if each.safe is not None]
-        if others and ends:
-            lows, highs = zip(*ends, strict=True)
-            across = EndsAcrossFits(len(ends), ((min(lows), max(lows)), (min(highs), max(highs))))
-            one = replace(one, across_fits=across)
-        scans.append(one)
+    for of_characteristic in zip(*(scan(with_set, columns, unsafe) for with_set in evaluators), strict=True):
+        own_scan, intervals = of_characteristic[0], [each.safe for each in of_characteristic if each.safe is not None]
+        if len(evaluators) > 1 and intervals:
+            lows, highs = zip(*intervals, strict=True)
+            ranges = (min(lows), max(lows)), (min(highs), max(highs))
+            own_scan = replace(own_scan, across_fits=EndsAcrossFits(len(intervals), ranges))
+        scans.append(own_scan)
     return scans
 
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:
-    """New values between neighbouring values of different states."""
+    """New values that divide the intervals between neighbouring values of different states."""
     values, states = profile["value"].to_numpy(), profile["state"].to_numpy()
     rows = np.flatnonzero(states[1:] != states[:-1])[:, np.newaxis]
     inner = values[rows] + (values[rows + 1] - values[rows]) * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
@@ -173,11 +194,11 @@ def _evaluate_profiles(
     evaluator: Evaluator, columns: Sequence[int], others: FloatArray, values: Sequence[FloatArray], unsafe: Unsafe
 ) -> list[pd.DataFrame]:
     """The profile of each characteristic at its `values`."""
-    ends = np.cumsum([len(its_values) for its_values in values])[:-1]
+    ends = np.cumsum(list(map(len, values)))[:-1]
     settings = np.concatenate(
         [
-            _settings_with(row, [column], its_values[:, np.newaxis])
-            for row, column, its_values in zip(others, columns, values, strict=True)
+            _settings_with(setting, [column], its_values[:, np.newaxis])
+            for setting, column, its_values in zip(others, columns, values, strict=True)
         ]
     )
     evaluations = evaluator.evaluate(settings, "one characteristic at a time")
@@ -186,7 +207,7 @@ def _evaluate_profiles(
         ["infeasible", "not_simulated", "unsafe"],
         "safe",
     )
-    points = {name: degrees for name, degrees in evaluations.metrics.items() if name == RATING_POINTS.name}
+    points = {name: column for name, column in evaluations.metrics.items() if name == RATING_POINTS.name}
     frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "state": state, **points})
     return [frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)]
 
@@ -219,77 +240,85 @@ class Pair(NamedTuple):
 
 
 def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
-    """The plane of every pair of characteristics, with the plane's unsafe setting nearest to the original."""
+    """Find the unsafe share of the plane of every pair of characteristics, and its unsafe setting nearest to the
+    original.
+    """
     characteristics, planes = evaluator.characteristics, [list(plane) for plane in combinations(columns, 2)]
     axes = np.linspace(characteristics.lower, characteristics.upper, GRID_VALUES).T
     grids = [np.stack(np.meshgrid(*axes[plane], indexing="ij"), axis=-1).reshape(-1, 2) for plane in planes]
 
     def evaluate(values: Sequence[FloatArray], stage: str) -> Evaluations:
-        settings = [_settings_with(characteristics.original, *pair) for pair in zip(planes, values, strict=True)]
+        settings = [
+            _settings_with(characteristics.original, plane, pairs) for plane, pairs in zip(planes, values, strict=True)
+        ]
         return evaluator.evaluate(np.concatenate(settings), stage)
 
     evaluations = evaluate(grids, "two characteristics at a time")
-    is_unsafe, is_valid, is_lost = (
+    is_unsafe, is_valid, is_not_simulated = (
         flags.reshape(len(planes), GRID_VALUES, GRID_VALUES)
         for flags in (unsafe.of(evaluations), evaluations.valid, ~evaluations.valid & ~evaluations.infeasible)
     )
-    searches = [_search_nearest(grid, characteristics, plane) for grid, plane in zip(is_unsafe, planes, strict=True)]
-    values = [next(search) for search in searches]
+    searches = [_NearestSearch(grid, characteristics, plane) for grid, plane in zip(is_unsafe, planes, strict=True)]
     for _ in range(PLANE_ROUNDS):
-        found = unsafe.of(evaluate(values, "nearest unsafe settings"))
-        parts = np.split(found, np.cumsum(list(map(len, values)))[:-1])
-        values = [search.send(part) for search, part in zip(searches, parts, strict=True)]
-    ends = np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)
-    unsafe_area, valid_area, lost_area = (
-        np.sum(np.outer(ends, ends) * flags, axis=(1, 2)) for flags in (is_unsafe, is_valid, is_lost)
+        values = [search.values for search in searches]
+        is_unsafe_value = unsafe.of(evaluate(values, "nearest unsafe settings"))
+        parts = np.split(is_unsafe_value, np.cumsum(list(map(len, values)))[:-1])
+        for search, part in zip(searches, parts, strict=True):
+            search.divide(part.reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1))
+    weights = np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)  # the trapezoidal rule's
+    unsafe_area, valid_area, not_simulated_area = (
+        np.sum(np.outer(weights, weights) * flags, axis=(1, 2)) for flags in (is_unsafe, is_valid, is_not_simulated)
     )
     names = [[characteristics.names[column] for column in plane] for plane in planes]
     return [
         Pair(
             characteristics=names[k],
             unsafe_share=float(unsafe_area[k] / valid_area[k]) if valid_area[k] else 0.0,
-            not_simulated_share=float(lost_area[k] / ends.sum() ** 2),
-            nearest=dict(zip(names[k], nearest[0].tolist(), strict=True)) if len(nearest) else None,
+            not_simulated_share=float(not_simulated_area[k] / weights.sum() ** 2),
+            nearest=next((dict(zip(names[k], row.tolist(), strict=True)) for row in search.nearest), None),
         )
-        for k, nearest in enumerate(values)
+        for k, search in enumerate(searches)
     ]
 
 
-def _search_nearest(
-    grid: BoolArray, characteristics: CharacteristicSet, plane: list[int]
-) -> Generator[FloatArray, BoolArray]:
-    """Find the unsafe setting of a plane nearest to the original, from where its grid is unsafe; distances are in
-    domain widths.
+class _NearestSearch:
+    """The search for the unsafe setting of a plane nearest to the original; distances are in domain widths.
 
-    Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe; at last, after `PLANE_ROUNDS`,
-    yields the setting's values, shape (1, 2), or (0, 2) if there is none. A branch and bound search: a square with an
-    unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest unsafe setting so
-    far; each round divides the `MAX_SQUARES` nearest squares.
+    It is a branch and bound search. A square with an unsafe corner may hold a nearer unsafe setting, if it comes nearer
+    to the original than the nearest unsafe setting so far. Each round divides the `MAX_SQUARES` nearest of these
+    squares.
+
+    Attributes
+    ----------
+    values
+        Values of the two characteristics to evaluate next, shape (K, 2).
+    nearest
+        The nearest unsafe setting so far, shape (1, 2); (0, 2) if there is none.
     """
 
-    def distances(offset: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.sum((offset / width) ** 2, axis=-1)))
+    def __init__(self, grid: BoolArray, characteristics: CharacteristicSet, plane: list[int]) -> None:
+        """Begin with the plane's `grid`: which of its settings are unsafe."""
+        self.original, self.lower = characteristics.original[plane], characteristics.lower[plane]
+        self.width = characteristics.upper[plane] - self.lower
+        # Lower corners of the areas that `values` divide into squares, and the squares' size; at first the whole plane.
+        self.areas, self.size = self.lower[np.newaxis], self.width / (GRID_VALUES - 1)
+        self.values, self.nearest = self.lower + np.argwhere(np.ones_like(grid)) * self.size, np.zeros((0, 2))
+        self.divide(grid[np.newaxis])
 
-    original, lower, upper = (
-        ends[plane] for ends in (characteristics.original, characteristics.lower, characteristics.upper)
-    )
-    width = upper - lower
-    size = width / (GRID_VALUES - 1)
-    values = lower + np.argwhere(np.ones_like(grid)) * size
-    steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
-    nearest, corners, grids = np.zeros((0, 2)), lower[np.newaxis], grid[np.newaxis]
-    for round_number in range(PLANE_ROUNDS + 1):
-        known = np.concatenate([nearest, values[grids.ravel()]])
-        nearest = known[np.argsort(distances(known - original), kind="stable")[:1]]
-        if round_number == PLANE_ROUNDS:
-            break
-        square, i, j = np.nonzero(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
-        corners = corners[square] + np.stack([i, j], axis=1) * size
-        offset = corners - original
-        gaps = distances(np.maximum(np.maximum(offset, -offset - size), 0.0))
+    def divide(self, grids: BoolArray) -> None:
+        """Divide the nearest squares; `grids`, shape (areas, P, P), state which of `values` are unsafe."""
+        known = np.concatenate([self.nearest, self.values[grids.ravel()]])
+        self.nearest = known[np.argsort(self._distances(known - self.original), kind="stable")[:1]]
+        has_unsafe_corner = grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1]
+        area, i, j = np.nonzero(has_unsafe_corner)
+        corners = self.areas[area] + np.stack([i, j], axis=1) * self.size
+        offset = corners - self.original
+        gaps = self._distances(np.maximum(np.maximum(offset, -offset - self.size), 0.0))
         order = np.argsort(gaps, kind="stable")
-        order = order[gaps[order] < np.min(distances(nearest - original), initial=math.inf)][:MAX_SQUARES]
-        corners, size = corners[order], size / PARTS_PER_SIDE
-        values = np.minimum(corners[:, np.newaxis] + steps * size, lower + width).reshape(-1, 2)
-        grids = (yield values).reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)
-    yield nearest
+        is_nearer = gaps[order] < np.min(self._distances(self.nearest - self.original), initial=math.inf)
+        self.areas, self.size = corners[order[is_nearer][:MAX_SQUARES]], self.size / PARTS_PER_SIDE
+        steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
+        self.values = np.minimum(self.areas[:, np.newaxis] + steps * self.size, self.lower + self.width).reshape(-1, 2)
+
+    def _distances(self, offsets: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.sum((offsets / self.width) ** 2, axis=-1)))

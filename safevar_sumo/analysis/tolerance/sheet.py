@@ -26,13 +26,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NONE = "-"
+ROUNDING = 1e-6
+"""Share of a text's last digit by which a value may be off its rounded one, from rounding errors."""
 
 
 def describe_failure(run: Evaluations, points: Sequence[Point], unsafe: Unsafe) -> dict[str, str]:
-    """An unsafe evaluation at its worst point: the point ("" without a matrix), the outcome, and both in words."""
+    """An unsafe evaluation in words: the name of its worst point ("" without a matrix), its outcome, and a
+    description.
+    """
     point = points[0] if run.worst_points is None else points[int(run.worst_points[0])]
     scenario, degree = point.scenario, float(run.f_safe[0])
-    name, speed = point.name, "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
+    name = point.name
+    speed = "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
     if unsafe.points is not None:
         name, text = "", f"the car {unsafe.in_words}"
     elif run.collided[0]:
@@ -46,10 +51,20 @@ def describe_failure(run: Evaluations, points: Sequence[Point], unsafe: Unsafe) 
 
 @dataclass(frozen=True, kw_only=True)
 class LimitRow:
-    """One characteristic: how far it may go alone, by its `scan`, and `together` with all others at their limits.
+    """How far one characteristic may go.
 
-    `specified` is the user's limit, None without one; `together_is_safe` says whether all of these can be reached
-    together. `first_failure` is what fails first beyond the limit, alone or else with the others at their limits.
+    Attributes
+    ----------
+    scan
+        How far it may go alone.
+    together
+        How far it may go together with all others; None if nothing is safe, or no box was sought.
+    specified
+        The user's limit; None without one.
+    together_is_safe
+        Whether all specified limits can be reached together.
+    first_failure
+        What fails first beyond the limit, alone or else with the others at their limits (`describe_failure`).
     """
 
     scan: OneAtATimeScan
@@ -68,8 +83,9 @@ class LimitRow:
         if self.specified is None or self.scan.safe is None:
             return None
         (low, high), limit = self.scan.safe, self.specified
-        ways = [] if limit.at_least is None else [limit.at_least - low]
-        return min(ways if limit.at_most is None else [*ways, high - limit.at_most])
+        below = math.inf if limit.at_least is None else limit.at_least - low
+        above = math.inf if limit.at_most is None else high - limit.at_most
+        return min(below, above)
 
     @property
     def kept(self) -> bool:
@@ -79,12 +95,12 @@ class LimitRow:
 
     def to_dict(self) -> JsonObject:
         """A record of `tolerance --limits --json`."""
-        limit, one = self.specified or Limit(), self.characteristic
+        limit, item = self.specified or Limit(), self.characteristic
         return {
             "limit": {
-                "characteristic": one.name,
-                "unit": one.unit,
-                "original": one.original,
+                "characteristic": item.name,
+                "unit": item.unit,
+                "original": item.original,
                 "alone": list(self.scan.safe or (None, None)),
                 "together": list(self.together or (None, None)),
                 "specified": {"low": limit.at_least, "high": limit.at_most, "source": limit.source},
@@ -95,20 +111,22 @@ class LimitRow:
         }
 
     def texts(self, ends: Interval) -> tuple[str, str]:
-        """Two limits as text, rounded to the safe side; "" where the domain ends."""
-        one, (low, high) = self.characteristic, ends
+        """The ends of an interval as text, rounded to the safe side; "" where the domain ends."""
+        item, (low, high) = self.characteristic, ends
         return (
-            "" if low <= one.lower else safe_text(one, low, upwards=True),
-            "" if high >= one.upper else safe_text(one, high, upwards=False),
+            "" if low <= item.lower else safe_text(item, low, upwards=True),
+            "" if high >= item.upper else safe_text(item, high, upwards=False),
         )
 
     def in_words(self, ends: Interval | None) -> str:
-        """Two limits in words: `from 2.32 mm`, `1 to 2 s`, `whole domain`."""
+        """An interval in words: `from 2.32 mm`, `1 to 2 s`, `whole domain`."""
         if ends is None:
             return "nowhere safe"
         low, high = self.texts(ends)
-        text = f"{low} to {high}" if low and high else f"from {low}" if low else f"up to {high}" if high else ""
-        return f"{text}{self.characteristic.suffix}" if text else "whole domain"
+        if not low and not high:
+            return "whole domain"
+        text = f"{low} to {high}" if low and high else f"from {low}" if low else f"up to {high}"
+        return f"{text}{self.characteristic.suffix}"
 
     @property
     def specified_in_words(self) -> str:
@@ -135,21 +153,24 @@ class LimitRow:
     @property
     def sentence(self) -> str:
         """A sentence for a maintenance manual."""
-        one, failure, alone = self.characteristic, self.first_failure, bool(self.scan.unsafe)
-        name, ends = one.short_name[:1].upper() + one.short_name[1:], self.scan.safe if alone else self.together
+        item, failure, is_unsafe_alone = self.characteristic, self.first_failure, bool(self.scan.unsafe)
+        name = item.short_name[:1].upper() + item.short_name[1:]
+        ends = self.scan.safe if is_unsafe_alone else self.together
         if self.scan.safe is None:
             return f"{name}: the car is unsafe as new."
         if failure is None or ends is None:
-            return f"{name}: nothing in {one.lower:g} to {one.upper:g}{one.suffix} is unsafe alone."
+            return f"{name}: nothing in {item.lower:g} to {item.upper:g}{item.suffix} is unsafe alone."
         words = zip(("at least", "at most"), self.texts(ends), strict=True)
-        keep = " and ".join(f"{word} {text}{one.suffix}" for word, text in words if text)
-        others = "" if alone else " with the other characteristics at their limits,"
-        return f"{name}: keep {keep or f'{one.original:g}{one.suffix}'}; beyond,{others} {failure['description']}."
+        keep = " and ".join(f"{word} {text}{item.suffix}" for word, text in words if text)
+        others = "" if is_unsafe_alone else " with the other characteristics at their limits,"
+        return f"{name}: keep {keep or f'{item.original:g}{item.suffix}'}; beyond,{others} {failure['description']}."
 
     def draw(self, axis: Axes, height: float) -> None:
-        """Draw bars over the domain from 0 to 1, with the values at their ends."""
-        one, specified = self.characteristic, self.specified or Limit()
-        domain = (one.lower, one.upper)
+        """Draw a bar for the limits alone and one for those together, with values at their ends; 0 to 1 is the
+        domain.
+        """
+        item, specified = self.characteristic, self.specified or Limit()
+        domain = (item.lower, item.upper)
         axis.plot([0, 1], [height] * 2, color="0.8", linewidth=1, zorder=1)
         for ends, offset, width, alpha in ((self.scan.safe, 0.2, 11, 0.35), (self.together, -0.36, 5, 1.0)):
             if ends is None:
@@ -157,20 +178,20 @@ class LimitRow:
             places = np.interp(ends, domain, (0, 1))
             axis.plot(places, [height] * 2, color=BLUE, linewidth=width, alpha=alpha, solid_capstyle="butt", zorder=2)
             for text, place, side in zip(self.texts(ends), places, ("left", "right"), strict=True):
-                if text and (offset > 0 or ends != self.scan.safe):
-                    label = f"{text}{as_formula(one.suffix)}"
+                if text and (offset > 0 or ends != self.scan.safe):  # the same values are not written twice
+                    label = f"{text}{as_formula(item.suffix)}"
                     axis.text(place, height + offset, label, ha=side, fontsize=FONT_SIZE - 1.5)
         for value in (specified.at_least, specified.at_most):
             place = np.interp(math.nan if value is None else value, domain, (0, 1))
             axis.plot([place] * 2, [height - 0.3, height + 0.3], color=VERMILION, linewidth=1.5, zorder=3)
-        axis.plot(np.interp(one.original, domain, (0, 1)), height, marker="o", color="black", markersize=4, zorder=4)
+        axis.plot(np.interp(item.original, domain, (0, 1)), height, marker="o", color="black", markersize=4, zorder=4)
 
 
 def safe_text(characteristic: Characteristic, value: float, *, upwards: bool) -> str:
     """A limit as text, rounded upwards or downwards; never beyond the original."""
     digits, original = len(characteristic.text(value).partition(".")[2]), characteristic.original
     scaled = value * 10**digits
-    rounded = (math.ceil(scaled - 1e-6) if upwards else math.floor(scaled + 1e-6)) / 10**digits
+    rounded = (math.ceil(scaled - ROUNDING) if upwards else math.floor(scaled + ROUNDING)) / 10**digits
     is_beyond = rounded > original >= value if upwards else rounded < original <= value
     return f"{original:g}" if is_beyond else f"{rounded:.{digits}f}"
 

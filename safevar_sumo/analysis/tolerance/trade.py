@@ -28,11 +28,17 @@ TRADE_VALUES = 10
 
 @dataclass(frozen=True, kw_only=True)
 class Trade:
-    """How far the `second` characteristic may go at values of the `first`.
+    """How far one characteristic, `second`, may go at values of another one, `first`.
 
-    `curve` has the safe interval of the second around its original by the value of the first, None where there is none.
-    Characteristics of `fixed` are at these limits, and as in the original: the worse of both counts. All others are as
-    in the original.
+    Attributes
+    ----------
+    first, second
+        The two characteristics.
+    fixed
+        The limits of other characteristics. These are at their limits and, in a second computation, as in the original;
+        the smaller interval counts. All further characteristics are as in the original.
+    curve
+        By value of the first, the interval around the original in which the second is safe; None if there is none.
     """
 
     first: Characteristic
@@ -64,8 +70,10 @@ class Trade:
         for value, ends in self.curve.items():
             texts = ["nowhere"] * 2
             if ends is not None:
-                stars = ["*" if end in (second.lower, second.upper) else "" for end in ends]
-                texts = [safe_text(second, ends[k], upwards=k == 0) + stars[k] for k in (0, 1)]
+                texts = [
+                    safe_text(second, end, upwards=upwards) + ("*" if end in (second.lower, second.upper) else "")
+                    for end, upwards in zip(ends, (True, False), strict=True)
+                ]
             table.add_row(safe_text(first, value, upwards=value < first.original), *texts)
         return table
 
@@ -73,38 +81,42 @@ class Trade:
         """The safe values of the second characteristic over those of the first."""
         first, second = self.first, self.second
         figure, ((axis,),) = new_figure(f"{subject}: {second.name} at values of {first.name}", 1, 1, (4.6, 3.4))
-        found = {value: ends for value, ends in self.curve.items() if ends is not None}
-        lows, highs = np.array(list(found.values())).reshape(-1, 2).T
-        axis.vlines(list(found), lows, highs, color=BLUE, linewidth=5, alpha=0.5)
-        axis.plot(list(found), lows, "_", list(found), highs, "_", color=BLUE, clip_on=False)
+        safe = {value: ends for value, ends in self.curve.items() if ends is not None}
+        values, (lows, highs) = list(safe), np.array(list(safe.values())).reshape(-1, 2).T
+        axis.vlines(values, lows, highs, color=BLUE, linewidth=5, alpha=0.5)
+        axis.plot(values, lows, "_", values, highs, "_", color=BLUE, clip_on=False)
         axis.plot(first.original, second.original, "o", color="black", markersize=5, clip_on=False)
-        labels = [f"{escape_dollars(one.name)} [{as_formula(one.unit)}]" for one in (first, second)]
-        axis.set(xlim=(first.lower, first.upper), ylim=(second.lower, second.upper), xlabel=labels[0], ylabel=labels[1])
+        x_label, y_label = (f"{escape_dollars(item.name)} [{as_formula(item.unit)}]" for item in (first, second))
+        axis.set(xlim=(first.lower, first.upper), ylim=(second.lower, second.upper), xlabel=x_label, ylabel=y_label)
         figure.supxlabel("dot: the original vehicle; bars: safe", fontsize=FONT_SIZE)
         return figure
 
 
 def find_trade(evaluator: Evaluator, names: Sequence[str], unsafe: Unsafe, limits: Mapping[str, Limit]) -> Trade:
-    """How far the second of two characteristics may go at values of the first: from its original to where it is unsafe
-    by itself.
+    """Find how far the second of two characteristics may go at values of the first.
+
+    The first goes from its original to where it is unsafe by itself.
     """
     characteristics = evaluator.characteristics
     first, second = (characteristics.names.index(name) for name in names)
     fixed = {name: limit for name, limit in limits.items() if name not in names}
-    corners = list(
-        product(*(filter(lambda end: end is not None, (one.at_least, one.at_most)) for one in fixed.values()))
-    )
-    others = np.tile(characteristics.original, (1 + len(corners), 1))
+    bounds = ([limit.at_least, limit.at_most] for limit in fixed.values())
+    corners = list(product(*([end for end in ends if end is not None] for ends in bounds)))
+    others = np.tile(characteristics.original, (1 + len(corners), 1))  # the original, and the corners of the limits
     others[1:, [characteristics.names.index(name) for name in fixed]] = corners
 
     def safe_intervals(column: int, settings: FloatArray) -> list[Interval | None]:
-        """The interval of a characteristic that is safe with each of the `others`, for K settings of another one."""
-        safe = [one.safe for one in scan(evaluator, [column] * len(settings), unsafe, settings)]
+        """The interval of a characteristic that is safe with each of the `others`, for each group of as many
+        settings.
+        """
+        safe = [scan_of_column.safe for scan_of_column in scan(evaluator, [column] * len(settings), unsafe, settings)]
         intervals: list[Interval | None] = []
         for start in range(0, len(safe), len(others)):
-            found = [ends for ends in safe[start : start + len(others)] if ends is not None]
-            lows, highs = zip(*found, strict=True) if len(found) == len(others) else ((), ())
-            intervals.append((max(lows), min(highs)) if lows else None)
+            ends = [interval for interval in safe[start : start + len(others)] if interval is not None]
+            intervals.append(None)
+            if len(ends) == len(others):
+                lows, highs = zip(*ends, strict=True)
+                intervals[-1] = max(lows), min(highs)
         return intervals
 
     (ends,) = safe_intervals(first, others)
