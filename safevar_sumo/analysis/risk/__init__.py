@@ -1,6 +1,6 @@
 """How likely is an unsafe outcome when vehicles vary as a study specifies, and which characteristic decides?
 
-The command's options and the Python function `risk` are defined here, so that help can be shown without loading the
+The options and the function of the library are defined here, so that a command's help can be shown without loading the
 computation.
 """
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")
 """Methods that estimate a probability."""
 RARE_BELOW = 1e-2
-"""Probability from which plain Monte Carlo is as efficient as a method for rare failures."""
+"""Probability below which a method for rare failures is more efficient than plain Monte Carlo."""
 PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH_FAILURES = 100
-"""Failures to expect among `samples` vehicles, by the pilot, from which on plain Monte Carlo is kept."""
+"""Plain Monte Carlo is kept if, by the pilot, at least so many of `samples` vehicles are expected to fail."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,4 +106,4 @@ def risk(
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_call(estimate_risk, RiskOptions, locals())  # the arguments by name, the subject first
+    return answer_call(estimate_risk, RiskOptions, locals())

@@ -30,7 +30,7 @@ FLEET_VEHICLES = 1000
 SOBOL, SHAPLEY = ("first_order", "total"), ("share",)
 """Columns of Sobol indices, and of Shapley effects as shares of the variance."""
 UNSAFE = "unsafe"
-"""Name of the second output, beside the safety degree."""
+"""Name of the second output whose variance is divided; the first is the safety degree."""
 BARS = {
     "total": ("total: with all others", GREY, 0.2),
     "first_order": ("alone", BLUE, -0.2),
@@ -41,8 +41,8 @@ BARS = {
 
 def effect_columns(indices: tuple[str, ...]) -> list[str]:
     """The columns of `Risk.effects` for Sobol indices or Shapley effects."""
-    first = ["output", "characteristic", *(["effect"] if indices == SHAPLEY else [])]
-    return [*first, *(f"{name}{end}" for name in indices for end in ("", "_lower", "_upper"))]
+    columns = ["output", "characteristic", *(["effect"] if indices == SHAPLEY else [])]
+    return columns + [f"{name}{suffix}" for name in indices for suffix in ("", "_lower", "_upper")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,8 @@ class Estimate:
 
     Attributes
     ----------
+    probability, interval
+        The probability of an unsafe outcome, and its confidence interval.
     samples, failures, errors
         Number of simulated vehicles, of unsafe ones among them, and of vehicles that could not be simulated.
     method
@@ -123,7 +125,9 @@ class Risk(Estimate):
             "study": self.study.name,
             **driven_entry(self.no_verdict),
             "unsafe": str(self.unsafe),
-            **{name: getattr(self, name) for name in ("samples", "failures", "probability")},
+            "samples": self.samples,
+            "failures": self.failures,
+            "probability": self.probability,
             "interval": list(self.interval),
             "confidence": self.confidence,
             **({"sensitivity": rows} if self._indices == SOBOL else {"sensitivity": [], "shapley": rows}),
@@ -162,7 +166,7 @@ class Risk(Estimate):
         if self.remark:
             yield f"note: {self.remark}."
         if point := self.design_point:
-            values = ", ".join(f"{one.name} = {one.text(point[one.name])}{one.suffix}" for one in characteristics)
+            values = ", ".join(f"{item.name} = {item.text(point[item.name])}{item.suffix}" for item in characteristics)
             yield f"The most probable failure: {values}."
         if is_share:
             yield (
@@ -236,7 +240,11 @@ def _index_in_words(row: pd.Series[float], index: str) -> str:
 
 def _how_vehicles_vary(study: Study) -> str:
     """How vehicles vary, in a sentence."""
-    parts = [f"{name} {one.__struct_config__.tag}" for name, one in study.variation.items() if one != Uniform()]
+    parts = [
+        f"{name} {distribution.__struct_config__.tag}"
+        for name, distribution in study.variation.items()
+        if distribution != Uniform()
+    ]
     if len(parts) < len(study.vehicle.characteristics):
         parts.append("the others uniformly" if parts else "uniformly over the whole domain")
     pairs = ", ".join(f"{' with '.join(pair.between)} {pair.value:g}" for pair in study.correlations)

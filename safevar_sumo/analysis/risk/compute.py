@@ -27,8 +27,9 @@ MAX_VEHICLES_PER_CALL = 50_000
 
 
 def estimate_risk(source: Study | Case, options: RiskOptions, evaluator: Evaluator) -> Risk:
-    """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes
-    vehicles.
+    """Estimate the probability of an unsafe outcome.
+
+    The filter of small changes is not applied, as no search changes vehicles.
 
     Raises
     ------
@@ -63,7 +64,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     rng, requested, counts = np.random.default_rng(study.search.seed), options.samples, np.zeros(3, dtype=int)
 
     def simulate(settings: FloatArray) -> Evaluations:
-        """Simulate vehicles, and count all, those that could be simulated and the unsafe ones."""
+        """Simulate vehicles, and add to `counts`: of all, of those that could be simulated, and of the unsafe ones."""
         evaluations = evaluator.evaluate(settings, "sampling vehicles")
         counts[:] += len(settings), np.count_nonzero(evaluations.valid), np.count_nonzero(unsafe.of(evaluations))
         return evaluations
@@ -72,17 +73,18 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         load_openturns()  # raises if the module is missing
         requested = max(requested, PILOT_VEHICLES)
         remark = "the study has constraints, which only plain Monte Carlo supports" if evaluator.region else ""
-    # Unless required, no method for rare failures estimates a share of the domain, which `rules` counts likewise.
+    # Without [variation] the answer is a share of the domain, which is counted as `rules` does unless the user requires
+    # a method for rare failures.
     may_be_rare = options.method == "auto" and bool(study.variation) and options.width is None
     needs_pilot = options.requires_rare_method or (may_be_rare and options.samples >= 2 * PILOT_VEHICLES)
     if needs_pilot and not evaluator.region:
         probabilities = rng.random((PILOT_VEHICLES, len(evaluator.characteristics)))
         response = Response(evaluator, model.settings_of_normal, unsafe)
         responses = response.record(scipy.stats.norm.ppf(probabilities), simulate(model.settings(probabilities)))
-        estimate = _try_rare_method(response, responses, options, requested)
-        if isinstance(estimate, Estimate):
-            return estimate
-        remark = estimate
+        estimate_or_remark = _try_rare_method(response, responses, options, requested)
+        if isinstance(estimate_or_remark, Estimate):
+            return estimate_or_remark
+        remark = estimate_or_remark
     while True:
         drawn, valid, failures = counts.tolist()
         interval = clopper_pearson(failures, valid, options.confidence) if valid else (0.0, 1.0)
@@ -106,11 +108,16 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
 
 
 def _try_rare_method(response: Response, responses: FloatArray, options: RiskOptions, requested: int) -> Estimate | str:
-    """The estimate by a method for rare failures; why plain Monte Carlo has to continue if there is none."""
+    """The estimate by a method for rare failures; without one, a remark why plain Monte Carlo has to continue, which
+    may be empty.
+
+    `response` has simulated the vehicles of the pilot, `responses` are theirs.
+    """
     required, percent = options.requires_rare_method, f"{100 * RARE_BELOW:g} %"
     if not response.samples or response.failures >= RARE_BELOW * response.samples:
-        frequent = f"at least {percent} of {response.samples} vehicles are unsafe"
-        pilot = frequent if response.samples else f"none of the first {PILOT_VEHICLES} vehicles could be simulated"
+        pilot = f"none of the first {PILOT_VEHICLES} vehicles could be simulated"
+        if response.samples:
+            pilot = f"at least {percent} of {response.samples} vehicles are unsafe"
         return f"{pilot}: plain Monte Carlo is used" if required else ""
     if not required and response.failures * requested / PILOT_VEHICLES >= ENOUGH_FAILURES:
         return ""

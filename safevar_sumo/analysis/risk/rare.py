@@ -21,23 +21,23 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
 
 LEVEL_SHARE = 0.1
-"""p0: share of a level's vehicles (those nearest to failure) from which the next level starts."""
+"""p0: the next level starts from this share of a level's vehicles, those nearest to failure."""
 LEVEL_SIZE = 1000
 """N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from another vehicle of its
 block.
 """
 REPEATS, VERY_RARE_REPEATS = 4, 8
-"""Number of independent repeats for probabilities of at least `VERY_RARE_BELOW`, and for lower probabilities."""
+"""Number of independent repeats of a method; more of a subset simulation for very rare failures."""
 VERY_RARE_BELOW = 3e-4
+"""Failures are very rare below this probability."""
+
 INFLATION = 1.3
 """Factor on OpenTURNS' coefficient of variation, which wrongly assumes that the levels of a subset simulation are
 independent. In 240 repeats with linear limit states (probability 1e-3 to 1e-6, 5 to 12 dimensions) the observed
 coefficients were 1.1 to 1.3 times as large.
 """
 PRIOR_DEGREES = 3
-"""Degrees of freedom of the interval in addition to the number of repeats, for the information in OpenTURNS' own
-estimates.
-"""
+"""The interval has so many more degrees of freedom than repeats, for the information in OpenTURNS' own estimates."""
 MIN_PROBABILITY = 1e-10
 """Probability at which a subset simulation gives up."""
 PROPOSAL_WIDTH = 2.0
@@ -54,6 +54,7 @@ PLATEAU = "the response is a plateau before failures, which methods for rare fai
 SEARCH_SETTINGS = 100
 """Number of settings around the design point in each round of its search."""
 SEARCH_ROUNDS = 4
+"""Number of these rounds."""
 
 
 class RareMethodError(Exception):
@@ -63,8 +64,14 @@ class RareMethodError(Exception):
 class Response:
     """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe.
 
-    It counts `samples` that could be simulated, `failures` among them and `errors`, and keeps the failure nearest to
-    the origin, shape (1, n), or (0, n) if there is none yet. `settings_of` turns points into settings.
+    Attributes
+    ----------
+    settings_of
+        Turns points into settings.
+    samples, failures, errors
+        Number of vehicles that could be simulated, of unsafe ones among them, and of those that could not be simulated.
+    nearest_failure
+        The failure nearest to the origin so far, shape (1, n), or (0, n) if there is none.
     """
 
     def __init__(self, evaluator: Evaluator, settings_of: Callable[[FloatArray], FloatArray], unsafe: Unsafe) -> None:
@@ -79,7 +86,7 @@ class Response:
         return self.record(array, self.evaluator.evaluate(self.settings_of(array), "rare failures"))
 
     def record(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
-        """Count known evaluations of points, remember the nearest failure among the points, and return the response."""
+        """The response at points whose evaluations are known; these are counted, too."""
         is_unsafe, margin = self._unsafe.of(evaluations), self._unsafe.margin(evaluations)
         response = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE_RESPONSE)
         self.samples += int(np.count_nonzero(evaluations.valid))
@@ -108,11 +115,14 @@ def load_openturns() -> Any:
 
 
 def is_plateau(responses: FloatArray) -> bool:
-    """Whether most of the responses nearest to failure (a share p0 of all) equal each other."""
-    lowest = np.sort(responses[responses > 0])[: max(int(LEVEL_SHARE * len(responses)), 2)]
-    if not len(lowest):
+    """Whether most of the safe responses nearest to failure (a share p0 of all) equal each other, or the safety degree
+    is undefined for one of them.
+    """
+    nearest = np.sort(responses[responses > 0])[: max(int(LEVEL_SHARE * len(responses)), 2)]
+    if not len(nearest):
         return False
-    return bool(np.count_nonzero(lowest == lowest[-1]) >= PLATEAU_SHARE * len(lowest) or lowest[-1] >= SAFE_RESPONSE)
+    highest = nearest[-1]
+    return bool(np.count_nonzero(nearest == highest) >= PLATEAU_SHARE * len(nearest) or highest >= SAFE_RESPONSE)
 
 
 def estimate_rare(response: Response, method: str, confidence: float) -> Estimate:
@@ -125,20 +135,21 @@ def estimate_rare(response: Response, method: str, confidence: float) -> Estimat
         failures.
     """
     seed, estimates = response.evaluator.study.search.seed, list[tuple[float, float]]()
-    interval = clopper_pearson(response.failures, response.samples, confidence)  # of independent vehicles so far
+    # Without a failure, the interval is that of the independent vehicles that the response has simulated so far.
+    interval = clopper_pearson(response.failures, response.samples, confidence)
     remark = (
         f"the method found no failure: either there is none, or the response does not lead to it; the interval is "
         f"that of the first {response.samples} vehicles"
     )
     repeats, is_subset = REPEATS, method == "subset_simulation"
+    estimate_once = _run_subset_simulation if is_subset else _run_cross_entropy
     while len(estimates) < repeats:
-        estimate_once = _run_subset_simulation if is_subset else _run_cross_entropy
-        estimates.append(estimate_once(response, (seed + 7919 * len(estimates)) % 2**31))
-        if len(estimates) == REPEATS and is_subset and np.mean(estimates, axis=0)[0] < VERY_RARE_BELOW:
+        estimates.append(estimate_once(response, (seed + 7919 * len(estimates)) % 2**31))  # seeds differ by a prime
+        probabilities, coefficients = np.array(estimates).T
+        mean = float(np.mean(probabilities))
+        if len(estimates) == REPEATS and is_subset and mean < VERY_RARE_BELOW:
             repeats = VERY_RARE_REPEATS
-    probabilities, coefficients = np.array(estimates).T
-    mean = float(np.mean(probabilities))
-    failures, errors = response.failures, response.errors  # without those around the design point
+    failures, errors = response.failures, response.errors  # before the search for the design point
     coefficient_of_variation, design_point = math.nan, None
     if mean > 0:
         observed = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
@@ -228,15 +239,14 @@ def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float]:
 
 
 def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArray:
-    """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that
-    failure.
+    """The failure nearest to the origin, which is sought between the nearest known failure and the origin, and around
+    the nearest known failure.
     """
     for search_round in range(SEARCH_ROUNDS):
         nearest = response.nearest_failure
-        shape = (SEARCH_SETTINGS, response.dimensions)
-        points_around = (
-            nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1))) + rng.normal(size=shape) * 0.4 / 2**search_round
-        )
+        # Slightly nearer to the origin, with a standard deviation that halves from round to round.
+        centres = nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
+        points_around = centres + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**search_round
         response(nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis])
         response(points_around)
     return response.nearest_failure

@@ -1,5 +1,5 @@
-"""How the characteristics of vehicles vary, and which of them decide: each one's share of a variance, as Sobol
-indices or, if they are correlated or constrained, as Shapley effects.
+"""How the characteristics of vehicles vary, and which of them decide: the share of each in a variance, as Sobol indices
+or, if characteristics are correlated or constrained, as Shapley effects.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class VariationModel:
         try:
             self._factor = np.linalg.cholesky(self.correlation)
         except np.linalg.LinAlgError:
-            pairs = ", ".join(f"{' and '.join(one.between)} {one.value:g}" for one in study.correlations)
+            pairs = ", ".join(f"{' and '.join(pair.between)} {pair.value:g}" for pair in study.correlations)
             problem = f"correlations contradict each other: {pairs}"
             raise InputError(study.source, problem, "a positive definite matrix") from None
 
@@ -70,7 +70,7 @@ class VariationModel:
         return self.settings_at(scipy.stats.norm.cdf(points @ self._factor.T if self.is_correlated else points))
 
     def settings_at(self, probabilities: FloatArray) -> FloatArray:
-        """Settings whose values have these probabilities, shape (N, n), which have the study's correlations already."""
+        """Settings whose values have these cumulative probabilities, shape (N, n); the correlations are in them."""
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
         return np.clip(np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper)
 
@@ -91,7 +91,7 @@ class VariationModel:
 def _quantile_function(
     characteristic: Characteristic, distribution: Distribution
 ) -> Callable[[FloatArray], FloatArray]:
-    """Turns probabilities into values in the characteristic's unit."""
+    """The function that turns cumulative probabilities into values in the characteristic's unit."""
     low, high, original = characteristic.lower, characteristic.upper, characteristic.original
     stated = stated_values(distribution)
     match distribution:
@@ -127,19 +127,21 @@ DRAWS = 3
 MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, in a design for indices of the unsafe outcome."""
 SMALLEST_PROBABILITY = 1e-12
+"""Probabilities of Sobol points are at least this far from 0 and 1, so that their normal values are finite."""
 
 
 def compute_effects(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float) -> pd.DataFrame:
-    """What decides the safety degree, and the unsafe outcome: the frame `Risk.effects`.
+    """Compute what decides the safety degree, and the unsafe outcome: the frame `Risk.effects`.
 
     Notes
     -----
     The Shapley effect of a characteristic is the mean, over the orders in which the characteristics may join a set J,
     of the growth of c(J) = E[Var(Y | the others)] when it joins (Song, Nelson, Staum 2016, SIAM/ASA J. Uncertainty
     Quantification 4, 1060-1083). Orders are drawn at random, or all taken equally often if there are few. Values of
-    J given the others are drawn by the Gaussian copula, and again where they violate a constraint. Sobol points replace
-    random numbers, the same for all sets of an order. The linear regression on the normal values behind the settings is
-    a control variate, because its conditional variances are known, unless there are constraints.
+    J given the others are drawn by the Gaussian copula, and drawn again where they violate a constraint. Sobol points
+    replace random numbers, the same for all sets of an order. The linear regression on the normal values behind the
+    settings is a control variate, because its conditional variances are known; with constraints they are not, and no
+    control variate is used.
     """
     seed, names = evaluator.study.search.seed, evaluator.characteristics.names
     indices: tuple[str, ...]
@@ -169,32 +171,40 @@ def compute_effects(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe,
 def _sobol_indices(
     problem: JsonObject, confidence: float, seed: int, output: FloatArray
 ) -> dict[str, FloatArray | float]:
-    """Sobol indices of an output over the design, without base points at which the output is undefined for any
-    setting.
-    """
+    """Sobol indices of an output over the design; base points with a setting whose output is undefined do not count."""
     from SALib.analyze import sobol
 
     blocks = output.reshape(BASE_POINTS, -1)
     outputs = blocks[np.isfinite(blocks).all(axis=1)].ravel()
     if not outputs.size or np.ptp(outputs) == 0:
         return dict.fromkeys(effect_columns(SOBOL)[2:], np.nan)
-    found = sobol.analyze(
+    analysis = sobol.analyze(
         problem, outputs, calc_second_order=False, num_resamples=BOOTSTRAP_SAMPLES, conf_level=confidence, seed=seed
     )
     columns = dict[str, FloatArray | float]()
     for name, key in (("first_order", "S1"), ("total", "ST")):
-        index, half = found[key], found[f"{key}_conf"]
-        columns |= {name: index, f"{name}_lower": index - half, f"{name}_upper": index + half}
+        index, half_width = analysis[key], analysis[f"{key}_conf"]
+        columns |= {name: index, f"{name}_lower": index - half_width, f"{name}_upper": index + half_width}
     return columns
 
 
 class Design(NamedTuple):
-    """Orders of the d characteristics that vary, shape (M, d), and M times 1 + (d - 1) `DRAWS` settings of all n: one
-    at random, then draws for the sets of the first 1, 2, ... d - 1 characteristics given the other values of it.
+    """The settings from which Shapley effects are estimated; d of the n characteristics vary.
 
-    `latent` are the correlated normal values behind the settings, shape (M, 1 + (d - 1) `DRAWS`, d). `sets` holds for
-    each set of characteristics the orders that begin with it, the set, and the covariance of its values given the
-    others; it ends with the set of all. It is empty if constraints make this covariance unknown.
+    Attributes
+    ----------
+    orders
+        M orders in which the d characteristics join, shape (M, d).
+    settings
+        1 + (d - 1) `DRAWS` settings for each order, shape (M, 1 + (d - 1) `DRAWS`, n): a random one, then `DRAWS`
+        settings for each set of the order's first 1, 2, ..., d - 1 characteristics. In these only the set's values
+        are drawn anew, given the other values of the random setting.
+    latent
+        The correlated normal values behind the settings, shape (M, 1 + (d - 1) `DRAWS`, d).
+    sets
+        For each set: the rows of the orders that begin with it, which characteristics it has, and the covariance of
+        its normal values given the others. The last set is that of all. Empty if constraints make the covariances
+        unknown.
     """
 
     orders: np.ndarray
@@ -218,83 +228,91 @@ def _design(model: VariationModel, seed: int) -> Design:
         probabilities = scipy.stats.norm.cdf(points.reshape(-1, len(varying)))
         return model.settings_at(probabilities).reshape(points.shape)
 
-    def redraw(latent: FloatArray, mean: FloatArray, factor: FloatArray, columns: BoolArray) -> None:
-        """Draw rows of K points, shape (K, d), again while they violate a constraint."""
+    def redraw(latent: FloatArray, mean: FloatArray, factor: FloatArray, in_set: BoolArray) -> None:
+        """Draw the set's values of K points, shape (K, d), again where they violate a constraint."""
         if not region:
             return
         for _ in range(REJECTIONS):
-            bad = ~region.feasible(settings_of(latent))
-            if not bad.any():
+            violates = ~region.feasible(settings_of(latent))
+            if not violates.any():
                 return
-            latent[np.ix_(bad, columns)] = mean[bad] + rng.standard_normal((int(bad.sum()), len(factor))) @ factor.T
+            normal = rng.standard_normal((int(violates.sum()), len(factor)))
+            latent[np.ix_(violates, in_set)] = mean[violates] + normal @ factor.T
 
     factor = np.linalg.cholesky(correlation)
-    base, everything = normal[:, 0] @ factor.T, np.ones(d, dtype=bool)
-    redraw(base, np.zeros_like(base), factor, everything)
+    base, in_all = normal[:, 0] @ factor.T, np.ones(d, dtype=bool)
+    redraw(base, np.zeros_like(base), factor, in_all)
     latent = np.repeat(base[:, np.newaxis], 1 + max(0, d - 1) * DRAWS, axis=1)
     sets = []
     for size in range(1, d):
-        joined = np.zeros((PERMUTATIONS, d), dtype=bool)
-        np.put_along_axis(joined, orders[:, :size], True, axis=1)
-        for columns in np.unique(joined, axis=0):
-            rows = np.flatnonzero((joined == columns).all(axis=1))
-            others = ~columns
-            weights = np.linalg.solve(correlation[np.ix_(others, others)], correlation[np.ix_(others, columns)])
-            rest = correlation[np.ix_(columns, columns)] - correlation[np.ix_(columns, others)] @ weights
-            factor = np.linalg.cholesky(rest)
+        has_joined = np.zeros((PERMUTATIONS, d), dtype=bool)
+        np.put_along_axis(has_joined, orders[:, :size], True, axis=1)
+        for in_set in np.unique(has_joined, axis=0):
+            rows = np.flatnonzero((has_joined == in_set).all(axis=1))
+            others = ~in_set
+            weights = np.linalg.solve(correlation[np.ix_(others, others)], correlation[np.ix_(others, in_set)])
+            covariance = correlation[np.ix_(in_set, in_set)] - correlation[np.ix_(in_set, others)] @ weights
+            factor = np.linalg.cholesky(covariance)
             mean = np.repeat(base[rows][:, others] @ weights, DRAWS, axis=0)
             points = np.repeat(base[rows], DRAWS, axis=0)
-            points[:, columns] = mean + normal[rows, 1:][:, :, columns].reshape(len(mean), -1) @ factor.T
-            redraw(points, mean, factor, columns)
+            points[:, in_set] = mean + normal[rows, 1:][:, :, in_set].reshape(len(mean), -1) @ factor.T
+            redraw(points, mean, factor, in_set)
             start = 1 + (size - 1) * DRAWS
             latent[rows, start : start + DRAWS] = points.reshape(len(rows), DRAWS, d)
-            sets.append((rows, columns, rest))
+            sets.append((rows, in_set, covariance))
     settings = settings_of(latent)
     if region:  # a draw that found no feasible values keeps those of the setting that it varies
-        bad = ~region.feasible(settings.reshape(-1, len(varying))).reshape(settings.shape[:2])
-        settings = np.where(bad[..., np.newaxis], settings[:, :1], settings)
-    sets.append((np.arange(PERMUTATIONS), everything, correlation))
+        is_feasible = region.feasible(settings.reshape(-1, len(varying))).reshape(settings.shape[:2])
+        settings = np.where(is_feasible[..., np.newaxis], settings, settings[:, :1])
+    sets.append((np.arange(PERMUTATIONS), in_all, correlation))
     return Design(orders, settings, latent, [] if region else sets)
 
 
 def _orders(d: int, rng: np.random.Generator) -> np.ndarray:
-    """`PERMUTATIONS` orders of d characteristics, with their reverses: all as often as possible, and random ones."""
+    """`PERMUTATIONS` orders of d characteristics: half of them, then the reverse of each.
+
+    All possible orders occur equally often; the rest, or all if there are too many possible ones, is drawn at random.
+    """
     half, number = PERMUTATIONS // 2, math.factorial(d)
-    every = list(permutations(range(d))) * (half // number) if number <= half else []
-    chance = rng.permuted(np.tile(np.arange(d), (half - len(every), 1)), axis=1)
-    orders = rng.permutation(np.concatenate([np.array(every, dtype=np.intp).reshape(len(every), d), chance]))
+    systematic = list(permutations(range(d))) * (half // number) if number <= half else []
+    drawn = rng.permuted(np.tile(np.arange(d), (half - len(systematic), 1)), axis=1)
+    systematic_rows = np.array(systematic, dtype=np.intp).reshape(len(systematic), d)
+    orders = rng.permutation(np.concatenate([systematic_rows, drawn]))
     return np.concatenate([orders, orders[:, ::-1]])
 
 
 def _shapley_effects(
     design: Design, varying: BoolArray, confidence: float, output: FloatArray
 ) -> dict[str, FloatArray | float]:
-    """Effects on an output of the design, without orders in which it is undefined anywhere."""
+    """Shapley effects on an output of the design; orders with a setting whose output is undefined do not count."""
     values = output.reshape(design.latent.shape[:2])
-    complete = np.isfinite(values).all(axis=1)
-    values, orders, latent = values[complete], design.orders[complete], design.latent[complete]
+    is_complete = np.isfinite(values).all(axis=1)
+    values, orders, latent = values[is_complete], design.orders[is_complete], design.latent[is_complete]
     if len(values) < 2 or np.ptp(values) == 0 or not varying.any():
         return dict.fromkeys(effect_columns(SHAPLEY)[2:], np.nan)
     number, variances = len(values), _variances(values)
     if design.sets:
+        # The last coefficient is the intercept.
         slopes = np.linalg.lstsq(np.column_stack([latent[:, 0], np.ones(number)]), values[:, 0], rcond=None)[0][:-1]
-        known = np.zeros(design.orders.shape)
-        for rows, joined, covariance in design.sets:
-            known[rows, np.count_nonzero(joined) - 1] = slopes[joined] @ covariance @ slopes[joined]
-        error = _variances(latent @ slopes) - known[complete]
-        factor = np.sum(error * (variances - known[complete])) / max(np.sum(error**2), np.finfo(float).tiny)
+        exact = np.zeros(design.orders.shape)
+        for rows, in_set, covariance in design.sets:
+            exact[rows, np.count_nonzero(in_set) - 1] = slopes[in_set] @ covariance @ slopes[in_set]
+        error = _variances(latent @ slopes) - exact[is_complete]
+        factor = np.sum(error * (variances - exact[is_complete])) / max(np.sum(error**2), np.finfo(float).tiny)
         variances = variances - factor * error
     contributions = np.zeros((number, len(varying)))
     growth = np.diff(variances, axis=1, prepend=0.0)
     np.put_along_axis(contributions, np.flatnonzero(varying)[orders], growth, axis=1)
     effect, variance = contributions.mean(axis=0), float(variances[0, -1])
-    half = scipy.stats.norm.ppf((1 + confidence) / 2) * contributions.std(axis=0, ddof=1) / math.sqrt(number)
-    ends = {"share": effect, "share_lower": effect - half, "share_upper": effect + half}
-    return {"effect": effect, **{name: end / variance for name, end in ends.items()}}
+    half_width = scipy.stats.norm.ppf((1 + confidence) / 2) * contributions.std(axis=0, ddof=1) / math.sqrt(number)
+    columns = {"share": effect, "share_lower": effect - half_width, "share_upper": effect + half_width}
+    return {"effect": effect, **{name: column / variance for name, column in columns.items()}}
 
 
 def _variances(values: FloatArray) -> FloatArray:
-    """For each order the conditional variances of its first 1, 2, ... d - 1 characteristics, and the whole variance."""
+    """For each order the conditional variances of its first 1, 2, ..., d - 1 characteristics, then the whole
+    variance.
+    """
     draws = values[:, 1:].reshape(len(values), (values.shape[1] - 1) // DRAWS, DRAWS)
     whole = np.full((len(values), 1), values[:, 0].var(ddof=1))
     return np.concatenate([draws.var(axis=2, ddof=1), whole], axis=1)
