@@ -27,21 +27,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VERDICTS = {"only_a_unsafe": "only A unsafe", "only_b_unsafe": "only B unsafe", "both": "both unsafe", "": "both safe"}
-"""Verdicts on a setting, by the key of their number in the JSON; the last has none."""
+"""Verdicts on a setting, by the key under which the JSON counts them; settings that are safe in both have no key there.
+"""
 COLOURS = {"": GREY, "both": SKY_BLUE, "only_a_unsafe": BLUE, "only_b_unsafe": VERMILION}
+"""Colours by verdict, in the order in which the points are drawn."""
 SOURCES = {"a": "solutions of A", "b": "solutions of B", "sample": "common sample"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Side:
-    """One of the systems.
+    """One of the two systems.
 
     Attributes
     ----------
+    original
+        The evaluation of the original vehicle.
     limits
         Scans of each characteristic alone, in the study's order.
     points
         The original's points in the rating; None unless both systems are rated.
+    no_verdict
+        Why simulations tell nothing about the driving system; "" if they do.
     """
 
     study: Study
@@ -55,7 +61,7 @@ class Side:
         return {
             "outcome": str(self.original.outcome[0]),
             SAFETY_DEGREE: finite_or_none(self.original.f_safe[0]),
-            "values": {one.characteristic.name: one.characteristic.original for one in self.limits},
+            "values": {scan.characteristic.name: scan.characteristic.original for scan in self.limits},
         }
 
 
@@ -67,9 +73,13 @@ class SystemComparison:
     ----------
     frame
         One row for each setting that both systems could simulate: see `to_frame`.
-    p, a12
-        The signed-rank test of the safety degree (of the points, if rated), paired by `test_unit`, and the probability
-        that it is greater in A than in B (Vargha and Delaney); None without pairs.
+    p
+        p-value of the signed-rank test of the safety degree (if both systems are rated, of the points); None without
+        pairs.
+    a12
+        Probability that this quantity is greater in A than in B (Vargha and Delaney); None without pairs.
+    test_unit, test_size
+        What the pairs of the test are, "run" or "setting", and their number.
     weather
         The table `weather` of the research questions, if the systems differ in the weather alone.
     """
@@ -95,10 +105,10 @@ class SystemComparison:
         return " ".join(dict.fromkeys(filter(None, (self.a.no_verdict, self.b.no_verdict))))
 
     @property
-    def _limits(self) -> list[tuple[OneAtATimeScan, OneAtATimeScan]]:
-        """Both scans of each characteristic, in A's order."""
-        of_b = {one.characteristic.name: one for one in self.b.limits}
-        return [(one, of_b[one.characteristic.name]) for one in self.a.limits]
+    def _scans(self) -> list[tuple[OneAtATimeScan, OneAtATimeScan]]:
+        """The scans of each characteristic in A and in B, in A's order."""
+        scans_of_b = {scan.characteristic.name: scan for scan in self.b.limits}
+        return [(scan, scans_of_b[scan.characteristic.name]) for scan in self.a.limits]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each setting that both systems could simulate.
@@ -109,9 +119,9 @@ class SystemComparison:
         return self.frame.copy()
 
     def _verdicts(self, frame: pd.DataFrame) -> dict[str, pd.Series[bool]]:
-        """The rows of each verdict, in the order of `VERDICTS`."""
-        a, b = frame["unsafe_a"], frame["unsafe_b"]
-        return dict(zip(VERDICTS, (a & ~b, b & ~a, a & b, ~a & ~b), strict=True))
+        """Which rows have each verdict, in the order of `VERDICTS`."""
+        in_a, in_b = frame["unsafe_a"], frame["unsafe_b"]
+        return dict(zip(VERDICTS, (in_a & ~in_b, in_b & ~in_a, in_a & in_b, ~in_a & ~in_b), strict=True))
 
     def counts(self, source: str = "") -> dict[str, int]:
         """Number of different settings by verdict, in the order of `VERDICTS`; of one source, or of all."""
@@ -133,7 +143,7 @@ class SystemComparison:
             "a12": self.a12,
             "limits": [
                 {"characteristic": a.characteristic.name, "unit": a.characteristic.unit, "a": a.safe, "b": b.safe}
-                for a, b in self._limits
+                for a, b in self._scans
             ],
         }
         if self.original_differences:
@@ -147,14 +157,16 @@ class SystemComparison:
     @property
     def original_differences(self) -> list[str]:
         """How the original vehicles differ: in their values, and in what they do; empty if they do not."""
+        pairs = [(scan_a.characteristic, scan_b.characteristic) for scan_a, scan_b in self._scans]
         texts = [
             f"{a.name} {a.text(a.original)} in A, {b.text(b.original)}{b.suffix} in B"
-            for a, b in ((one.characteristic, other.characteristic) for one, other in self._limits)
+            for a, b in pairs
             if a.original != b.original
         ]
         ends = [(facts["outcome"], facts[SAFETY_DEGREE]) for facts in (self.a.original_facts, self.b.original_facts)]
         if ends[0] != ends[1]:
-            texts.append(" in A, ".join(f"{outcome}, SD {two_decimals(degree)}" for outcome, degree in ends) + " in B")
+            in_a, in_b = (f"{outcome}, SD {two_decimals(degree)}" for outcome, degree in ends)
+            texts.append(f"{in_a} in A, {in_b} in B")
         return texts
 
     _repr_html_ = answer_as_html
@@ -179,8 +191,9 @@ class SystemComparison:
         )
         table = WholeTable("settings", right=("number", *VERDICTS.values()), title="The same settings in both systems")
         for source, words in SOURCES.items():
-            if number := sum((of_source := self.counts(source)).values()):
-                table.add_row(words, str(number), *map(str, of_source.values()))
+            numbers = self.counts(source).values()
+            if any(numbers):
+                table.add_row(words, str(sum(numbers)), *map(str, numbers))
         yield table
         yield self._test_in_words()
         yield _as_table(self.limits_frame(), "Limits of each alone, all others as in the original")
@@ -189,22 +202,21 @@ class SystemComparison:
         if self.weather is not None:
             names = self.weather[["setting", "other"]].iloc[0].to_list()
             heads = [f"{quantity} {name}" for quantity in ("%", "rank", "+", "-") for name in names]
-            frame = self.weather.drop(columns=["setting", "other", "difference"]).set_axis(
-                ["characteristic", *heads], axis=1
-            )
+            frame = self.weather.drop(columns=["setting", "other", "difference"])
+            frame.columns = ["characteristic", *heads]
             yield _as_table(frame, "What critical solutions change (rank), and mean increase (+) and decrease (-)")
-        yield meanings(one.characteristic for one in self.a.limits)
+        yield meanings(scan.characteristic for scan in self.a.limits)
         yield from (f"note: {remark}." for remark in self.remarks)
 
     def limits_frame(self) -> pd.DataFrame:
         """The limits side by side, as texts."""
         rows = [
             (
-                f"{both[0].characteristic.name} [{both[0].characteristic.unit}]",
-                *(f"{one.characteristic.original:g}" for one in both),
-                *("nowhere" if one.safe is None else "{:.5g} to {:.5g}".format(*one.safe) for one in both),
+                f"{pair[0].characteristic.name} [{pair[0].characteristic.unit}]",
+                *(f"{scan.characteristic.original:g}" for scan in pair),
+                *("nowhere" if scan.safe is None else "{:.5g} to {:.5g}".format(*scan.safe) for scan in pair),
             )
-            for both in self._limits
+            for pair in self._scans
         ]
         return pd.DataFrame(rows, columns=["characteristic", "original A", "original B", "safe in A", "safe in B"])
 
@@ -230,15 +242,14 @@ class SystemComparison:
         points.axline((0, 0), slope=1, color="black", linewidth=0.6)
         points.set(xlabel="safety degree in A [m, below 0: -m/s]", ylabel="safety degree in B [m, below 0: -m/s]")
         points.legend(fontsize=FONT_SIZE - 1, markerscale=2)
-        limits, places = self._limits[::-1], np.arange(number)
-        domains = [one.characteristic for one, _ in limits]
+        pairs, places = self._scans[::-1], np.arange(number)  # bars are drawn from the bottom up
+        domains = [scan.characteristic for scan, _ in pairs]
+        lower, upper = np.array([(domain.lower, domain.upper) for domain in domains]).T
         for k, colour, shift in ((0, BLUE, 0.2), (1, VERMILION, -0.2)):
-            ends = [both[k].safe or (domain.lower, domain.lower) for both, domain in zip(limits, domains, strict=True)]
-            low, high = np.array(
-                [np.subtract(end, one.lower) / (one.upper - one.lower) for end, one in zip(ends, domains, strict=True)]
-            ).T
+            ends = [pair[k].safe or (domain.lower, domain.lower) for pair, domain in zip(pairs, domains, strict=True)]
+            low, high = (np.array(ends).T - lower) / (upper - lower)
             bars.barh(places + shift, high - low, left=low, height=0.36, color=colour, label=f"safe in {'AB'[k]}")
-        bars.set_yticks(places, [escape_dollars(one.name) for one in domains])
+        bars.set_yticks(places, [escape_dollars(domain.name) for domain in domains])
         bars.set(xlabel="share of A's domain [-]")
         bars.grid(visible=False, axis="y")
         figure.legend(
@@ -250,6 +261,6 @@ class SystemComparison:
 def _as_table(frame: pd.DataFrame, title: str) -> WholeTable:
     """A frame as a table for the terminal; a number has four digits, and "-" stands for none."""
     table = WholeTable(frame.columns[0], right=frame.columns[1:], title=title)
-    for row in frame.itertuples(index=False):
-        table.add_row(*(one if isinstance(one, str) else "-" if pd.isna(one) else f"{one:.4g}" for one in row))
+    for cells in frame.astype(object).where(frame.notna(), "-").itertuples(index=False):
+        table.add_row(*(cell if isinstance(cell, str) else f"{cell:.4g}" for cell in cells))
     return table

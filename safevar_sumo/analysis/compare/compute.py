@@ -25,13 +25,15 @@ from safevar_sumo.results import handles_of
 from safevar_sumo.study import SAFETY_DEGREE, Study
 
 SAMPLE = "sample"
+"""Source of the settings of the common sample."""
 RUN_COLUMNS = ["source", "algorithm", "run"]
+"""Columns that identify a run."""
 
 
 def compare_systems(
     subject: Study | Case, options: CompareOptions, evaluator: Evaluator, *, other: Study | Case
 ) -> SystemComparison:
-    """Compare two systems by one criterion. The filter of small changes is not applied: its thresholds are a search's.
+    """Compare two systems by one criterion, without the filter of small changes, whose thresholds are a search's.
 
     Raises
     ------
@@ -40,68 +42,73 @@ def compare_systems(
     SimulationError
         If an original vehicle cannot be simulated.
     """
-    subjects, evaluators = (subject, other), (evaluator, evaluator.for_study(study_in(other)))
-    _require_same_characteristics(*(one.study for one in evaluators))
-    stated = [one.parse_criterion(options.unsafe) for one in evaluators if options.unsafe is not None]
+    evaluators = evaluator, evaluator.for_study(study_in(other))
+    studies = [of_side.study for of_side in evaluators]
+    _require_same_characteristics(*studies)
+    stated = [of_side.parse_criterion(options.unsafe) for of_side in evaluators if options.unsafe is not None]
     names = list(evaluator.characteristics.names)
-    orders = [[names.index(name) for name in one.characteristics.names] for one in evaluators]
+    orders = [[names.index(name) for name in of_side.characteristics.names] for of_side in evaluators]
     lower, upper = _common_domain(evaluators, orders)
     sample = pd.DataFrame(_common_sample(evaluators, orders, lower, upper, options.samples), columns=names)
-    solutions = [
-        _solutions_of(side, one, names) for side, one in zip("ab", subjects, strict=True) if isinstance(one, Case)
-    ]
+    cases = {side: case for side, case in (("a", subject), ("b", other)) if isinstance(case, Case)}
+    solutions = [_solutions_of(side, case, names) for side, case in cases.items()]
     frame = pd.concat([*solutions, sample.assign(source=SAMPLE)], ignore_index=True)
-    inside = ((frame[names] >= lower) & (frame[names] <= upper)).all(axis=1)
-    outside, frame = int(np.count_nonzero(~inside)), frame[inside].reset_index(drop=True)
+    is_inside = ((frame[names] >= lower) & (frame[names] <= upper)).all(axis=1)
+    outside, frame = int(np.count_nonzero(~is_inside)), frame[is_inside].reset_index(drop=True)
     values = frame[names].to_numpy(dtype=float)
     evaluations = [
-        one.evaluate(values[:, order], f"settings in {side}")
-        for one, order, side in zip(evaluators, orders, "AB", strict=True)
+        of_side.evaluate(values[:, order], f"settings in {side}")
+        for of_side, order, side in zip(evaluators, orders, "AB", strict=True)
     ]
-    originals = [one.evaluate_original() for one in evaluators]
-    unsafe = stated[0] if stated else _default_criterion(evaluators, evaluations, originals)
-    both_rated = all(is_rated(one.study) for one in evaluators)
-    is_valid = np.logical_and.reduce([one.valid for one in evaluations])
-    for side, one in zip("ab", evaluations, strict=True):
-        frame[f"outcome_{side}"] = one.outcome
-        frame[f"{SAFETY_DEGREE}_{side}"] = one.f_safe
-        frame[f"unsafe_{side}"] = unsafe.of(one)
-    quantities = [one.column(RATING_POINTS.name if both_rated else SAFETY_DEGREE) for one in evaluations]
-    p, a12, unit, number = _test(frame.assign(**dict(zip("ab", quantities, strict=True)))[is_valid])
-    sides = [_side(one, original, unsafe, both_rated) for one, original in zip(evaluators, originals, strict=True)]
-    remarks = {
-        "solution": (outside, "outside the other system's domain left out"),
-        "setting": (int(np.count_nonzero(~is_valid)), "left out, which one of the systems could not simulate"),
-    }
+    originals = [of_side.evaluate_original() for of_side in evaluators]
+    both_rated = all(map(is_rated, studies))
+    unsafe = stated[0] if stated else _default_criterion(both_rated, evaluations, originals)
+    is_valid = np.logical_and.reduce([of_side.valid for of_side in evaluations])
+    tested = frame.copy()
+    for side, of_side in zip("ab", evaluations, strict=True):
+        frame[f"outcome_{side}"] = of_side.outcome
+        frame[f"{SAFETY_DEGREE}_{side}"] = of_side.f_safe
+        frame[f"unsafe_{side}"] = unsafe.of(of_side)
+        tested[side] = of_side.column(RATING_POINTS.name if both_rated else SAFETY_DEGREE)
+    p, a12, unit, number = _test(tested[is_valid])
+    side_a, side_b = (
+        _side(of_side, original, unsafe, both_rated) for of_side, original in zip(evaluators, originals, strict=True)
+    )
+    remarks = (
+        (outside, "solution", "outside the other system's domain left out"),
+        (int(np.count_nonzero(~is_valid)), "setting", "left out, which one of the systems could not simulate"),
+    )
     return SystemComparison(
-        a=sides[0],
-        b=sides[1],
+        a=side_a,
+        b=side_b,
         unsafe=unsafe,
         frame=frame[is_valid].reset_index(drop=True),
         p=p,
         a12=a12,
         test_unit=unit,
         test_size=number,
-        weather=_weather_table(subjects),
-        remarks=tuple(f"{number_of(count, noun)} {rest}" for noun, (count, rest) in remarks.items() if count),
+        weather=_weather_table(list(cases.values())),
+        remarks=tuple(f"{number_of(count, noun)} {remark}" for count, noun, remark in remarks if count),
     )
 
 
-def _side(evaluator: Evaluator, original: Evaluations, unsafe: Unsafe, is_rated: bool) -> Side:
+def _side(evaluator: Evaluator, original: Evaluations, unsafe: Unsafe, both_rated: bool) -> Side:
     return Side(
         study=evaluator.study,
         original=original,
         limits=scan(evaluator, range(len(evaluator.characteristics)), unsafe),
-        points=rate(evaluator, {}).original.points if is_rated else None,
+        points=rate(evaluator, {}).original.points if both_rated else None,
         no_verdict=evaluator.no_verdict,
     )
 
 
 def _common_domain(evaluators: tuple[Evaluator, Evaluator], orders: list[list[int]]) -> tuple[FloatArray, FloatArray]:
-    """The ends of the domain that both systems have, in the order of the first one's characteristics."""
-    sets = [(one.characteristics, np.argsort(order)) for one, order in zip(evaluators, orders, strict=True)]
-    lower = np.max([one.lower[order] for one, order in sets], axis=0)
-    upper = np.min([one.upper[order] for one, order in sets], axis=0)
+    """The ends of the domain that both systems have, in the order of A's characteristics; `orders` are their columns in
+    each system's order.
+    """
+    sets = [(system.characteristics, np.argsort(order)) for system, order in zip(evaluators, orders, strict=True)]
+    lower = np.max([characteristics.lower[order] for characteristics, order in sets], axis=0)
+    upper = np.min([characteristics.upper[order] for characteristics, order in sets], axis=0)
     if (lower > upper).any():
         name = evaluators[0].characteristics.names[int(np.argmax(lower > upper))]
         raise InputError(
@@ -113,32 +120,34 @@ def _common_domain(evaluators: tuple[Evaluator, Evaluator], orders: list[list[in
 
 
 def _require_same_characteristics(a: Study, b: Study) -> None:
-    units = [{name: row.unit for name, row in study.vehicle.characteristics.items()} for study in (a, b)]
-    if units[0] == units[1]:
+    units_a, units_b = ([(name, row.unit) for name, row in study.vehicle.characteristics.items()] for study in (a, b))
+    if set(units_a) == set(units_b):
         return
-    ours, theirs = (
-        ", ".join(f"{name} [{unit}]" for name, unit in one.items() if another.get(name) != unit) or "none"
-        for one, another in (units, units[::-1])
+    a_alone, b_alone = (
+        ", ".join(f"{name} [{unit}]" for name, unit in units if (name, unit) not in other_units) or "none"
+        for units, other_units in ((units_a, units_b), (units_b, units_a))
     )
     raise InputError(
         b.source,
-        f"cannot be compared: characteristics of {a.name!r} alone: {ours}; of {b.name!r} alone: {theirs}",
+        f"cannot be compared: characteristics of {a.name!r} alone: {a_alone}; of {b.name!r} alone: {b_alone}",
         "studies with the same characteristics in the same units",
     )
 
 
 def _solutions_of(source: str, case: Case, names: list[str]) -> pd.DataFrame:
-    """Settings of the solutions with the columns of `RUN_COLUMNS`, if there are runs, and `solution`, the handle."""
-    frame = case.solutions
-    kept = frame[[*names, *(name for name in RUN_COLUMNS if name in frame and case.has_runs)]]
-    return kept.assign(source=source, solution=list(map(str, handles_of(frame))))
+    """Settings of the solutions with the columns `source`, `solution`, the handle, and, if there are runs, `algorithm`
+    and `run`.
+    """
+    run_columns = [name for name in RUN_COLUMNS if name in case.solutions and case.has_runs]
+    handles = list(map(str, handles_of(case.solutions)))
+    return case.solutions[[*names, *run_columns]].assign(source=source, solution=handles)
 
 
 def _common_sample(
     evaluators: tuple[Evaluator, Evaluator], orders: list[list[int]], lower: FloatArray, upper: FloatArray, number: int
 ) -> FloatArray:
-    """`number` settings that cover the common domain evenly and satisfy the constraints of both studies; fewer where
-    hardly any do.
+    """`number` settings that cover the common domain evenly and satisfy the constraints of both studies; fewer if
+    hardly any settings do.
     """
     factor = 1
     while True:
@@ -151,20 +160,22 @@ def _common_sample(
         factor *= 2
 
 
-def _default_criterion(
-    evaluators: tuple[Evaluator, Evaluator], evaluations: list[Evaluations], originals: list[Evaluations]
-) -> Unsafe:
-    """The default of all vehicles of both systems, with the limit of the first original."""
-    original = originals[0]
-    if not all(is_rated(one.study) for one in evaluators):
-        metrics = {name: values for name, values in original.metrics.items() if name != RATING_POINTS.name}
-        original = replace(original, metrics=metrics)
-    return Unsafe.default_among(Evaluations.concatenate([*evaluations, originals[1]]), original)
+def _default_criterion(both_rated: bool, evaluations: list[Evaluations], originals: list[Evaluations]) -> Unsafe:
+    """The default criterion for all vehicles of both systems; its limit depends on A's original, on its points only if
+    both systems are rated.
+    """
+    original_a, original_b = originals
+    if not both_rated:
+        metrics = {name: values for name, values in original_a.metrics.items() if name != RATING_POINTS.name}
+        original_a = replace(original_a, metrics=metrics)
+    return Unsafe.default_among(Evaluations.concatenate([*evaluations, original_b]), original_a)
 
 
 def _test(frame: pd.DataFrame) -> tuple[float | None, float | None, str, int]:
-    """The paired test and A12 of the columns `a` and `b`, with the paired unit and its number: each run's mean over its
-    solutions, or each setting of the sample if there are fewer runs than the test needs.
+    """Test the columns `a` and `b` in pairs: the p-value, A12, and the unit and number of the pairs.
+
+    A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs, a setting of the
+    sample.
     """
     frame = frame.dropna(subset=["a", "b"])
     pairs, unit = frame[frame["source"] == SAMPLE][["a", "b"]], "setting"
@@ -177,9 +188,8 @@ def _test(frame: pd.DataFrame) -> tuple[float | None, float | None, str, int]:
     return finite_or_none(p), finite_or_none(a12), unit, len(pairs)
 
 
-def _weather_table(subjects: tuple[Study | Case, Study | Case]) -> pd.DataFrame | None:
-    """The table `weather` of the research questions, if the systems differ in the weather alone."""
-    cases = [one for one in subjects if isinstance(one, Case)]
+def _weather_table(cases: list[Case]) -> pd.DataFrame | None:
+    """The table `weather` of the research questions, if both subjects are results that differ in the weather alone."""
     try:
         return compare_weathers(*cases) if len(cases) == 2 else None
     except UnanswerableError:

@@ -1,6 +1,6 @@
 """In which regions of the domain do failures lie, in physical units?
 
-The command's options and the Python function `rules` are defined here, so that help can be shown without loading the
+The options and the function of the library are defined here, so that a command's help can be shown without loading the
 computation.
 """
 
@@ -57,4 +57,4 @@ def rules(
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_call(find_rules, RulesOptions, locals())  # the arguments by name, the subject first
+    return answer_call(find_rules, RulesOptions, locals())

@@ -33,18 +33,23 @@ if TYPE_CHECKING:
 
 MIN_SETTINGS = 10
 """Minimum number of unsafe settings, and of safe settings, that rules need."""
-FOLDS, MAX_DEPTH, MAX_PRUNINGS = 5, 6, 24
-"""Number of folds of the cross-validation; maximum depth of the tree; maximum number of prunings compared."""
+FOLDS = 5
+"""Number of folds of the cross-validation."""
+MAX_DEPTH = 6
+"""Maximum depth of the tree."""
+MAX_PRUNINGS = 24
+"""Maximum number of prunings compared."""
 MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
 RULES_NOTE = (
-    "Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the "
-    "whole domain; how far "
-    "one may go while all others stay as in the original says `tolerance`."
+    "Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the whole "
+    "domain; how far one may go while all others stay as in the original says `tolerance`."
 )
 """What the shares of rules are shares of."""
 LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
+UNLIMITED = np.array([[-np.inf], [np.inf]])
+"""Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in row 1."""
 
 
 class Rule(NamedTuple):
@@ -72,23 +77,20 @@ class Rule(NamedTuple):
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
     def conditions(self, characteristics: CharacteristicSet) -> list[str]:
-        """Its limits in words, such as `mass above 2500 kg`; `everywhere` without any."""
+        """The limits in words, such as `mass above 2500 kg`; `everywhere` without any."""
         conditions = []
         for item in characteristics:
             low, high = self.limits.get(item.name, (None, None))
-            if low is not None or high is not None:
-                limit = (
-                    f"below {high:g}"
-                    if low is None
-                    else f"above {low:g}"
-                    if high is None
-                    else f"from {low:g} to {high:g}"
-                )
-                conditions.append(f"{item.name} {limit}{item.suffix}")
+            if low is not None and high is not None:
+                conditions.append(f"{item.name} from {low:g} to {high:g}{item.suffix}")
+            elif low is not None:
+                conditions.append(f"{item.name} above {low:g}{item.suffix}")
+            elif high is not None:
+                conditions.append(f"{item.name} below {high:g}{item.suffix}")
         return conditions or ["everywhere"]
 
     def in_words(self, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-        """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 %`."""
+        """The rule and its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 %`."""
         others = ", the others anywhere" if 0 < len(self.limits) < len(characteristics) else ""
         density, coverage = (
             f"{100 * (share or 0.0):.0f} % ({100 * ends[0]:.0f} % to {100 * ends[1]:.0f} %)" if ends else "-"
@@ -98,18 +100,29 @@ class Rule(NamedTuple):
         return f"{conditions}{others}: {unsafe.in_words} in {density}, covers {coverage}"
 
     def to_dict(self) -> JsonObject:
-        """An entry of `rules --json`."""
-        limits, *shares = self
+        """An entry for a rule in `rules --json`."""
+        shares = self._asdict()
+        limits = shares.pop("limits")
         conditions = [
             {"characteristic": name, "at_least": low, "at_most": high} for name, (low, high) in limits.items()
         ]
-        return {"conditions": conditions, **dict(zip(self._fields[1:], shares, strict=True))}
+        return {"conditions": conditions, **shares}
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Rules(Answer):
-    """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe, with its 95 %
-    interval.
+    """Rules of a study, ordered by coverage.
+
+    Attributes
+    ----------
+    samples
+        Number of settings that could be simulated.
+    unsafe_share, unsafe_interval
+        Share of these settings that is unsafe, and its 95 % interval.
+    remark
+        Why there can be no rule; may be empty.
+    no_verdict
+        Why simulations tell nothing about the driving system; "" if they do.
     """
 
     study: Study
@@ -122,9 +135,7 @@ class Rules(Answer):
     no_verdict: str = ""
 
     def to_dict(self) -> list[JsonObject]:
-        """The JSON of `rules`: a list with an entry for each rule, and a summary if no verdict on the ADS is
-        possible.
-        """
+        """The JSON of `rules`: an entry for each rule, and a summary if no verdict on the ADS is possible."""
         return [*(rule.to_dict() for rule in self.rules), *summary_entry(self.no_verdict)]
 
     def to_frame(self) -> pd.DataFrame:
@@ -164,9 +175,8 @@ class Rules(Answer):
         """Every rule with its density and coverage."""
         characteristics, (low, high) = CharacteristicSet.of(self.study), self.unsafe_interval
         yield (
-            f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles "
-            "drawn evenly over "
-            f"the whole domain ({100 * low:.2f} % to {100 * high:.2f} %)."
+            f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles drawn "
+            f"evenly over the whole domain ({100 * low:.2f} % to {100 * high:.2f} %)."
         )
         yield from constraints_in_words(self.study)
         if self.remark:
@@ -180,7 +190,7 @@ class Rules(Answer):
             yield f"Left out: {omitted} that may be due to chance; more samples decide."
         if self.rules:
             named = {name for rule in dense for name in rule.limits}
-            yield meanings(characteristic for characteristic in characteristics if characteristic.name in named)
+            yield meanings(item for item in characteristics if item.name in named)
             yield f"{RULES_NOTE} In brackets: {100 * CONFIDENCE:.0f} % intervals."
 
 
@@ -199,19 +209,19 @@ def find_rules(source: Study | Case, options: RulesOptions, evaluator: Evaluator
         evaluations.take(rows[evaluations.valid[rows]]) for rows in np.split(np.arange(len(evaluations)), [half])
     )
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
-    count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
+    unsafe_count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
     remark, boxes = "", list[FloatArray]()
-    if count == len(is_unsafe) > 0:
-        boxes = [np.repeat([[-np.inf], [np.inf]], len(characteristics), axis=1)]
-    elif min(count, len(is_unsafe) - count) < MIN_SETTINGS:
+    if unsafe_count == len(training) > 0:
+        boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]
+    elif min(unsafe_count, len(training) - unsafe_count) < MIN_SETTINGS:
         remark = (
-            f"{count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many "
-            "safe settings (the command rules --samples N simulates more)"
+            f"{unsafe_count} of {len(training)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as "
+            "many safe settings (the command rules --samples N simulates more)"
         )
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(box, validation.settings, is_unsafe_validation, characteristics.names) for box in boxes]
-    all_unsafe = count + int(np.count_nonzero(is_unsafe_validation))
+    all_unsafe = unsafe_count + int(np.count_nonzero(is_unsafe_validation))
     return Rules(
         study=evaluator.study,
         unsafe=unsafe,
@@ -230,18 +240,20 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
     """
     lower, width = characteristics.lower, characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
-    everywhere = np.repeat([[-np.inf], [np.inf]], len(width), axis=1)
-    leaves = list(_boxes_of_leaves(tree, 0, everywhere, lower, width))
-    dense_boxes = [box for box, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
+    leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
+    dense_boxes = [box for box, density in leaves if density > 0.5]
+    if not dense_boxes:
+        densest, _ = max(leaves, key=lambda leaf: leaf[1])
+        dense_boxes = [densest]
     digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
     rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
-    chosen, uncovered = list[FloatArray](), is_unsafe.copy()
+    chosen, is_uncovered = list[FloatArray](), is_unsafe.copy()
     for box in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
         is_inside = is_within(box, settings)
-        if not chosen or np.count_nonzero(uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
+        if not chosen or np.count_nonzero(is_uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
             chosen.append(box)
-            uncovered &= ~is_inside
+            is_uncovered &= ~is_inside
     return chosen
 
 
@@ -251,16 +263,17 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     def smallest_good_enough(results: Any) -> int:
-        """The index of the strongest pruning whose score is good enough."""
+        """The index of the strongest pruning whose score is within a standard error of the best."""
         means = results["mean_test_score"]
         best = np.argmax(means)
         least = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
         return int(np.flatnonzero(means >= least)[-1])
 
     tree = DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0)
-    path = np.unique(np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))[:-1]
-    some = np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))
-    prunings = {"ccp_alpha": path[some] if len(path) else np.zeros(1)}
+    strengths = np.unique(np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))
+    strengths = strengths[:-1]  # the strongest pruning leaves no condition
+    evenly_spaced = np.unique(np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int))
+    prunings = {"ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)}
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
     search = GridSearchCV(tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough)
     return search.fit(inputs, is_unsafe).best_estimator_
@@ -269,12 +282,13 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
 def _boxes_of_leaves(
     tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
 ) -> Iterator[tuple[FloatArray, float]]:
-    """The boxes of a tree below a node, each with its share of unsafe settings."""
-    if tree.children_left[node] < 0:
+    """The boxes of a tree's leaves below a node, whose own box is `box`, each with its share of unsafe settings."""
+    if tree.children_left[node] < 0:  # a leaf
         counts = tree.value[node][0]
         yield box, float(counts[-1] / counts.sum())
         return
     column = int(tree.feature[node])
+    # The threshold is the lower end of the right child, and the upper end of the left one.
     for end, children in enumerate((tree.children_right, tree.children_left)):
         part = box.copy()
         part[end, column] = lower[column] + tree.threshold[node] * width[column]
@@ -291,7 +305,7 @@ def _drop_useless_conditions(box: FloatArray, settings: FloatArray, is_unsafe: B
 
     while np.isfinite(box).any():
         columns = np.flatnonzero(np.isfinite(box).any(axis=0))
-        wider = [np.where(np.arange(box.shape[1]) == column, [[-np.inf], [np.inf]], box) for column in columns]
+        wider = [np.where(np.arange(box.shape[1]) == column, UNLIMITED, box) for column in columns]
         best = max(wider, key=least_density)
         if least_density(best) < least_density(box):
             break
@@ -305,7 +319,7 @@ def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
 
 
 def _validate_rule(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray, names: Sequence[str]) -> Rule:
-    """The rule of a box, with its shares of validation settings."""
+    """The rule of a box, with its density and coverage among validation settings."""
     is_inside = is_within(box, settings)
     limits = {
         name: (None if low == -np.inf else low, None if high == np.inf else high)
@@ -319,5 +333,5 @@ def _validate_rule(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray, 
 
 
 def _share(count: int, total: int) -> tuple[float, Interval] | tuple[None, None]:
-    """The share `count` / `total` with its 95 % interval; None if there is none."""
+    """The share `count` / `total` with its 95 % interval; twice None if `total` is 0."""
     return (count / total, clopper_pearson(count, total)) if total else (None, None)
