@@ -1,5 +1,5 @@
-"""The results of one study for the research questions: solutions by algorithm and run, and the original vehicle's
-metrics.
+"""The results of one study, which all questions read: solutions by algorithm and run, and the metrics of the original
+vehicle.
 """
 
 from __future__ import annotations
@@ -135,23 +135,22 @@ class Case:
     @property
     def remarks(self) -> list[str]:
         """Notes for the readers of every table of this case."""
-        lines = [self.shortfall] if self.shortfall else []
+        remarks = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
-            lines.append(
-                f"{self.name}: imported solutions, without runs; "
-                "the original vehicle's metrics are published or supplied."
+            remarks.append(
+                f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or "
+                "supplied."
             )
         if self.failures:
-            lines.append(
-                f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) "
-                "and are in no result: "
-                f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again."
+            remarks.append(
+                f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no "
+                f"result: {'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again."
             )
-        return lines
+        return remarks
 
 
 def solutions_for_metric(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
-    """The solutions that count for a metric: for TET and TIT only those without collision (docs/method.md, section
+    """The solutions that count for a metric; for TET and TIT only those without collision (docs/method.md, section
     4).
     """
     return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]

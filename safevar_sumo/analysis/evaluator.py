@@ -38,7 +38,8 @@ CRITERION_SETTINGS = 1024
 a safety degree.
 """
 MAX_REJECTIONS = 64
-"""If fewer than 1 in this many Sobol points is feasible, mixtures of the feasible region's vertices replace the points.
+"""Maximum number of points drawn for each feasible setting; mixtures of the feasible region's vertices replace those
+that are still missing.
 """
 
 
@@ -65,8 +66,8 @@ class Evaluator:
         Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
         `ignore_constraints` is true.
         """
-        is_feasible = self.region.feasible(settings)
-        if ignore_constraints or is_feasible.all():
+        is_feasible = self.region.feasible(settings) | ignore_constraints
+        if is_feasible.all():
             return self._evaluate_shown(settings, stage, self._verified)
         infeasible, undefined = settings[~is_feasible], np.full(np.count_nonzero(~is_feasible), np.nan)
         not_simulated = Evaluations(
@@ -78,12 +79,13 @@ class Evaluator:
             f_num_diff=self.characteristics.number_changed(infeasible),
         )
         groups = [self._evaluate_shown(settings[is_feasible], stage, self._verified), not_simulated]
-        order = np.argsort(np.argsort(~is_feasible, kind="stable"), kind="stable")
-        return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
+        rows = np.argsort(~is_feasible, kind="stable")  # of `settings`, as `groups` have them
+        return Evaluations.concatenate(groups).take(np.argsort(rows))  # restores the order of the settings
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
-        """Evaluate M settings with the values of some parameters of the ADS beside them, shape (M, n + P), at some
-        points.
+        """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.
+
+        The values stand beside the settings, shape (M, n + P).
         """
         return self._evaluate_shown(rows, stage, 0, selection, self._inputs)
 
@@ -115,8 +117,9 @@ class Evaluator:
         return evaluations
 
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
-        """`number` settings that cover the feasible part of the domain evenly; optionally, they also stay feasible when
-        filtered.
+        """`number` settings that cover the feasible part of the domain evenly.
+
+        With `feasible_after_filter`, they are also feasible after the filter.
         """
         rng, drawn = np.random.default_rng(seed), 0
 
@@ -131,8 +134,8 @@ class Evaluator:
         )
 
     def random_settings(self, number: int) -> FloatArray:
-        """The first `number` random vehicles of the study, uniform over the domain's feasible part: those that `risk`
-        draws, too.
+        """The first `number` random vehicles of the study, uniform over the feasible part of the domain; `risk` draws
+        the same ones.
         """
         bounds, seed = self.characteristics, self.study.search.seed
         rng = np.random.default_rng(seed)
@@ -156,8 +159,7 @@ class Evaluator:
         cell_count = len(rater.protocol.cells)
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
-        task = Task(study=self.study, inputs=self._inputs)
-        tasks = [msgspec.structs.replace(task, cells=(part, parts)) for part in range(parts)]
+        tasks = [Task(study=self.study, inputs=self._inputs, cells=(part, parts)) for part in range(parts)]
         results, done = list[CellResults](), 0
 
         def show_more_done(part: int, size: int) -> None:
@@ -166,13 +168,14 @@ class Evaluator:
             self.progress(stage, done, cell_count)
 
         self.progress(stage, done, cell_count)
-        for evaluations in evaluate_batches([Batch(one.packed, settings) for one in tasks], self._pool, show_more_done):
+        batches = [Batch(task.packed, settings) for task in tasks]
+        for evaluations in evaluate_batches(batches, self._pool, show_more_done):
             if evaluations.cells is None:
                 reason = evaluations.reason(int(np.argmax(evaluations.failed)))
                 raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
             results.append(evaluations.cells)
         self.simulated += len(settings)
-        order = np.argsort(np.concatenate(cells))
+        order = np.argsort(np.concatenate(cells))  # restores the order of the cells
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in zip(*results, strict=True))
 
     def evaluate_original(self) -> Evaluations:
@@ -196,8 +199,8 @@ class Evaluator:
         return ask_why_no_verdict(self.study, self._pool)
 
     def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:
-        """The criterion that an option states, or the default: that of the solutions, or of a study without results, of
-        its whole domain.
+        """The criterion that an option states, or else the default for the solutions of results, or for settings over
+        the whole domain of a study.
 
         Raises what `parse_criterion` and `Unsafe.default_among` raise.
         """
@@ -205,14 +208,16 @@ class Evaluator:
             return self.parse_criterion(text)
         if not isinstance(source, Study) and len(source.solutions):
             return source.unsafe
-        original = others = self.evaluate_original() if original is None else original
-        if RATING_POINTS.name not in original.metrics:  # a lost point depends on the original vehicle alone
-            others = self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain")
-        return Unsafe.default_among(others, original)
+        original = original or self.evaluate_original()
+        if RATING_POINTS.name in original.metrics:  # a lost point depends on the original vehicle alone
+            return Unsafe.default_among(original, original)
+        evaluations = self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain")
+        return Unsafe.default_among(evaluations, original)
 
     def parse_criterion(self, text: str) -> Unsafe:
-        """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without
-        a rating.
+        """Parse the criterion that an option states.
+
+        Raises what `Unsafe.parse` raises, and an error if the criterion is about points and the study is not rated.
         """
         criterion = Unsafe.parse(text)
         if criterion.points is not None and not is_rated(self.study):
@@ -234,7 +239,7 @@ class Evaluator:
     def for_sets(self, fits: int) -> list[Evaluator]:
         """An evaluator for each of the first `fits` parameter sets, the study's own first; none without [spread].
 
-        Scene and equations are the study's, so that nothing is simulated in SUMO once more.
+        No setting is verified in SUMO, because scene and equations are those of the study.
         """
         studies = studies_of_sets(self.study)[:fits] if fits and self.study.spread else []
         return [self.for_study(study, verified=0) for study in studies]
@@ -261,7 +266,7 @@ def open_evaluator(
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
-    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they spread evenly if `number` is a power of
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they are most even if `number` is a power of
     two.
     """
     import scipy  # takes longer to load than a simulation

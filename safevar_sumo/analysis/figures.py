@@ -32,24 +32,15 @@ colours too.
 def new_figure(
     title: str, rows: int, columns: int, size: tuple[float, float], **options: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure outside pyplot's state, and its axes, shape (rows, columns). `size` is in inches; `options` go to
-    `Figure.subplots`.
+    """A figure, which pyplot does not know, and its axes, shape (rows, columns).
+
+    `size` is in inches; `options` go to `Figure.subplots`.
     """
     import matplotlib.style
     from matplotlib.figure import Figure
 
-    with matplotlib.style.context(
-        [
-            "seaborn-v0_8-whitegrid",
-            {
-                "font.size": FONT_SIZE,
-                "axes.labelsize": FONT_SIZE,
-                "axes.titlesize": FONT_SIZE,
-                "xtick.labelsize": FONT_SIZE,
-                "ytick.labelsize": FONT_SIZE,
-            },
-        ]
-    ):
+    texts = ("font.size", "axes.labelsize", "axes.titlesize", "xtick.labelsize", "ytick.labelsize")
+    with matplotlib.style.context(["seaborn-v0_8-whitegrid", dict.fromkeys(texts, FONT_SIZE)]):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
     figure.suptitle(escape_dollars(title), fontsize=FONT_SIZE + 2)

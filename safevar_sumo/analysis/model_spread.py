@@ -21,14 +21,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
-"""Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
+"""Half the width [standard deviations] of the interval that holds `BAND_SHARE` of a normal distribution."""
 ROUNDING_TOLERANCE = 1e-5
 """Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of
 [spread].
 """
 LEAST_DISTANCE = 0.3
-"""Distance [domain widths] that the model's error assumes of nearer vehicles: near the original too, a decision may
-fall a frame off.
+"""The model's error takes no vehicle as nearer to the original than this distance [domain widths]: near the original,
+too, a decision may fall a frame off.
 """
 
 
@@ -81,9 +81,7 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
 
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the
-    model's error.
-    """
+    """Lower and upper ends, shape (M,) each, of the band of the sets' predictions for M settings."""
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(study, evaluations[0].settings)
     return prediction_band(
         np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error
@@ -91,8 +89,7 @@ def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArra
 
 
 def error_distance(study: Study, settings: FloatArray) -> FloatArray:
-    """Distance of settings from the original vehicle to which the model's error is proportional [domain widths]; shape
-    (M,).
+    """The distance of settings from the original vehicle to which the model's error is proportional, shape (M,).
 
     It is the Euclidean distance, each characteristic in widths of its domain, but at least `LEAST_DISTANCE`.
     """
@@ -104,12 +101,14 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
 def prediction_band(
     safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it
-    on each side.
+    """Lower and upper ends, shape (M,) each, of the band of predicted safety degrees, shape (sets, M).
+
+    Repeats of a simulation, with the standard deviation `repeatability`, and the model's `error` widen the band on each
+    side.
     """
     ends = np.full((2, safety_degrees.shape[1]), np.nan)
-    defined, shares = np.isfinite(safety_degrees).any(axis=0), [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2]
-    ends[:, defined] = np.nanquantile(safety_degrees[:, defined], shares, axis=0)
+    is_defined, shares = np.isfinite(safety_degrees).any(axis=0), [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2]
+    ends[:, is_defined] = np.nanquantile(safety_degrees[:, is_defined], shares, axis=0)
     lower, upper = ends
     return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error
 
@@ -117,8 +116,8 @@ def prediction_band(
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
     systems = [
-        assemble(variant, study.source if k == 0 else f"{study.source}: spread: set {k}")
-        for k, variant in enumerate(studies_of_sets(study))
+        assemble(study_of_set, f"{study.source}: spread: set {k}" if k else study.source)
+        for k, study_of_set in enumerate(studies_of_sets(study))
     ]
     if point:
         systems = [system_at_point(system, point, source="point") for system in systems]
@@ -144,8 +143,9 @@ def studies_of_sets(study: Study) -> list[Study]:
 
 
 def parameters_outside_sets(study: Study) -> list[str]:
-    """The parameters under [spread] whose value in `study` is not that of the first set: the sets say nothing on other
-    values.
+    """The parameters under [spread] whose value in `study` is not that of the first set.
+
+    The sets say nothing about such a value.
     """
     return [
         key
@@ -163,8 +163,9 @@ def remarks_on_sets(study: Study) -> list[str]:
 
 
 def with_values(study: Study, values: Mapping[str, float], stated_in: str = "calibration") -> Study:
-    """A study with other values of some parameters, named by their keys in the study file; errors name the table
-    `stated_in`.
+    """A study with other values of some parameters, which are named by their keys in the study file.
+
+    Errors name the table `stated_in`, which has the values.
 
     Raises
     ------

@@ -52,8 +52,11 @@ class Option(NamedTuple):
         below_high = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
         if above_low and below_high:
             return ""
-        ends = [f"{'above' if self.is_open[0] else 'at least'} {self.low:,g}"] if self.low is not None else []
-        ends += [f"{'below' if self.is_open[1] else 'at most'} {self.high:,g}"] if self.high is not None else []
+        ends = []
+        if self.low is not None:
+            ends.append(f"{'above' if self.is_open[0] else 'at least'} {self.low:,g}")
+        if self.high is not None:
+            ends.append(f"{'below' if self.is_open[1] else 'at most'} {self.high:,g}")
         return f"a number {' and '.join(ends)}"
 
 
@@ -70,9 +73,8 @@ def unsafe_option() -> Any:
         None,
         f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {default}]",
         metavar="collision|below=X|points=X",
-        python='What is unsafe: `"collision"`, or a number X for a safety degree below X [m, or minus a '
-        "collision's speed in "
-        f"m/s], or an `Unsafe`. By default {default}.",
+        python='What is unsafe: `"collision"`, or a number X for a safety degree below X [m, or minus a collision\'s '
+        f"speed in m/s], or an `Unsafe`. By default {default}.",
     )
 
 
@@ -95,8 +97,9 @@ class Options:
             if definition.form != "one" and value is not None and not isinstance(value, Mapping):
                 object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
             if value is not None and definition.kind in (int, float):
-                if isinstance(value, bool) or not isinstance(value, Integral if definition.kind is int else Real):
-                    raise InputError(name, repr(value), "a whole number" if definition.kind is int else "a number")
+                number, words = (Integral, "a whole number") if definition.kind is int else (Real, "a number")
+                if isinstance(value, bool) or not isinstance(value, number):
+                    raise InputError(name, repr(value), words)
                 if expected := definition.expected_range(float(value)):
                     raise InputError(name, repr(value), expected)
 
@@ -127,7 +130,9 @@ class Options:
                 parts += [f"{flag} {quote(str(element))}" for element in value]
             else:
                 parts.append(f"{flag} {quote(','.join(value) if definition.form == 'commas' else str(value))}")
-        return " ".join([*parts, *([f"--point {quote(point)}"] if point else [])])
+        if point:
+            parts.append(f"--point {quote(point)}")
+        return " ".join(parts)
 
 
 COMMON_ARGUMENTS = """pool
@@ -153,8 +158,9 @@ QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
 def document_options(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
-    """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the
-    first argument.
+    """Decorator: appends the options, and the arguments that all questions have, to the docstring of a function.
+
+    The docstring must end with the first argument.
     """
 
     def append_arguments(function: QuestionFunction) -> QuestionFunction:

@@ -2,8 +2,8 @@
 
 If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible
 moment avoids it, the vehicle is the cause. UN R157 means its driver for cars that cut in, cut out or brake on
-motorways; its use for pedestrians is ours. So the share that he avoids is a range: it is computed for a later reaction,
-too.
+motorways; its use for pedestrians is ours. So the share of collisions that he avoids is a range: it is computed for a
+later reaction, too.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ Avoidance = tuple[PreventableBy, bool]
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Counts of collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
+    """Counts of collisions, or of a random sample of them, by category: the weakest driver that avoids a collision.
 
-    The collisions are the distinct solutions that collide, or of a study without results the drawn settings that
-    collide.
+    The collisions are the distinct solutions that collide; without results, the settings drawn from the study's domain
+    that collide.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Preventability:
 
     @property
     def range_in_words(self) -> str:
-        """The share that the competent driver avoids: `71 % (39 % if he needs 0.4 s longer)`."""
+        """The share of collisions that the competent driver avoids: `71 % (39 % if he needs 0.4 s longer)`."""
         later = share_in_words(self.later / max(self.looked_at, 1))
         return f"{share_in_words(self.share(PreventableBy.COMPETENT_DRIVER))} ({later} if he needs {DELAY:g} s longer)"
 
@@ -130,7 +130,7 @@ def assess_preventability(
     If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the
     study's seed. A setting that cannot be simulated with a reference driver is not counted.
     """
-    distinct = np.unique(collisions.settings, axis=0, return_index=True)[1]
+    _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
     sample = shuffled[: max(max_simulations // SIMULATIONS, 1)]
     avoidances = list(filter(None, classify_collisions(evaluator, collisions.take(sample))))
@@ -142,7 +142,7 @@ def assess_preventability(
 
 
 def classify_collisions(evaluator: Evaluator, collisions: Evaluations) -> list[Avoidance | None]:
-    """Who avoids each of M evaluated collisions, simulated at its worst point; None where that cannot be simulated."""
+    """Who avoids each of M evaluated collisions at its worst point; None if a reference driver cannot be simulated."""
     avoidances: list[Avoidance | None] = [None] * len(collisions)
     system = assemble(evaluator.study)
     worst = np.zeros(len(collisions), dtype=np.intp) if collisions.worst_points is None else collisions.worst_points
@@ -161,20 +161,20 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
 
     def drive(driver: str, rows: FloatArray, **parameters: float) -> Evaluations:
         ads = ModelTable(model=driver, parameters={**approach, **parameters})
-        driven = evaluator.for_study(replace(evaluator.study, ads=ads))
-        return driven.evaluate(rows, "reference drivers in the same vehicle")
+        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads))
+        return with_driver.evaluate(rows, "reference drivers in the same vehicle")
 
-    first = drive("competent_driver", settings)
+    competent = drive("competent_driver", settings)
     later = drive("competent_driver", settings, reaction_time=LATER_REACTION)
-    full_braking = drive("full_braking", settings[first.collided])
-    category = np.full(len(settings), PreventableBy.COMPETENT_DRIVER, dtype=object)
-    category[first.collided] = np.where(full_braking.collided, PreventableBy.NOBODY, PreventableBy.FULL_BRAKING)
-    valid = first.valid.copy()
-    valid[first.collided] = full_braking.valid
-    avoided = (later.valid & ~later.collided).tolist()
+    full_braking = drive("full_braking", settings[competent.collided])
+    categories = np.full(len(settings), PreventableBy.COMPETENT_DRIVER, dtype=object)
+    categories[competent.collided] = np.where(full_braking.collided, PreventableBy.NOBODY, PreventableBy.FULL_BRAKING)
+    is_valid = competent.valid.copy()
+    is_valid[competent.collided] = full_braking.valid
+    avoids_later = (later.valid & ~later.collided).tolist()
     return [
-        (PreventableBy(by), late) if is_valid else None
-        for by, late, is_valid in zip(category, avoided, valid, strict=True)
+        (PreventableBy(category), avoids) if valid else None
+        for category, avoids, valid in zip(categories, avoids_later, is_valid, strict=True)
     ]
 
 

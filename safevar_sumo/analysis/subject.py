@@ -1,4 +1,4 @@
-"""Subjects of questions: a study, or results read back from their directory."""
+"""Subjects of questions: a study, or results read from their directory."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Results:
     directory
         The directory.
     case
-        Study, solutions and evaluations, the input of the research questions.
+        Study, solutions and evaluations, from which the research questions are answered.
     """
 
     directory: Path
@@ -123,7 +123,7 @@ def load(directory: str | Path) -> Results:
 def study_or_case(
     source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False
 ) -> Study | Case:
-    """The subject of a question: a study, or the case of results, which may be named by their directory.
+    """The subject of a question: a study, or the case of results; `source` may be a name or a path.
 
     With `results_only`, a name or path means a directory, even if a study has the same name.
 
@@ -269,7 +269,7 @@ def answer_question(
 def answer_call(
     compute: Callable[..., Answer], options: type[Options], arguments: JsonObject, *, results_only: bool = False
 ) -> Answer:
-    """Answer a call of a question's function with these `arguments`, its local names; the first is the subject."""
+    """Answer a call of a question's function; `arguments` are its arguments by name, the subject first."""
     from safevar_sumo.metrics import Unsafe
 
     source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]

@@ -23,8 +23,9 @@ OUTCOME_VERBS = {
 
 
 def ending_in_words(outcome: str, safety_degree: float | None) -> str:
-    """How a run ended, such as `collides at 3.21 m/s` or `stops, safety degree 0.87 m`; the safety degree is in m, or
-    -m/s on a collision.
+    """How a run ended, such as `collides at 3.21 m/s` or `stops, safety degree 0.87 m`.
+
+    The safety degree is in m, or -m/s on a collision.
     """
     degree = "" if safety_degree is None or math.isnan(safety_degree) else f"{abs(safety_degree):.2f}"
     if outcome == Outcome.COLLISION:
@@ -37,13 +38,11 @@ def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]
     %)`.
     """
     texts = []
-    for characteristic in characteristics:
-        original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
+    for item in characteristics:
+        original, value = item.original, values.get(item.name, item.original)
         if value != original:
-            texts.append(
-                f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
-                f"({100 * (value - original) / abs(original):+.1f} %)"
-            )
+            share = 100 * (value - original) / abs(original)
+            texts.append(f"{item.name} {original:g} -> {item.text(value)}{item.suffix} ({share:+.1f} %)")
     return texts
 
 
@@ -62,7 +61,7 @@ def simulate_command(study: str, values: Mapping[str, float], point: str = "") -
 
 def question_command(question: str, subject: str, point: str = "") -> str:
     """The command that asks a question about results or a study; `point` may name a point of the study's matrix."""
-    return " ".join([PROGRAM_COMMAND, question, quote(subject), *(["--point", quote(point)] if point else [])])
+    return f"{PROGRAM_COMMAND} {question} {quote(subject)}" + (f" --point {quote(point)}" if point else "")
 
 
 def join_phrases(phrases: Iterable[str]) -> str:
@@ -88,12 +87,14 @@ def points_in_words(failing_points: Sequence[str], point_count: int) -> str:
 
 
 def share_in_words(share: float) -> str:
-    """A share with two digits, such as `14 %`; `all` and `none` only if it is exactly that."""
+    """A share in whole per cent, such as `14 %`; `all` and `none` only if it is exactly that."""
     if share in (0, 1):
         return "all" if share else "none"
-    return "nearly all" if share >= 0.995 else "hardly any" if share < 0.005 else f"{100 * share:.0f} %"
+    if share >= 0.995:
+        return "nearly all"
+    return "hardly any" if share < 0.005 else f"{100 * share:.0f} %"
 
 
 def two_decimals(value: float | None) -> str:
-    """Two decimals, never `-0.00`; `-` if undefined."""
-    return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"
+    """A value with two decimals, never `-0.00`; `-` if undefined."""
+    return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"  # -0.0 + 0.0 is 0.0

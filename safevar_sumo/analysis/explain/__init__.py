@@ -84,4 +84,4 @@ def explain(
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 
-    return answer_call(explain_failures, ExplainOptions, locals())  # `locals()`: the arguments by name, in their order
+    return answer_call(explain_failures, ExplainOptions, locals())

@@ -30,25 +30,6 @@ MAX_DISTINCT_CAUSES = 10
 """Maximum number of distinct causes in the table of all failures."""
 MAX_NECESSARY = 4
 """Maximum number of characteristics that a sentence names as necessary."""
-FRAME_COLUMNS = (
-    "failure",
-    "algorithm",
-    "run",
-    "index",
-    "cause",
-    "characteristic",
-    "unit",
-    "original",
-    "value",
-    "boundary",
-    "alone",
-    "fraction",
-    "outcome",
-    SAFETY_DEGREE,
-    "robustness",
-    "whose",
-    "points",
-)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -115,7 +96,9 @@ class Explained(Answer):
         counts = f"{self.failures} of {vehicles} are unsafe: {self.unsafe.description}."
         if self.otherwise:
             counts += f" {number_of(self.otherwise, 'setting')} with another outcome than recorded."
-        return f"{counts} {self.across_fits}" if self.across_fits else counts
+        if self.across_fits:
+            counts += f" {self.across_fits}"
+        return counts
 
     @property
     def verdict(self) -> list[str]:
@@ -262,7 +245,9 @@ class Explained(Answer):
             for item in failure.characteristics
             if item.name in cause.changes
         ]
-        return pd.DataFrame(rows, columns=list(FRAME_COLUMNS))
+        columns = ["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original"]
+        columns += ["value", "boundary", "alone", "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"]
+        return pd.DataFrame(rows, columns=columns)
 
     def figure(self) -> Figure:
         """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""

@@ -191,12 +191,12 @@ def measure_braking(runs: SimulationRuns, column: int) -> Braking | None:
         return None
     initial_speed, delay = float(relative_speed[onset]), (followed - onset) * trace.step
     has_collided = nearest is None or np.isfinite(runs.collision_speed[column])
-    delay_distance = float(relative_position[followed] - relative_position[onset])
+    mean_speed = float(relative_position[followed] - relative_position[onset]) / delay if delay else initial_speed
     return Braking(
         gap=float(trace.gap[onset, column]),
         speed=initial_speed + obstacle_speed,
         delay=delay,
-        speed_deficit=initial_speed - delay_distance / delay if delay else 0.0,
+        speed_deficit=initial_speed - mean_speed,
         speed_lost=initial_speed - float(relative_speed[followed]),
         deceleration=specific_energy / distance,
         obstacle_speed=obstacle_speed,

@@ -376,8 +376,8 @@ def find_boundary_shares(
     The error is at most `RESOLUTION` times the line above `lowest`. A setting that cannot be simulated is neither safe
     nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
     """
-    number, rows = len(starts), np.arange(len(starts))
-    lowest = np.broadcast_to(lowest, number)
+    number = len(starts)
+    rows, lowest = np.arange(number), np.broadcast_to(lowest, number)
     low, high, low_is_valid = lowest, np.ones(number), np.ones(number, dtype=bool)
     for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts

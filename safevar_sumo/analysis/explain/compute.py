@@ -38,7 +38,7 @@ from safevar_sumo.analysis.words import list_of_changes, question_command
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
-from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, choose_handle, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, worst_points
@@ -69,14 +69,12 @@ def explain_failures(
     study, characteristics = evaluator.study, evaluator.characteristics
     population = _evaluate(source, options, evaluator)
     limit = options.limit // len(assemble(study).points)  # an evaluation simulates a setting at every point
-    settings, sample, reasons = population.evaluations.settings, list[int](), Reasons()
-    if options.solutions:
-        sample, reasons = population.rows, {row: ("requested",) for row in population.rows}
-    else:
+    settings, sample = population.evaluations.settings, population.rows
+    reasons: Reasons = dict.fromkeys(population.rows, ("requested",))
+    if not options.solutions:
         reasons = _choose_rows(population, limit)
-        if statistics:
-            affordable = select_affordable_rows(settings[population.rows], evaluator, limit)
-            sample = [population.rows[index] for index in affordable]
+        affordable = select_affordable_rows(settings[population.rows], evaluator, limit) if statistics else []
+        sample = [population.rows[index] for index in affordable]
     analysed = sorted({*sample, *reasons})
     causes = dict(zip(analysed, find_minimal_causes(evaluator, settings[analysed], population.unsafe), strict=True))
     sample_causes = [causes[row] for row in sample]
@@ -84,7 +82,9 @@ def explain_failures(
     if not options.solutions:
         reasons = _add_distinct_causes(population, sample, reasons, causes, distinct["cause"], options.top)
     models = evaluator.for_sets(options.fits if statistics and len(population.evaluations) else 0)
-    preventability = assess_preventability(evaluator, _collisions(study, population.evaluations))
+    preventability = assess_preventability(
+        evaluator, population.evaluations.take(_is_assessed(study, population.evaluations))
+    )
     necessity = necessity_frame(
         characteristics, characteristics.changed(settings[sample]), sample_causes, len(population.rows)
     )
@@ -161,11 +161,11 @@ def _evaluate(source: Study | Case, options: ExplainOptions, evaluator: Evaluato
     return Population(evaluator, original, evaluations, handles, criterion, rows, int(otherwise))
 
 
-def _collisions(study: Study, evaluations: Evaluations) -> Evaluations:
-    """The collisions whose preventability is assessed; none in a rated study, where every vehicle collides in some
-    cell.
+def _is_assessed(study: Study, evaluations: Evaluations) -> BoolArray:
+    """Which vehicles collide, so that their preventability is assessed; none in a rated study, where every vehicle
+    collides in some cell.
     """
-    return evaluations.take(evaluations.collided & (not is_rated(study)))
+    return evaluations.collided & (not is_rated(study))
 
 
 def _choose_rows(population: Population, limit: int) -> Reasons:
@@ -229,11 +229,11 @@ def _explain_rows(
         replace(cause, neighbours=robustness, sets=len(models), holds=holds)
         for cause, robustness, holds in zip(described, of_causes, count_holding(models, described, unsafe), strict=True)
     )
-    collisions = _collisions(study, failures)
-    avoidances = dict(zip(map(bytes, collisions.settings), classify_collisions(evaluator, collisions), strict=True))
+    is_assessed = _is_assessed(study, failures)
+    avoidances = iter(classify_collisions(evaluator, failures.take(is_assessed)))
     explanations = []
     for index, (row, (comparison, points)) in enumerate(zip(reasons, comparisons, strict=True)):
-        avoidance = avoidances.get(bytes(settings[index]))
+        avoidance = next(avoidances) if is_assessed[index] else None
         explanations.append(
             Explanation(
                 characteristics=characteristics,
@@ -275,8 +275,8 @@ def compare_at_points(
     comparisons = []
     for vehicle in range(1, len(worst)):  # vehicle 0 is the original
         point, evaluations, runs = results[worst[vehicle]]
-        indices = np.flatnonzero(is_unsafe[:, vehicle]).tolist() if system.matrix else []
-        unsafe_points = tuple(system.matrix[index].name for index in indices)
+        names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
+        unsafe_points = tuple(filter(None, names))  # without a matrix, the only point has no name
         comparisons.append((compare_braking(runs, vehicle, evaluations.f_safe, point.name), unsafe_points))
     return comparisons
 

@@ -190,12 +190,12 @@ def sample_box(
     accepts. Later tests draw more settings, so that the bound stays `MAX_UNSAFE_SHARE` if all of them are safe.
     """
     error_probability = (1 - CONFIDENCE) / 2**attempt
-    number = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
-    settings = random_settings(evaluator, columns, *ends, number, np.random.default_rng(seed))
+    count = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
+    settings = random_settings(evaluator, columns, *ends, count, np.random.default_rng(seed))
     evaluations = evaluator.evaluate(settings, stage)
     unsafe_settings = settings[unsafe.of(evaluations)]
     failed = int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
-    at_most, not_safe, safe = 1.0, len(unsafe_settings) + failed, len(settings) - len(unsafe_settings) - failed
-    if safe:
-        at_most = float(scipy.stats.beta.ppf(1 - error_probability, not_safe + 1, safe))
-    return unsafe_settings, len(settings), failed, at_most
+    number, at_most = len(settings), 1.0
+    if safe := number - len(unsafe_settings) - failed:
+        at_most = float(scipy.stats.beta.ppf(1 - error_probability, number - safe + 1, safe))
+    return unsafe_settings, number, failed, at_most

@@ -38,8 +38,7 @@ CAUSES_PER_ROUND = 4
 """Approximate number of unsafe settings of a search whose causes are sought."""
 ROUNDING = 1e-9
 """Rounding errors of a setting, as a share of the domain."""
-LEAST_SHARE = 1e-9
-"""Share of the domain as which a smaller width counts, so that its logarithm is finite."""
+
 STAGE = "limits together"
 
 
@@ -230,7 +229,7 @@ class _BoxSearch:
     def _log_volume(self, boxes: FloatArray) -> FloatArray:
         """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
         shares = np.divide(boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0)
-        return np.asarray(np.sum(np.log(np.maximum(shares, LEAST_SHARE)), axis=-1))
+        return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))  # finite for a width of 0, too
 
     def widened(self, sides: FloatArray) -> FloatArray:
         """Move each free side of a box outwards in steps, until something unsafe is in the next step or the domain
@@ -314,8 +313,9 @@ def find_joint_limits(
         kept = attempt < MAX_ROUNDS and not len(search.attack(search.fixed))
         sides = search.best(start) if kept else search.fixed
         ends, stream = search.ends(sides), (evaluator.study.search.seed, 1, attempt)
-        stage = "test of the limits together"
-        unsafe_samples, samples, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
+        unsafe_samples, samples, failed, at_most = sample_box(
+            evaluator, columns, unsafe, ends, attempt, stream, "test of the limits together"
+        )
         if not kept or not len(unsafe_samples):
             break
         search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_samples])

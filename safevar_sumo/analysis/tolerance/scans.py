@@ -5,7 +5,7 @@ values.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -258,13 +258,13 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
         flags.reshape(len(planes), GRID_VALUES, GRID_VALUES)
         for flags in (unsafe.of(evaluations), evaluations.valid, ~evaluations.valid & ~evaluations.infeasible)
     )
-    searches = [_NearestSearch(grid, characteristics, plane) for grid, plane in zip(is_unsafe, planes, strict=True)]
+    searches = [_search_nearest(grid, characteristics, plane) for grid, plane in zip(is_unsafe, planes, strict=True)]
+    rounds = [next(search) for search in searches]
     for _ in range(PLANE_ROUNDS):
-        values = [search.values for search in searches]
-        is_unsafe_value = unsafe.of(evaluate(values, "nearest unsafe settings"))
-        parts = np.split(is_unsafe_value, np.cumsum(list(map(len, values)))[:-1])
-        for search, part in zip(searches, parts, strict=True):
-            search.divide(part.reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1))
+        to_evaluate = [settings for _, settings in rounds]
+        is_unsafe_setting = unsafe.of(evaluate(to_evaluate, "nearest unsafe settings"))
+        parts = np.split(is_unsafe_setting, np.cumsum(list(map(len, to_evaluate)))[:-1])
+        rounds = [search.send(part) for search, part in zip(searches, parts, strict=True)]
     weights = np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)  # the trapezoidal rule's
     unsafe_area, valid_area, not_simulated_area = (
         np.sum(np.outer(weights, weights) * flags, axis=(1, 2)) for flags in (is_unsafe, is_valid, is_not_simulated)
@@ -275,50 +275,48 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
             characteristics=names[k],
             unsafe_share=float(unsafe_area[k] / valid_area[k]) if valid_area[k] else 0.0,
             not_simulated_share=float(not_simulated_area[k] / weights.sum() ** 2),
-            nearest=next((dict(zip(names[k], row.tolist(), strict=True)) for row in search.nearest), None),
+            nearest=dict(zip(names[k], nearest[0].tolist(), strict=True)) if len(nearest) else None,
         )
-        for k, search in enumerate(searches)
+        for k, (nearest, _) in enumerate(rounds)
     ]
 
 
-class _NearestSearch:
-    """The search for the unsafe setting of a plane nearest to the original; distances are in domain widths.
+def _search_nearest(
+    grid: BoolArray, characteristics: CharacteristicSet, plane: list[int]
+) -> Generator[tuple[FloatArray, FloatArray], BoolArray]:
+    """Search the unsafe setting of a plane that is nearest to the original; `grid` tells where the plane's grid is
+    unsafe.
 
     It is a branch and bound search. A square with an unsafe corner may hold a nearer unsafe setting, if it comes nearer
     to the original than the nearest unsafe setting so far. Each round divides the `MAX_SQUARES` nearest of these
-    squares.
+    squares. Distances are in domain widths.
 
-    Attributes
-    ----------
-    values
-        Values of the two characteristics to evaluate next, shape (K, 2).
-    nearest
-        The nearest unsafe setting so far, shape (1, 2); (0, 2) if there is none.
+    Each round yields the nearest unsafe setting so far, shape (1, 2), or (0, 2) if there is none, and the settings to
+    evaluate next, shape (K, 2); it is sent which of these are unsafe. Settings are values of the two characteristics.
     """
 
-    def __init__(self, grid: BoolArray, characteristics: CharacteristicSet, plane: list[int]) -> None:
-        """Begin with the plane's `grid`: which of its settings are unsafe."""
-        self.original, self.lower = characteristics.original[plane], characteristics.lower[plane]
-        self.width = characteristics.upper[plane] - self.lower
-        # Lower corners of the areas that `values` divide into squares, and the squares' size; at first the whole plane.
-        self.areas, self.size = self.lower[np.newaxis], self.width / (GRID_VALUES - 1)
-        self.values, self.nearest = self.lower + np.argwhere(np.ones_like(grid)) * self.size, np.zeros((0, 2))
-        self.divide(grid[np.newaxis])
+    def distances(offsets: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.sum((offsets / width) ** 2, axis=-1)))
 
-    def divide(self, grids: BoolArray) -> None:
-        """Divide the nearest squares; `grids`, shape (areas, P, P), state which of `values` are unsafe."""
-        known = np.concatenate([self.nearest, self.values[grids.ravel()]])
-        self.nearest = known[np.argsort(self._distances(known - self.original), kind="stable")[:1]]
-        has_unsafe_corner = grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1]
-        area, i, j = np.nonzero(has_unsafe_corner)
-        corners = self.areas[area] + np.stack([i, j], axis=1) * self.size
-        offset = corners - self.original
-        gaps = self._distances(np.maximum(np.maximum(offset, -offset - self.size), 0.0))
+    original, lower, upper = (
+        ends[plane] for ends in (characteristics.original, characteristics.lower, characteristics.upper)
+    )
+    width = upper - lower
+    size = width / (GRID_VALUES - 1)
+    settings = lower + np.argwhere(np.ones_like(grid)) * size
+    steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
+    # `areas` are the lower corners of areas that `grids` divide into squares of `size`; at first of the whole plane.
+    nearest, areas, grids = np.zeros((0, 2)), lower[np.newaxis], grid[np.newaxis]
+    while True:
+        known = np.concatenate([nearest, settings[grids.ravel()]])
+        nearest = known[np.argsort(distances(known - original), kind="stable")[:1]]
+        # Squares with an unsafe corner.
+        area, i, j = np.nonzero(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
+        corners = areas[area] + np.stack([i, j], axis=1) * size
+        offset = corners - original
+        gaps = distances(np.maximum(np.maximum(offset, -offset - size), 0.0))
         order = np.argsort(gaps, kind="stable")
-        is_nearer = gaps[order] < np.min(self._distances(self.nearest - self.original), initial=math.inf)
-        self.areas, self.size = corners[order[is_nearer][:MAX_SQUARES]], self.size / PARTS_PER_SIDE
-        steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
-        self.values = np.minimum(self.areas[:, np.newaxis] + steps * self.size, self.lower + self.width).reshape(-1, 2)
-
-    def _distances(self, offsets: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.sum((offsets / self.width) ** 2, axis=-1)))
+        is_nearer = gaps[order] < np.min(distances(nearest - original), initial=math.inf)
+        areas, size = corners[order[is_nearer][:MAX_SQUARES]], size / PARTS_PER_SIDE
+        settings = np.minimum(areas[:, np.newaxis] + steps * size, lower + width).reshape(-1, 2)
+        grids = (yield nearest, settings).reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)
