@@ -16,8 +16,6 @@ from safevar_sumo.study import SAFETY_DEGREE, MetricsTable, unit_text
 
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
-
-
 STUDY_SOURCE = "study"
 """Source of errors about a study's table [metrics], in functions that do not know the study's file."""
 
@@ -43,8 +41,9 @@ def sampling_stride(step: float, interval: float | None) -> int:
 
 
 def sum_in_order(samples: FloatArray) -> FloatArray:
-    """Sum over the first axis, in order; in numpy's own sum the order depends on the shape, and results would depend on
-    N.
+    """Sum over the first axis, in order.
+
+    In numpy's own sum the order depends on the shape, so that a vehicle's result would depend on N.
     """
     return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
 
@@ -138,7 +137,7 @@ def guard_metric(metric: Any, guard: Guard) -> Metric:
         values = guard.call(facts.name, metric.function, read_only_copy(runs), thresholds)
         return guard.numbers(facts.name, "values", values, (len(runs.outcome),), Legal(undefined=True))
 
-    return Metric(**{name: getattr(facts, name) for name in MetricFacts.__struct_fields__}, function=guarded_function)
+    return Metric(**msgspec.structs.asdict(facts), function=guarded_function)
 
 
 class Objective(Struct, frozen=True, kw_only=True):

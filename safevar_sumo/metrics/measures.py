@@ -1,6 +1,6 @@
 """The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), and a rating's points.
 
-Below them metrics of longitudinal comfort, which a study has only if it names them: jerk, weighted acceleration, harsh
+Metrics of longitudinal comfort follow, which a study has only if it names them: jerk, weighted acceleration, harsh
 braking.
 """
 
@@ -95,16 +95,14 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     Positive for a loss of speed; shape (N,); NaN for a vehicle that never braked.
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
-    interval = stride * runs.trace.step
     speed, active = runs.trace.speed[::stride], runs.trace.active[::stride]
     is_braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
-    decelerations = (speed[:-1] - speed[1:]) / interval
+    decelerations = (speed[:-1] - speed[1:]) / (stride * runs.trace.step)
     is_counted = is_braking[1:]
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
-    return np.asarray(
-        np.divide(deceleration_sum, sample_count, out=np.full_like(deceleration_sum, np.nan), where=sample_count > 0)
-    )
+    undefined = np.full_like(deceleration_sum, np.nan)
+    return np.asarray(np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0))
 
 
 AVE_DECE = Metric(
@@ -147,18 +145,16 @@ def _filter(
 ) -> FloatArray:
     """Samples after a second-order filter along the first axis, from rest, sample by sample: no result depends on N.
 
-    The filter is a transfer function in s, with coefficients from the highest power, by Tustin's rule.
+    The filter is a transfer function in s, with coefficients from the highest power; Tustin's rule makes it discrete.
     """
-    k, (a, b, c) = 2 / step, denominator
-    leading = a * k * k + b * k + c
-    gains = [
-        value / leading
-        for a, b, c in (numerator, denominator)
-        for value in (a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c)
-    ]
-    b0, b1, b2, _, a1, a2 = gains
+    k = 2 / step
+    (b0, b1, b2), (a0, a1, a2) = (
+        (c2 * k * k + c1 * k + c0, 2 * (c0 - c2 * k * k), c2 * k * k - c1 * k + c0)
+        for c2, c1, c0 in (numerator, denominator)
+    )
+    b0, b1, b2, a1, a2 = (gain / a0 for gain in (b0, b1, b2, a1, a2))
     result = np.zeros_like(samples)
-    x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])
+    x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])  # none is changed in place
     for i, x in enumerate(samples):
         result[i] = b0 * x + b1 * x1 + b2 * x2 - a1 * y1 - a2 * y2
         x1, x2, y1, y2 = x, x1, result[i], y1
@@ -189,9 +185,8 @@ def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
 def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
     accelerations, is_counted = _accelerations(runs)
-    squares = (
-        np.where(is_counted, weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step), 0.0) ** 2
-    )
+    weighted = weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step)
+    squares = np.where(is_counted, weighted, 0.0) ** 2
     return mask_collisions(runs, np.sqrt(sum_in_order(squares) / np.maximum(np.count_nonzero(is_counted, axis=0), 1)))
 
 

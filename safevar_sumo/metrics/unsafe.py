@@ -33,8 +33,8 @@ POINT_LOSS, POINT_DECIMALS = 1.0, 6
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A criterion: a collision; with `below`, a safety degree below this limit [m, or -m/s]; with `points`, at most
-    that many points.
+    """A criterion of an unsafe vehicle: a collision; with `below`, a safety degree below this limit [m, or -m/s]; with
+    `points`, at most that many points of a rating.
     """
 
     below: float | None = None
@@ -80,8 +80,9 @@ class Unsafe:
         return outcome == COLLISION if self.below is None else column(F_SAFE.name) < self.below
 
     def margin(self, evaluations: Evaluations) -> FloatArray:
-        """Margin of evaluations above the limit, in the limit's unit; shape (M,). For collisions the limit is a safety
-        degree of 0.
+        """By how much evaluations are above the limit, in the limit's unit; shape (M,).
+
+        If the criterion is a collision, the limit is a safety degree of 0.
         """
         if self.points is not None:
             return evaluations.column(RATING_POINTS.name) - self.points
