@@ -39,7 +39,9 @@ CONSTANT_UNITS: Mapping[str, str] = {
 """Facts about the original vehicle, and the time between two calls: inputs, or parameters that are set at the start."""
 NOMINAL_PREFIX = "nominal_"
 OUTPUT_UNITS: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration": "m/s^2", "warns": "-"}
-"""Quantities that the FMU outputs, and their units; `warns` above one half is a warning."""
+"""Quantities that the FMU outputs, and their units."""
+WARNING = 0.5
+"""Value of the output `warns` above which it is a warning [-]."""
 
 
 class _Memory(NamedTuple):
@@ -118,20 +120,19 @@ class FmuAds(Ads):
         values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **memory.constants}
         history = memory.history or self._guard.call("initialisation", memory.fleet.start, values)[1]
         outputs, _, history = self._guard.call("doStep", memory.fleet.advance, history, values)
-        warns = None if "warns" not in outputs else outputs["warns"] > 0.5
+        warns = None if "warns" not in outputs else outputs["warns"] > WARNING
         memory = memory._replace(history=history, warns=warns)
+        shape = seen.speed.shape
         if "acceleration" in outputs:
-            acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], seen.speed.shape)
+            acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], shape)
             initial_trim = memory.trim or trim_at(memory.nominal, seen)
-            return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(
-                trim=initial_trim
-            )
-        pedals = (outputs.get(name, np.zeros_like(seen.speed)) for name in Command._fields)
-        checked = [
-            self._guard.numbers("doStep", name, pedal, seen.speed.shape, SHARE)
-            for name, pedal in zip(Command._fields, pedals, strict=True)
-        ]
-        return Command(*checked), memory
+            command = pedals_for(memory.nominal, seen.speed, acceleration, initial_trim)
+            return command, memory._replace(trim=initial_trim)
+        released = np.zeros(shape)
+        pedals = (
+            self._guard.numbers("doStep", name, outputs.get(name, released), shape, SHARE) for name in Command._fields
+        )
+        return Command(*pedals), memory
 
     def warns(self, memory: _Memory) -> BoolArray | None:
         return memory.warns

@@ -243,14 +243,13 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def _motion(self, world: World) -> TargetMotion:
         frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
-        constants = EncounterConstants(passed_gap=-start.extent.length - self.vut_length)
-        if self.parameter("hidden"):
-            constants = constants._replace(
-                hidden=True,
-                edge_to_middle=start.extent.length / 2,
-                setback=self.sensor_setback,
-                parked_offset=-self._parked_edge,
-            )
+        constants = EncounterConstants(
+            passed_gap=-start.extent.length - self.vut_length,
+            hidden=self.parameter("hidden"),
+            edge_to_middle=start.extent.length / 2,
+            setback=self.sensor_setback,
+            parked_offset=-self._parked_edge,
+        )
         direction, extent, profile = start.direction, start.extent, start.profile
         impact_position = start.mover.impact_position(frame, world, start.impact_left)
 

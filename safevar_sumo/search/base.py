@@ -40,11 +40,11 @@ class Problem:
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Unfiltered settings, drawn uniformly in the domains and feasible after the filter; shape (number, n)."""
         lower, upper = self.characteristics.lower, self.characteristics.upper
-        if not self.region:
-            return rng.uniform(lower, upper, (number, len(lower)))
-        return self.region.draw_feasible(
-            lambda count: rng.uniform(lower, upper, (count, len(lower))), number, rng, filtered=True
-        )
+
+        def draw(count: int) -> FloatArray:
+            return rng.uniform(lower, upper, (count, len(lower)))
+
+        return self.region.draw_feasible(draw, number, rng, filtered=True) if self.region else draw(number)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape (k,)."""

@@ -100,11 +100,10 @@ class _Ranges:
         """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the original until it is
         feasible.
         """
-        setting = self._draw_setting(rng)
-        for _ in range(MAX_REDRAWS):
+        for _ in range(1 + MAX_REDRAWS):
+            setting = self._draw_setting(rng)
             if self._problem.feasible(setting[np.newaxis])[0]:
                 return setting
-            setting = self._draw_setting(rng)
         return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
 
     def _draw_setting(self, rng: np.random.Generator) -> FloatArray:

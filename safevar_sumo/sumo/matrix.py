@@ -61,15 +61,18 @@ def point_record(result: PointResult) -> JsonObject:
     [km/h]; the time to collision at the first warning [s]; the side of the contact, and the position along that side
     [%].
     """
-    evaluations, relative_speed = result.evaluations, result.runs.relative_speed
+    evaluations, runs = result.evaluations, result.runs
+    test_speed_error, warning_ttc, side, place = (
+        np.broadcast_to(column, len(evaluations))[0]
+        for column in (runs.test_speed_error, runs.warning_ttc, *runs.contact)
+    )
     values = {
         "impact_speed": evaluations.collision_speed[0],
-        "relative_impact_speed": relative_speed[0],
+        "relative_impact_speed": runs.relative_speed[0],
         SAFETY_DEGREE: evaluations.f_safe[0],
-        "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[0] / KMH,
-        "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[0],
+        "test_speed_error": test_speed_error / KMH,
+        "warning_ttc": warning_ttc,
     }
-    side, place = (np.broadcast_to(column, relative_speed.shape)[0] for column in result.runs.contact)
     return {
         "point": result.point.name,
         **dict(result.point.parameters),

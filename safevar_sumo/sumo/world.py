@@ -78,19 +78,20 @@ class SumoWorld:
 
     def set_types(self, types: SumoType) -> None:
         vehicletype = self.api.vehicletype
-        columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
-        for id_, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
-            vehicletype.setMass(id_, mass)
-            vehicletype.setAccel(id_, accel)
-            vehicletype.setMaxSpeed(id_, max_speed)
-            vehicletype.setTau(id_, tau)
+        self._set(vehicletype.setMass, types.mass)
+        self._set(vehicletype.setAccel, types.accel)
+        self._set(vehicletype.setMaxSpeed, types.max_speed)
+        self._set(vehicletype.setTau, types.tau)
         self._set_decelerations(types.decel)
 
     def _set_decelerations(self, decel: FloatArray) -> None:
         """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
-        for id_, value in zip(self.ids(VUT), decel.tolist(), strict=True):
-            self.api.vehicletype.setDecel(id_, value)
-            self.api.vehicletype.setEmergencyDecel(id_, value)
+        self._set(self.api.vehicletype.setDecel, decel)
+        self._set(self.api.vehicletype.setEmergencyDecel, decel)
+
+    def _set(self, set_value: Callable[[str, float], None], values: FloatArray) -> None:
+        for id_, value in zip(self.ids(VUT), values.tolist(), strict=True):
+            set_value(id_, value)
 
     def insert(self, types: SumoType) -> None:
         """Insert all actors, the vehicles under test with these types; raises the errors of `depart`."""
@@ -100,8 +101,7 @@ class SumoWorld:
 
     def insert_at_any_speed(self) -> None:
         """Insert all actors; the types of the vehicles under test change."""
-        for id_ in self.ids(VUT):
-            self.api.vehicletype.setMaxSpeed(id_, MAX_DEPARTURE_SPEED)
+        self._set(self.api.vehicletype.setMaxSpeed, np.full(self.n, MAX_DEPARTURE_SPEED))
         self._set_decelerations(np.full(self.n, INSERTION_DECELERATION))
         self.depart()
 

@@ -212,14 +212,13 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         needed_torque = p.damping * wheel_speed + p.radius * force
         throttle = np.minimum(np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0)
         brake = np.minimum(np.maximum(-needed_torque, 0.0) / p.brake_torque, 1.0)
-        return LgsvlState(
+        return self.at_rest(p)._replace(
             speed=speed,
             wheel_speed=wheel_speed,
             engine_rpm=engine_rpm,
             gear=gear,
             old_ratio=ratio,
             new_ratio=ratio,
-            since_shift=zeros + SHIFT_DELAY,
             traction_torque=p.motor_torque,
             lateral=zeros,
             heading=zeros,
