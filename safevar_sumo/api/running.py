@@ -149,12 +149,12 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
     """Remarks on earlier results in a directory: runs of other lengths, and runs that the study no longer has."""
     if not (results.path / MANIFEST).exists():
         return []
-    earlier, now = read_manifest(results.path)["study"]["search"]["evaluations"], study.search.evaluations
+    earlier_budget, budget = read_manifest(results.path)["study"]["search"]["evaluations"], study.search.evaluations
     remarks = []
-    if earlier != now:
+    if earlier_budget != budget:
         remarks.append(
-            f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
-            "name another solution than in earlier output and reports"
+            f"{results.path}: each run had {earlier_budget} evaluations before and has {budget} now: an id such as "
+            "nsga2:0:0 may name another solution than in earlier output and reports"
         )
     names = stored_runs(results.path) - set(map(str, all_runs(study)))
     if names:
@@ -216,9 +216,9 @@ class CampaignProgress:
         unused = sum(budget - self._runs[key].asked for key in self._finished_runs)
         degrees = [run.best for run in self._runs.values() if run.best is not None]
         collisions = sum(run.collisions for run in self._runs.values())
-        found = f", {collisions} collisions, best SD {min(degrees):.2f}" if degrees else ""
+        findings = f", {collisions} collisions, best SD {min(degrees):.2f}" if degrees else ""
         self._progress(
-            f"{self._study.name}: runs {len(self._finished_runs)}/{self._run_count}{found}",
+            f"{self._study.name}: runs {len(self._finished_runs)}/{self._run_count}{findings}",
             sum(run.asked for run in self._runs.values()) - replayed,
             self._run_count * budget - unused - replayed,
         )

@@ -392,7 +392,7 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
-    is_legal = [item.is_legal(values, beyond=beyond) for item, values in zip(characteristics, array.T, strict=True)]
+    is_legal = [row.is_legal(values, beyond=beyond) for row, values in zip(characteristics, array.T, strict=True)]
     for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:  # the first illegal value
         characteristics.members[column].check(float(array[row, column]), f"settings, row {row}", beyond=beyond)
     return array, index

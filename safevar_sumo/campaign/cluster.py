@@ -101,7 +101,7 @@ class ClusterPool:
         try:
             name = f"safevar-{uuid4()}"
             messages = Queue(name, client=self._client)
-            future = self._client.submit(_carry, self._time_limit, _versions(), job, name, pure=False)
+            future = self._client.submit(_carry_in_worker, self._time_limit, _versions(), job, name, pure=False)
             while (message := receive()) is not None:
                 report(message)
         except SafevarError:
@@ -117,7 +117,7 @@ class ClusterPool:
             raise PoolLostError(GONE) from None
 
 
-def _carry(time_limit: float, versions: dict[str, str], job: Job, queue: str) -> None:
+def _carry_in_worker(time_limit: float, versions: dict[str, str], job: Job, queue: str) -> None:
     """Carry out a job in a worker; a message, put into a Dask queue, ends the job if the caller is gone."""
     from distributed import Queue, get_worker
 

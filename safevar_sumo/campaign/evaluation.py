@@ -36,7 +36,7 @@ Evaluate = Callable[[bytes, FloatArray], Evaluations]
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """What a task simulates instead of the whole study.
+    """Restricts a task to some points of a study, and varies parameters of its ADS.
 
     Attributes
     ----------

@@ -43,10 +43,10 @@ def identity_of(study: Study, system: System, pool: Pool | None = None) -> JsonO
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
         if isinstance(model, msgspec.Struct):
-            given = resolved[table]["parameters"]
+            # All parameters, with the model's defaults; but texts as the study has them, as paths become absolute.
             texts_and_paths = {
                 key: value
-                for key, value in given.items()
+                for key, value in resolved[table]["parameters"].items()
                 if isinstance(value, str) or any(files_named_in(value, study.origin.places))
             }
             resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **texts_and_paths}}

@@ -239,9 +239,9 @@ class Run:
         _, requested = self._requested()
         solutions = {setting.tobytes() for setting in self.result.settings}
         is_solution = np.array([setting.tobytes() in solutions for setting in requested.settings], dtype=bool)
-        others = np.flatnonzero(~requested.failed & ~is_solution)
-        others = others[rng.permutation(len(others))[:VERIFIED_SETTINGS]]
-        return requested.take(np.concatenate([np.flatnonzero(~requested.failed & is_solution), others]))
+        other_rows = np.flatnonzero(~requested.failed & ~is_solution)
+        sample = other_rows[rng.permutation(len(other_rows))[:VERIFIED_SETTINGS]]
+        return requested.take(np.concatenate([np.flatnonzero(~requested.failed & is_solution), sample]))
 
     def finish(self) -> RunResult:
         """Journal the result of a search that has ended, and close the journal."""

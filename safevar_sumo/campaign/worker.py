@@ -239,7 +239,7 @@ class _ShareCarrier:
 
     def _simulate(self, runs: Sequence[Run]) -> None:
         """Simulate and journal the settings that the runs wait for, in equal batches."""
-        owners = [run for run in runs for _ in range(len(run.missing_settings))]
+        owners = [run for run in runs for _ in run.missing_settings]  # the run that waits for each setting
         if not owners:
             return
         settings = np.concatenate([run.missing_settings for run in runs])
@@ -287,10 +287,11 @@ class _ShareCarrier:
         if not any(map(len, samples)):
             return
 
+        recorded = Evaluations.concatenate(samples)
+
         def evaluate(packed_task: bytes) -> Evaluations:
             return Evaluations.concatenate([*self._evaluate(packed_task, recorded.settings, MAX_COPIES)])
 
-        recorded = Evaluations.concatenate(samples)
         in_sumo = evaluate(self._share.sumo_task)
         if self._share.recorded_task:  # SUMO repeats a few cells of a rating; the runs have no values of single cells
             recorded = evaluate(self._share.recorded_task)

@@ -68,11 +68,11 @@ def calibrate_command(
     names = [study, *(word for word in words if word in study_names() or word.endswith(".toml"))]
     changes = {name: value for name, value in fit_options.items() if value is not None}
     studies = [
-        msgspec.structs.replace(item, fit=msgspec.structs.replace(item.fit, **changes))
-        for item in map(load_study, names)
+        msgspec.structs.replace(written, fit=msgspec.structs.replace(written.fit, **changes))
+        for written in map(load_study, names)
     ]
-    systems = [assemble(item, name) for item, name in zip(studies, names, strict=True)]
-    if len({item.name for item in studies}) < len(studies):
+    systems = [assemble(loaded_study, name) for loaded_study, name in zip(studies, names, strict=True)]
+    if len({loaded_study.name for loaded_study in studies}) < len(studies):
         raise InputError("STUDY", f"two studies are called {studies[0].name!r}", "studies of different names")
     check_output(plot, "--plot")
     owners = [find_owner(word, studies) for word in words if word not in names]
@@ -83,14 +83,15 @@ def calibrate_command(
         check_study_output(target, "--out", studies)
     subjects = [
         FitSubject(
-            item, {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner == index}
+            loaded_study,
+            {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner == index},
         )
-        for index, (item, system) in enumerate(zip(studies, systems, strict=True))
+        for index, (loaded_study, system) in enumerate(zip(studies, systems, strict=True))
     ]
     results = _fit(subjects, targets, from_scratch, jobs)
     for subject, result in zip(subjects, results, strict=True):
         print_calibration(
-            Console(), subject.study, result, [item.name for item in studies if item is not subject.study]
+            Console(), subject.study, result, [other.name for other in studies if other is not subject.study]
         )
     comments = [
         describe_fit(subject, result, studies, from_scratch=from_scratch)
@@ -115,7 +116,7 @@ def _fit(
 
     def save_best(ending: str) -> None:
         comment = f"Best of {done} of {trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
-        best_without_spread = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
+        best_without_spread = [msgspec.structs.replace(study, spread={}, model_error={}) for study in best]
         _write_studies(targets, studies, best_without_spread, [comment] * len(studies))
 
     def after_trial(loss: float, best_studies: tuple[Study, ...]) -> None:
@@ -128,7 +129,7 @@ def _fit(
 
     try:
         with (
-            local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
+            local_pool(jobs or available_cores(), max(study.search.time_limit for study in studies)) as pool,
             open_progress(True) as show_progress,
         ):
             show_progress("trials", 0, trials)

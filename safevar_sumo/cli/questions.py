@@ -257,7 +257,7 @@ def compare(
     """
     from safevar_sumo.analysis.compare.compute import compare_systems
 
-    subjects = [load_results_or_study(one, point) for one in (source, other)]
+    subjects = [load_results_or_study(system, point) for system in (source, other)]
     check_output(plot, "--plot")
     compute = partial(compare_systems, other=subjects[1])
     return _show(answer_question(compute, subjects[0], CompareOptions(**values), jobs=jobs), as_json, plot)

@@ -76,14 +76,15 @@ def validate(
     settings = np.concatenate([characteristics.original[np.newaxis], data.settings])
     with open_progress(True) as progress:
         evaluations = evaluate_settings(loaded_study, settings, jobs=jobs, progress=progress)
-    valid = evaluations.valid[1:]
-    if not evaluations.valid[0] or not valid.any():
-        vehicle = "any row" if evaluations.valid[0] else "the original vehicle"
+    original, simulated = evaluations.take([0]), evaluations.take(range(1, len(evaluations)))
+    is_valid = simulated.valid
+    if not original.valid[0] or not is_valid.any():
+        vehicle = "any row" if original.valid[0] else "the original vehicle"
         raise SimulationError(f"study {study!r} cannot be simulated with {vehicle}")
-    if not valid.all():
-        print_warning(f"{reference}: {np.count_nonzero(~valid)} rows could not be simulated and are left out")
-    data, simulated = data.take(valid), evaluations.take(1 + np.flatnonzero(valid))
-    result = measure_agreement(data, simulated, loaded_study, evaluations.take([0]))
+    if not is_valid.all():
+        print_warning(f"{reference}: {np.count_nonzero(~is_valid)} rows could not be simulated and are left out")
+    data, simulated = data.take(is_valid), simulated.take(is_valid)
+    result = measure_agreement(data, simulated, loaded_study, original)
     if plot is not None:
         plot_agreement(plot, f"{loaded_study.title}\nagainst {reference.name}", characteristics, data, simulated)
     if totals is not None:

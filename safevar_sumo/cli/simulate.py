@@ -187,7 +187,7 @@ def _simulate_sweep(
         target.study, np.concatenate([system.characteristics.original[np.newaxis], settings])
     )
     no_verdict = why_no_verdict(system)
-    records = [
+    _, *records = [  # without the original
         {
             "study": target.study.name,
             "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
@@ -196,7 +196,7 @@ def _simulate_sweep(
         for row, setting in enumerate(evaluations.settings.tolist())
     ]
     if as_json:
-        print_json([*records[1:], *summary_entry(no_verdict)])
+        print_json([*records, *summary_entry(no_verdict)])
     else:
         print_heading(Console(), target.study.title, no_verdict)
         print_sweep(Console(), system.characteristics, names, evaluations)
@@ -206,7 +206,7 @@ def _simulate_sweep(
             f"in {reset_count} of {len(requested_settings)} settings the filter reset small changes; "
             "--no-filter keeps them"
         )
-    return records[1:]
+    return records
 
 
 def _print_results(
@@ -266,11 +266,11 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
         print_text(console, simulation.no_verdict)
     table = WholeTable("characteristic", "unit", right=("original", "simulated"), title=simulation.study.title)
     characteristics = CharacteristicSet.of(simulation.study)
-    changed = [item for item in characteristics if simulation.setting[item.name] != item.original]
-    for item in characteristics:
-        value, style = simulation.setting[item.name], "bold" if item in changed else None
-        beyond = "" if item.lower <= value <= item.upper else " (beyond)"
-        table.add_row(item.name, item.unit, f"{item.original:g}", f"{value:g}{beyond}", style=style)
+    changed = [row for row in characteristics if simulation.setting[row.name] != row.original]
+    for row in characteristics:
+        value, style = simulation.setting[row.name], "bold" if row in changed else None
+        beyond = "" if row.lower <= value <= row.upper else " (beyond)"
+        table.add_row(row.name, row.unit, f"{row.original:g}", f"{value:g}{beyond}", style=style)
     console.print(table)
     print_meanings(console, changed)
     records = (simulation.original.to_dict(), simulation.to_dict())

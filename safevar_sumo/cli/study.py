@@ -292,12 +292,12 @@ def status_view(progress: Status, rate: float | None) -> Group:
     begun = [
         f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"
     ]
-    rest = f" and {len(begun) - MAX_RUNS_NAMED} more" if len(begun) > MAX_RUNS_NAMED else ""
-    under_way = f"Under way: {', '.join(begun[:MAX_RUNS_NAMED])}{rest}" if begun else ""
-    left = f", {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace" if rate else ""
-    done = "Finished." if progress.finished else f"{progress.share:.0%} done{left}."
+    further_runs = f" and {len(begun) - MAX_RUNS_NAMED} more" if len(begun) > MAX_RUNS_NAMED else ""
+    under_way = f"Under way: {', '.join(begun[:MAX_RUNS_NAMED])}{further_runs}" if begun else ""
+    time_left = f", {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace" if rate else ""
+    state = "Finished." if progress.finished else f"{progress.share:.0%} done{time_left}."
     if not len(progress.points):
-        return Group(table, Text(under_way), Text(done), Text("Nothing simulated yet."))
+        return Group(table, Text(under_way), Text(state), Text("Nothing simulated yet."))
     front = nondominated_points(progress.points)
     front_table = WholeTable(
         right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
@@ -306,4 +306,4 @@ def status_view(progress: Status, rate: float | None) -> Group:
     by_safety_degree = front[:, 0].argsort(kind="stable")
     for f_safe, f_diff, number in front[by_safety_degree][:MAX_FRONT_ROWS].tolist():
         front_table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
-    return Group(table, Text(under_way), Text(done), front_table)
+    return Group(table, Text(under_way), Text(state), front_table)

@@ -138,9 +138,10 @@ class Instances:
         except Exception as error:  # any error of FMPy about an FMU
             # Any further call of an instance that failed is undefined.
             self._free, self.generation = [], self.generation + 1
-            messages, self._messages[:] = self._messages[-1:], []
+            last_message = self._messages[-1:]
+            self._messages.clear()
             reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-            raise FmuError(f"{': '.join([reason, *messages])} while it {activity}") from error
+            raise FmuError(f"{': '.join([reason, *last_message])} while it {activity}") from error
         return np.stack(
             [port.fmu_unit.to(port.outer_unit, row) for port, row in zip(self.outputs.values(), outputs, strict=True)]
         )

@@ -161,5 +161,6 @@ def differences(outputs: Results, others: Results, tolerance: float = 0.0) -> It
         is_same = values == others[name]
         if values.dtype.kind == "f":
             is_same |= np.isclose(values, others[name], rtol=0, atol=tolerance, equal_nan=True)
-        for row in np.flatnonzero(~is_same)[:1].tolist():
+        if not is_same.all():
+            row = int(np.argmin(is_same))
             yield row, f"{name} is {others[name][row]} instead of {values[row]}"

@@ -53,41 +53,6 @@ class ActorTrack(NamedTuple):
     angle: FloatArray
 
 
-ABSENT = (np.nan, np.nan, np.nan)
-"""The pose of an actor that is not there."""
-
-
-def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, ActorTrack]]:
-    """Simulate N settings, shape (N, n), and record the tracks of all actors by name, in alphabetical order."""
-    frames, sizes = list[dict[str, tuple[float, float, float]]](), dict[str, tuple[bool, float, float]]()
-
-    def record(world: SumoWorld) -> None:
-        frames.append(world.actor_poses())
-        sizes.update({actor: world.actor_size(actor) for actor in frames[-1].keys() - sizes.keys()})
-
-    runs, tracks = simulate(system, settings, watch=record), dict[str, ActorTrack]()
-    for actor in sorted(sizes):
-        copy, name = copy_and_name(actor)
-        absent = np.full((3, len(frames), len(settings)), np.nan)
-        track = tracks.setdefault(name, ActorTrack(*sizes[actor], *absent))
-        poses = np.array([frame.get(actor, ABSENT) for frame in frames])
-        track.x[:, copy], track.y[:, copy], track.angle[:, copy] = poses.T
-    return runs, tracks
-
-
-def read_road(network: Network) -> tuple[LaneLine, ...]:
-    """Read the lanes of one copy of a network, as netconvert built it."""
-    lanes = []
-    for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
-        for lane in edge.iter("lane"):
-            line = [[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()]
-            kind = {"walkingarea": "area", "crossing": "crossing"}.get(edge.get("function", ""))
-            for_persons = lane.get("allow", "").split() == ["pedestrian"]
-            width = 0.0 if kind == "area" else float(lane.get("width", 3.2))  # SUMO's default width
-            lanes.append(LaneLine(kind or ("path" if for_persons else "road"), np.array(line), width))
-    return tuple(lanes)
-
-
 class Moments(NamedTuple):
     """Indices of a run's samples; None where there is no such moment.
 
@@ -237,6 +202,42 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     )
 
 
+ABSENT = (np.nan, np.nan, np.nan)
+"""The pose of an actor that is not there."""
+
+
+def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, ActorTrack]]:
+    """Simulate N settings, shape (N, n), and record the tracks of all actors by name, in alphabetical order."""
+    frames, sizes = list[dict[str, tuple[float, float, float]]](), dict[str, tuple[bool, float, float]]()
+
+    def record(world: SumoWorld) -> None:
+        frames.append(world.actor_poses())
+        sizes.update({actor: world.actor_size(actor) for actor in frames[-1].keys() - sizes.keys()})
+
+    runs, tracks = simulate(system, settings, watch=record), dict[str, ActorTrack]()
+    for actor in sorted(sizes):
+        copy, name = copy_and_name(actor)
+        absent = np.full((3, len(frames), len(settings)), np.nan)
+        track = tracks.setdefault(name, ActorTrack(*sizes[actor], *absent))
+        poses = np.array([frame.get(actor, ABSENT) for frame in frames])
+        track.x[:, copy], track.y[:, copy], track.angle[:, copy] = poses.T
+    return runs, tracks
+
+
+def read_road(network: Network) -> tuple[LaneLine, ...]:
+    """Read the lanes of one copy of a network, as netconvert built it."""
+    lanes = []
+    for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
+        for lane in edge.iter("lane"):
+            # a point is x,y or x,y,z
+            line = [[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()]
+            kind = {"walkingarea": "area", "crossing": "crossing"}.get(edge.get("function", ""))
+            for_persons = lane.get("allow", "").split() == ["pedestrian"]
+            width = 0.0 if kind == "area" else float(lane.get("width", 3.2))  # SUMO's default width
+            lanes.append(LaneLine(kind or ("path" if for_persons else "road"), np.array(line), width))
+    return tuple(lanes)
+
+
 def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     """Runs with the pedals of the sample before an impact also at the impact, where a command has no effect any
     more.
@@ -257,7 +258,7 @@ def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
         differences.append(f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now")
     for name, values in replayed.metrics.items():
-        before = recorded.get(name, values[0])
-        if name != RATING_POINTS.name and not np.array_equal(before, values[0], equal_nan=True):
-            differences.append(f"{name} was {before:.6g} and is {values[0]:.6g} now")
+        stored = recorded.get(name, values[0])
+        if name != RATING_POINTS.name and not np.array_equal(stored, values[0], equal_nan=True):
+            differences.append(f"{name} was {stored:.6g} and is {values[0]:.6g} now")
     return differences

@@ -165,7 +165,7 @@ def _paint_road(api: Api, scene: FlatScene, row: int) -> None:
 
 def _show_sample(api: Api, scene: FlatScene, sample: int) -> None:
     """Show the actors, the camera and the legend at one sample."""
-    comparison, left = scene.comparison, scene.left_ends[sample]
+    comparison, left_end = scene.comparison, scene.left_ends[sample]
     for body in scene.bodies:
         x, y, angle = body.x[sample], body.y[sample], 90 - np.rad2deg(body.heading[sample])
         if not np.isnan(x):
@@ -175,14 +175,16 @@ def _show_sample(api: Api, scene: FlatScene, sample: int) -> None:
     for row in comparison.rows:
         right, up = _road_origin(scene, row)
         words = f"{comparison.name(row)} ({('blue', 'orange')[row]}): {scene.reading(row, sample)}"
-        api.poi.setPosition(f"legend.{row}", right + left + scene.width / 2, up + scene.bottom + LEGEND_HEIGHT)
+        api.poi.setPosition(f"legend.{row}", right + left_end + scene.width / 2, up + scene.bottom + LEGEND_HEIGHT)
         api.poi.setParameter(f"legend.{row}", "words", words)
     top = ORIGIN + scene.bottom + scene.height
     _, lowest_origin = _road_origin(scene, comparison.rows[-1])
-    api.gui.setBoundary(VIEW_NAME, ORIGIN + left, lowest_origin + scene.bottom, ORIGIN + left + scene.width, top)
+    api.gui.setBoundary(
+        VIEW_NAME, ORIGIN + left_end, lowest_origin + scene.bottom, ORIGIN + left_end + scene.width, top
+    )
     api.simulationStep()
 
 
 def _rgba(colour: str) -> tuple[int, int, int, int]:
-    red, green, blue = bytes.fromhex(colour[1:])
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
     return red, green, blue, 255

@@ -79,18 +79,18 @@ class FlatScene:
 
     def brakes(self, body: FlatBody, sample: int) -> bool:
         """Whether an actor is the vehicle under test and brakes; after the end of its run, whether it braked then."""
-        now = min(sample, self.comparison.moments[body.row].end)
-        return body.is_vut and bool(self.comparison.runs.trace.brake[now, body.row] > 0)
+        last_sample = self.comparison.moments[body.row].end
+        return body.is_vut and bool(self.comparison.runs.trace.brake[min(sample, last_sample), body.row] > 0)
 
     def reading(self, row: int, sample: int) -> str:
         """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run ends."""
         trace, moments = self.comparison.runs.trace, self.comparison.moments[row]
-        now = min(sample, moments.end)
-        ending = "brakes" if trace.brake[now, row] > 0 else ""
+        shown = min(sample, moments.end)
+        ending = "brakes" if trace.brake[shown, row] > 0 else ""
         if sample >= moments.decided:
             ending = self.comparison.verdict(row)
-        gap = f"gap {max(trace.gap[now, row], 0):.1f} m" if np.isfinite(trace.gap[now, row]) else ""
-        return f"{trace.speed[now, row]:4.1f} m/s  {gap:10}  {ending}"
+        gap = f"gap {max(trace.gap[shown, row], 0):.1f} m" if np.isfinite(trace.gap[shown, row]) else ""
+        return f"{trace.speed[shown, row]:4.1f} m/s  {gap:10}  {ending}"
 
     @property
     def all_marks(self) -> list[int]:

@@ -136,9 +136,9 @@ def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str]) 
         for known in getattr(field.type, "__struct_fields__", ())
     ]
     hint = did_you_mean(key, [*names, *(known for _, known in keys_of_tables if key_path == key)])
-    same = [f"{table}.{known}" for table, known in keys_of_tables if known == key]
+    exact = [f"{table}.{known}" for table, known in keys_of_tables if known == key]
     nearest = [f"{table}.{known}" for table, known in keys_of_tables if repr(known) in hint and known not in names]
-    suggestions = same or nearest
+    suggestions = exact or nearest
     if suggestions and "[" not in key_path:
         hint = f"; did you mean {' or '.join(suggestions)}?"
     return InputError(source, f"{key_path}: there is no such key{hint}", one_of(names))

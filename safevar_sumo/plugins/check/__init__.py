@@ -301,8 +301,11 @@ def check(name: str, study: str | None = None) -> Report:
         subject = find_subject(name, study)
         name, kind, remark, subjects = subject.name, subject.kind, subject.remark, [subject]
     findings = [finding for _, finding in _findings_in(subjects[0].study, subjects)]
-    if not findings and subjects[0].kind in ("ads", "traci") and not subjects[0].is_guest:
-        findings = _reaction(subjects[0])
+    driver = subjects[0]
+    if not findings and driver.kind in ("ads", "traci") and not driver.is_guest:
+        expected = "a drive to the encounter, with no braking while nobody is in sight"
+        reason = why_no_verdict(assemble(driver.study))
+        findings = [_finding(driver, ("reaction", expected, reason))] if reason else []
     return Report(subject=name, kind=kind, findings=findings, remark=remark, seconds=time.perf_counter() - start)
 
 
@@ -340,13 +343,6 @@ def _findings_in(study: Study, subjects: list[Subject]) -> Iterator[tuple[str, F
             failure, place = ("contract", error.legal or "no exception", problem), error.place
         if failure is not None:
             yield " and ".join(subject.key for subject in code), _finding(code[0], failure, place)
-
-
-def _reaction(driver: Subject) -> list[Finding]:
-    """The finding on a driver who does not drive to the encounter with nobody in sight."""
-    reason = why_no_verdict(assemble(driver.study))
-    expected = "a drive to the encounter, with no braking while nobody is in sight"
-    return [_finding(driver, ("reaction", expected, reason))] if reason else []
 
 
 def _finding(subject: Subject, failure: Failure, place: str = "") -> Finding:
