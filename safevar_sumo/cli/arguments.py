@@ -260,7 +260,8 @@ def _add_flag(flag: str, name: str, default: Any, option: Option) -> Decorator:
     if option.kind is int:
         click_type = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
-        click_type = click.FloatRange(option.low, option.high, *option.is_open)
+        low_is_open, high_is_open = option.is_open
+        click_type = click.FloatRange(option.low, option.high, low_is_open, high_is_open)
     return click.option(
         flag,
         name,
@@ -306,8 +307,9 @@ def _load_subject(source: str, point: str | None = None, *, results_only: bool =
 
 
 GATE_EXIT_CODE = 3
+"""Exit code of a command if a condition of --fail-if holds, or a limit is not kept."""
 FAILURES_KEY = "safevar_sumo.failures"
-"""Key, in a command's context, of the reasons for this exit code."""
+"""Key, in a command's context, of the sentences that say why it ends with this exit code."""
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
     "<=": operator.le,
@@ -361,8 +363,8 @@ def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:
         tables = [element for element in elements if isinstance(element, dict)]
         undefined = [element for element in elements if element is None]
         if elements and not undefined and not any(name in table for table in tables):
-            known = sorted({known for table in tables for known in table})
-            raise unknown_name("--fail-if", f"{key}: the command's JSON has no {name!r} there", name, known)
+            known_names = sorted({known for table in tables for known in table})
+            raise unknown_name("--fail-if", f"{key}: the command's JSON has no {name!r} there", name, known_names)
         values = [*(table[name] for table in tables if name in table), *undefined]
     return values
 
