@@ -227,6 +227,12 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
     assert result.end == BoundaryState.SAFE
 
 
+def test_a_boundary_just_below_a_change_is_found_as_accurately() -> None:
+    evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > 8.996)
+    (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
+    assert described(evaluator, causes).boundary["a"] == pytest.approx(8.996, abs=4 * RESOLUTION)
+
+
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > ORIGINAL)
     (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)

@@ -15,7 +15,12 @@ import scipy
 
 from safevar_sumo.analysis.case import build_case
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, measure_braking
+from safevar_sumo.analysis.explain.braking_comparison import (
+    MIN_PART,
+    BrakingComparison,
+    compare_braking,
+    measure_braking,
+)
 from safevar_sumo.analysis.explain.causes import (
     STEP_FACTORS,
     Robustness,
@@ -208,6 +213,8 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
         f"At {at.name}: the original stops, safety degree {original:.2f} m; this one collides at "
         f"{-evaluate(system, weak).f_safe[0]:.2f} m/s."
     )
+    least = failure[0]._replace(parts={"gap": MIN_PART, "remainder": 0.0})
+    assert f" {MIN_PART:.2f} m because" in str(least)
 
 
 @pytest.mark.slow
@@ -279,6 +286,13 @@ def test_one_difference_is_one_part(other: tuple[float, float, float, float], pa
     comparison = compared(SAME, other)
     assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
     assert all(abs(value) < 0.05 for name, value in comparison.parts.items() if name != part)
+
+
+def test_a_vehicle_that_slows_down_as_if_it_coasted_does_not_brake() -> None:
+    """13 m at 0.09 m/s^2, and at 0.11 m/s^2."""
+    coasting, braking = (compared(SAME, (10.0, 15.0, 0.2, deceleration)).changed for deceleration in (0.09, 0.11))
+    assert coasting is None
+    assert braking is not None
 
 
 def test_an_obstacle_that_walks_on_leaves_nothing_unexplained() -> None:

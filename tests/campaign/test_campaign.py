@@ -79,9 +79,10 @@ def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> N
     carried_out(study, tmp_path / "whole")
     results = ResultsDirectory(tmp_path / "out", study)
     theirs = [results.journal("rs-01"), results.journal("original")]
-    campaign = run_campaign(study, all_runs(study), results, FormulaPool(), EventLog())
+    campaign = run_campaign(study, all_runs(study), results, FormulaPool(), log := EventLog())
     assert campaign.busy == [RunKey("rs", 1)]
     assert set(campaign.solutions) == set(all_runs(study)) - {RunKey("rs", 1)}
+    assert set(log.finished_runs.values()) == {study.search.evaluations}
     for journal in theirs:
         journal.close()
     carried_out(study, tmp_path / "out")

@@ -187,6 +187,15 @@ def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault
         tried(Told(lambda rows, before: fault), settings(4))
 
 
+def test_twenty_failures_in_a_row_end_a_study_and_one_success_between_them_does_not() -> None:
+    def fault(rows: np.ndarray, before: int) -> Exception | None:
+        return SimulationError("no place") if np.isin(rows[:, 0], 4301 + np.arange(20)).any() else None
+
+    assert tried(Told(fault), settings(20)).failed.tolist() == [False] + [True] * 19
+    with pytest.raises(SimulationError, match="no place"):
+        tried(Told(fault), settings(21))
+
+
 def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
     def fault(rows: np.ndarray, before: int) -> Exception | None:
         return (
@@ -203,7 +212,7 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
     )
     assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
     assert str(caught.value).count("--set") == 1, "what is not changed need not be set"
-    assert len(pool.tried) < 15
+    assert len(pool.tried) == 1 + 6, "halvings of 50"
 
 
 def reproduced(study: Study, **values: float) -> str:

@@ -81,6 +81,14 @@ def test_thresholds_have_the_names_of_measures() -> None:
     assert set(study.evidence.threshold) == set(MEASURES)
 
 
+def test_a_threshold_is_kept_up_to_its_value_and_by_no_undefined_measure() -> None:
+    study = load_study("smoke", evidence={"threshold": {"rmse": 0.5, "pearson": 0.5}})
+    dossier = _Dossier(study, {}, [], [], 0)
+    for name, side, kept, other in (("rmse", "at most", 0.5, 0.6), ("pearson", "at least", 0.5, 0.4)):
+        said = [dossier._beside_threshold(name, value, side) for value in (kept, other, None)]
+        assert [text.endswith(f"user: {side} 0.5, which it keeps.") for text in said] == [True, False, False]
+
+
 def test_constants_are_counted_by_origin() -> None:
     rain = load_study("rain")
     counts = count_constants(rain)

@@ -14,7 +14,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from safevar_sumo.report.pack import DESCRIPTION, Description, describe, read_pack, write_pack
+from safevar_sumo.errors import InputError
+from safevar_sumo.report.pack import DESCRIPTION, Description, _check_entries, describe, read_pack, write_pack
 from safevar_sumo.shipped import NETWORKS
 from tests.analysis.test_repair import planted as planted
 from tests.in_process import refused, run
@@ -223,6 +224,10 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
         archive.writestr("zeros", "")
         archive.filelist[0].file_size = 10_000_000_000
     refused("verify", "bomb.zip", message=("unpacked it has 10.0 GB, at most 1 are allowed",))
+    many = [zipfile.ZipInfo(str(number)) for number in range(10_001)]
+    _check_entries(Path("many.zip"), many[1:])
+    with pytest.raises(InputError, match="holds 10001 files, at most 10000 are allowed"):
+        _check_entries(Path("many.zip"), many)
 
 
 @pytest.mark.slow
