@@ -16,9 +16,9 @@ import pytest
 from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign
 from safevar_sumo.campaign.campaign import deal
 from safevar_sumo.campaign.pool import WorkerLostError
-from safevar_sumo.campaign.run import Run
+from safevar_sumo.campaign.run import RANDOM_SAMPLES, Run
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import Journal, ResultsDirectory, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
@@ -109,16 +109,29 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(first, tmp_path / "out", FormulaPool(limit=0))
 
 
+def journaled(evaluations: Evaluations, budget: int, path: Path) -> Run:
+    """A run that has ended, and whose journal has evaluations."""
+    head = journal_head("study", "rs-00", SUN.names)
+    journal = Journal(path / "rs-00.jsonl", head)
+    journal.append(range(len(evaluations)), evaluations)
+    journal.finish([0], budget, budget)
+    journal.close()
+    return Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), budget)  # type: ignore[arg-type]
+
+
+def test_the_worst_and_the_last_evaluation_are_repeated_alone(tmp_path: Path) -> None:
+    settings = SUN.original + np.linspace(1, 0, 99)[:, np.newaxis] * (SUN.upper - SUN.original)
+    worst, last, *others = journaled(evaluated(settings), 99, tmp_path).sample_evaluations(np.random.default_rng(1))
+    assert np.array_equal(np.concatenate([worst.settings, last.settings]), settings[[0, -1]])
+    assert len(others) == RANDOM_SAMPLES
+
+
 @pytest.mark.parametrize("outcome", [Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR])
 def test_what_a_longer_run_found_after_its_budget_is_not_counted(outcome: Outcome, tmp_path: Path) -> None:
     """A journal of two settings, and a run of one evaluation."""
-    head = journal_head("study", "rs-00", SUN.names)
-    journal = Journal(tmp_path / "rs-00.jsonl", head)
     both = evaluated(np.stack([SUN.original, SUN.upper]))
-    journal.append([0, 1], dataclasses.replace(both, outcome=np.array(["stopped", outcome.value])))
-    journal.finish([0], 1, budget=1)
-    journal.close()
-    result = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), budget=1).finish()  # type: ignore[arg-type]
+    both = dataclasses.replace(both, outcome=np.array(["stopped", outcome.value]))
+    result = journaled(both, 1, tmp_path).finish()
     assert (result.progress.collisions, result.invalid_tests, result.failures) == (0, 0, [])
     assert result.progress.best == both.f_safe[0]
 
