@@ -13,6 +13,7 @@ from safevar_sumo.ads.base import Ads, DelayLine, interpolate_tables
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
+NonNegative = Annotated[float, Meta(ge=0)]
 HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
 CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
@@ -73,17 +74,17 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         Lag of the pedals assumed in planning [s].
     """
 
-    first_command: Annotated[float, Meta(ge=0)]
+    first_command: NonNegative
     cruise_speed: WidePositive
     cruise_gain: WidePositive
     cruise_acceleration: WidePositive
     jerk: WidePositive
-    stop_gap: Annotated[float, Meta(ge=0)]
+    stop_gap: NonNegative
     comfortable_deceleration: WidePositive
     largest_deceleration: WidePositive
-    creep_speed: Annotated[float, Meta(ge=0)]
-    creep_time: Annotated[float, Meta(ge=0)]
-    pedal_lag: Annotated[float, Meta(ge=0)]
+    creep_speed: NonNegative
+    creep_time: NonNegative
+    pedal_lag: NonNegative
     perception_range: WidePositive = 100.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _ApolloMemory:

@@ -29,6 +29,8 @@ from safevar_sumo.scenarios.euro_ncap import (
     BodySize,
     Direction,
     Heading,
+    Metres,
+    Seconds,
     SpeedProfile,
     VehicleMover,
     change_target_lanes,
@@ -203,8 +205,8 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     test: Literal["CPLA", "CBLA"] = "CPLA"
     target: Literal["adult", "child", "cyclist"] | None = None
     target_speed: Annotated[float, Meta(gt=0, le=60)] | None = None
-    acceleration_distance: Annotated[float, Meta(ge=0, le=100)] | None = None
-    time_to_impact: Annotated[float, Meta(gt=0, le=60)] = 6.0
+    acceleration_distance: Metres | None = None
+    time_to_impact: Seconds = 6.0
     network: str = "along"
 
     def obstacle(self) -> str:
@@ -268,11 +270,11 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
     speed: Annotated[float, Meta(gt=0, le=250)] = 50.0
     target_speed: Annotated[float, Meta(ge=0, le=250)] | None = None
-    headway: Annotated[float, Meta(gt=0, le=60)] | None = None
+    headway: Seconds | None = None
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
     target_deceleration: Annotated[float, Meta(gt=0, le=12)] = 4.0
     heading: Heading = 0.0
-    time_after: Annotated[float, Meta(gt=0, le=60)] = 5.0
+    time_after: Seconds = 5.0
 
     def __post_init__(self) -> None:
         if not self.network:

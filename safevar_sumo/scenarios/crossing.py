@@ -24,7 +24,9 @@ from safevar_sumo.scenarios.euro_ncap import (
     BodySize,
     Direction,
     Heading,
+    Metres,
     PersonMover,
+    Seconds,
     SpeedProfile,
     VehicleMover,
     lateral_offset,
@@ -50,7 +52,6 @@ LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
 ROUNDING_STEP = 0.5
 """A time to impact above `TIME_TO_IMPACT` is rounded up to a multiple of this step [s]."""
-Metres = Annotated[float, Meta(ge=0, le=100)]
 PRE_CRASH = {TESTS[test].target: TESTS[test].pre_crash for test in ("CPFA", "CPNCO", "CBNA", "CCCscp", "CMCscp")}
 """Pre-crash types by target."""
 
@@ -181,7 +182,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     heading: Heading = 0.0
     hidden: bool | None = None
     sensor_setback: Metres = 0.0
-    time_to_impact: Annotated[float, Meta(gt=0, le=60)] | None = None
+    time_to_impact: Seconds | None = None
 
     def __post_init__(self) -> None:
         if not self.network:

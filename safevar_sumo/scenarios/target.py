@@ -21,6 +21,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     VUT_WIDTH,
     ImpactLocation,
     PersonMover,
+    Seconds,
     VehicleMover,
 )
 
@@ -136,7 +137,7 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     test: str
     speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
     impact_location: ImpactLocation = 50.0
-    time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
+    time_after: Seconds = 4.0
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0

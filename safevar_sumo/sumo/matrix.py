@@ -89,12 +89,11 @@ def vehicle_remarks(system: System) -> list[str]:
         return []
     tables = system.nominal.tables()
     speed = min(max(speeds), float(tables.speeds[-1]))
-    drag = float(np.interp(speed, tables.speeds, tables.coasting))
+    drag = np.interp(speed, tables.speeds, tables.coasting)
     return [
         f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to "
-        f"{max(speeds) / KMH:.0f} "
-        f"km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses {drag:.1f} m/s^2 at "
-        f"{speed / KMH:.0f} km/h"
+        f"{max(speeds) / KMH:.0f} km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses "
+        f"{drag:.1f} m/s^2 at {speed / KMH:.0f} km/h"
     ]
 
 

@@ -34,8 +34,9 @@ class Perception:
         ]
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """The observation at this step; must be called in every step. An occluded obstacle appears at rest, infinitely
-        far away.
+        """The observation at this step; must be called in every step.
+
+        An occluded obstacle appears at rest, infinitely far away.
         """
         values = np.empty((len(OCCLUDED_VALUES) + 1, len(speed)))
         for row, quantity in enumerate((scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed)):
@@ -44,8 +45,8 @@ class Perception:
             values[:-1] = np.where(scene.visible, values[:-1], OCCLUDED_VALUES)
         seen = np.empty_like(values)
         for k, (vehicles, line) in enumerate(self._lines):
-            seen[:, vehicles], line = line.delayed(values[:, vehicles])
-            self._lines[k] = vehicles, line
+            seen[:, vehicles], next_line = line.delayed(values[:, vehicles])
+            self._lines[k] = vehicles, next_line
         gap, lateral, lateral_speed, obstacle_speed, old_speed = seen
         return Observation(
             time, speed, gap, old_speed - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed
@@ -69,13 +70,11 @@ class TargetObserver:
 
     def __init__(self, scenarios: Sequence[TargetTest], world: RecordedWorld, size: int) -> None:
         self._world, self._size = world, size
-        motions, targets, absences = zip(
-            *(
-                scenario.at_all_samples(recording, world.step_length)
-                for scenario, recording in zip(scenarios, world.recordings, strict=True)
-            ),
-            strict=True,
-        )
+        at_samples = [
+            scenario.at_all_samples(recording, world.step_length)
+            for scenario, recording in zip(scenarios, world.recordings, strict=True)
+        ]
+        motions, targets, absences = zip(*at_samples, strict=True)
         coordinates = np.array([(*motion.frame.origin, *motion.frame.direction) for motion in motions]).T.tolist()
         x, y, along_x, along_y = (per_vehicle(values, size) for values in coordinates)
         self._frame = Frame((x, y), (along_x, along_y))

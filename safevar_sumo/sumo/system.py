@@ -84,19 +84,19 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     """
     metrics = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}
     shipped: Mapping[str, Metric] = {**metrics, **OPTIONAL_METRICS}
-    changes, users = dict[str, Change](), dict[str, Metric | Change]()
+    changes, user_records = dict[str, Change](), dict[str, Metric | Change]()
 
-    def look_up(shipped: Mapping[str, Metric | Change], name: str, key: str) -> Metric | Change:
-        if name in users:
-            return users[name]
-        member = lookup.find(shipped, name, key)
+    def look_up(known: Mapping[str, Metric | Change], name: str, key: str) -> Metric | Change:
+        if name in user_records:
+            return user_records[name]
+        member = lookup.find(known, name, key)
         record: Metric | Change = member.target
         if member.guard is not None:
             is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
             record = (guard_change if is_change else guard_metric)(record, member.guard)
             if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
                 raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
-            users[name] = users[record.name] = record
+            user_records[name] = user_records[record.name] = record
             if isinstance(record, Change):
                 changes[record.name] = record
         if isinstance(record, Metric):
@@ -111,11 +111,10 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     objectives = []
     for name in study.search.objectives:
         record = look_up({**shipped, **CHANGES, **METRIC_OF_OBJECTIVE}, name, OBJECTIVES_KEY)
-        objectives.append(
-            Objective.of(record)
-            if isinstance(record, Metric)
-            else Objective(name=record.name, title=record.title, unit=record.unit)
-        )
+        if isinstance(record, Metric):
+            objectives.append(Objective.of(record))
+        else:
+            objectives.append(Objective(name=record.name, title=record.title, unit=record.unit))
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"
@@ -132,9 +131,11 @@ CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script
 class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
-    `source` is the study, as errors name it; `step_length` [s] is None if the network determines the time step; `rater`
-    rates results in the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; with
-    `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
+    - `source` is the study, as errors name it.
+    - `step_length` [s] is None if the network determines the time step.
+    - `rater` rates results in the matrix of a protocol; None in a study that is not rated.
+    - `metrics_table` has the thresholds of the metrics in `measuring`.
+    - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
     characteristics: CharacteristicSet
@@ -307,7 +308,8 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
     paths = [path for folder in folders if is_network(path := Path(folder, scenario.network))]
     if not paths or is_shipped(scenario.network):
         return scenario
-    network = str(next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0]))
+    with_sources = [path for path in paths if path.is_file() or any(path.glob("*.xml"))]
+    network = str((with_sources or paths)[0])
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=network)
     assert isinstance(scenario, GuardedScenario)

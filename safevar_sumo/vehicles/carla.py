@@ -258,14 +258,13 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rim speed at which the tyre force balances air drag and slope [m/s], and that force [N]."""
         force = np.minimum(np.maximum(p.air_drag * speed * speed + p.pull, -p.grip), p.grip)
-        share = np.abs(force) / p.grip
+        grip_share = np.abs(force) / p.grip
         root = np.ones_like(speed)
         for _ in range(NEWTON_STEPS):  # root^3 = 1 - force / grip; see `_tyre_force`
-            root = root - (root * root * root - 1 + share) / (3 * root * root)
+            root = root - (root * root * root - 1 + grip_share) / (3 * root * root)
         driving_rim = (p.slip_stiffness * speed + self.slip_offset * (1 - root)) / (p.slip_stiffness - 1 + root)
-        return np.where(
-            force < 0, speed - (speed + self.slip_offset) * (1 - root) / p.slip_stiffness, driving_rim
-        ), force
+        braking_rim = speed - (speed + self.slip_offset) * (1 - root) / p.slip_stiffness
+        return np.where(force < 0, braking_rim, driving_rim), force
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)

@@ -135,27 +135,28 @@ class FmuVehicle(Vehicle):
 
         Entries are numbers, characteristics or, in `sumo_type`, variables of the FMU, which are returned.
         """
-        variables = {}
+        source, variables = self._guard.source, {}
         for name, entry in entries.items():
-            where, row = f"vehicle.{key}.{name}", table["characteristics"].get(entry)
+            entry_key, characteristic = f"vehicle.{key}.{name}", table["characteristics"].get(entry)
             if name not in quantities:
-                raise unknown_name(self._guard.source, f"{where}: there is no such quantity", name, quantities)
-            if row is None and isinstance(entry, str):
+                raise unknown_name(source, f"{entry_key}: there is no such quantity", name, quantities)
+            if characteristic is None and isinstance(entry, str):
                 if key == "sensors":
-                    problem = f"{where} = {entry!r}: there is no such characteristic"
-                    raise unknown_name(self._guard.source, problem, entry, self.UNITS, ", or a number")
+                    problem = f"{entry_key} = {entry!r}: there is no such characteristic"
+                    raise unknown_name(source, problem, entry, self.UNITS, ", or a number")
                 variables[name] = entry
                 continue
-            lower = float(entry) if row is None else row.lower
-            if lower < 0 or (lower == 0 and name != "latency"):
-                problem = f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {where}"
-                expected = "a number of at least 0" if name == "latency" else "a number above 0"
-                raise InputError(self._guard.source, problem if row else f"{where} = {lower:g}", expected)
-            if row is not None:
-                unit, si_unit = description.unit(row.unit), COMMON_UNITS[quantities[name]]
+            lowest = float(entry) if characteristic is None else characteristic.lower
+            if lowest < 0 or (lowest == 0 and name != "latency"):
+                problem = f"vehicle.characteristics.{entry}.lower = {lowest:g}, the value of {entry_key}"
+                if characteristic is None:
+                    problem = f"{entry_key} = {lowest:g}"
+                raise InputError(source, problem, f"a number {'of at least' if name == 'latency' else 'above'} 0")
+            if characteristic is not None:
+                unit, si_unit = description.unit(characteristic.unit), COMMON_UNITS[quantities[name]]
                 if unit is None or unit.exponents != si_unit.exponents:
-                    problem = f"{where} = {entry!r}: the unit of that characteristic is {row.unit!r}"
-                    raise InputError(self._guard.source, problem, f"a unit of {quantities[name]}")
+                    problem = f"{entry_key} = {entry!r}: the unit of that characteristic is {characteristic.unit!r}"
+                    raise InputError(source, problem, f"a unit of {quantities[name]}")
                 self._units[name] = unit, si_unit
         return variables
 

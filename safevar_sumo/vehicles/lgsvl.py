@@ -74,8 +74,9 @@ class _Prepared(NamedTuple):
 
 
 class LgsvlState(NamedTuple):
-    """State of N vehicles: speeds [m/s, rad/s, r/min], gear and gear ratios [-], time since the last shift [s], torque
-    that the traction control allows [N m], lateral position [m], heading [rad], pedals [-].
+    """State of N vehicles: speeds of vehicle [m/s], wheels [rad/s] and engine [r/min]; gear and gear ratios [-]; time
+    since the last shift [s]; torque that the traction control allows [N m]; lateral position [m]; heading [rad];
+    pedals [-].
     """
 
     speed: FloatArray
@@ -259,13 +260,13 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed; for shiftTime after a shift, the ratio moves linearly from the old one to the
+    """Automatic gearbox by engine speed. For shiftTime after a shift, the ratio moves linearly from the old one to the
     new one.
     """
-    share = s.engine_rpm / p.largest_rpm
+    rpm_share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
-    up = is_ready & (share > SHIFT_UP) & (s.gear < LAST_GEAR)
-    down = is_ready & (share < SHIFT_DOWN) & (s.gear > FIRST_GEAR)
+    up = is_ready & (rpm_share > SHIFT_UP) & (s.gear < LAST_GEAR)
+    down = is_ready & (rpm_share < SHIFT_DOWN) & (s.gear > FIRST_GEAR)
     shifts = up | down
     if not np.count_nonzero(shifts):
         return s
@@ -321,23 +322,23 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     )
 
 
-def _torque_share(share: FloatArray) -> FloatArray:
+def _torque_share(rpm_share: FloatArray) -> FloatArray:
     """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola below 1, zero from 1
     on (assumption).
     """
-    torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
-    is_overspeed = share >= ONE
+    torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (ONE - rpm_share)
+    is_overspeed = rpm_share >= ONE
     if np.count_nonzero(is_overspeed):
-        torque[is_overspeed] = ZERO
-    return torque
+        torque_share[is_overspeed] = ZERO
+    return torque_share
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
     """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness` solved for the rim
     speed.
     """
-    share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
-    slip = PEAK_SLIP * share / (1 + np.sqrt(1 - share))
+    grip_share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
+    slip = PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))
     slow_rim = speed + SLIP_FLOOR * slip
     driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
     return np.asarray(np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim))

@@ -95,7 +95,7 @@ class FeasibleRegion:
         InputError
             Naming the constraint that the first infeasible setting violates, and the values of that setting.
         """
-        for setting in settings[~self.feasible(settings)][:1]:
+        for setting in settings[~self.feasible(settings)][:1]:  # the first one, if any
             row = setting[np.newaxis]
             bound = next(bound for bound in self.bounds if bound.excess(row)[0] > SLACK / len(self.bounds))
             values = ", ".join(
