@@ -159,7 +159,8 @@ class Evaluator:
         cell_count = len(rater.protocol.cells)
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
-        tasks = [Task(study=self.study, inputs=self._inputs, cells=(part, parts)) for part in range(parts)]
+        tasks = (Task(study=self.study, inputs=self._inputs, cells=(part, parts)) for part in range(parts))
+        batches = [Batch(task.packed, settings) for task in tasks]
         results, done = list[CellResults](), 0
 
         def show_more_done(part: int, size: int) -> None:
@@ -168,7 +169,6 @@ class Evaluator:
             self.progress(stage, done, cell_count)
 
         self.progress(stage, done, cell_count)
-        batches = [Batch(task.packed, settings) for task in tasks]
         for evaluations in evaluate_batches(batches, self._pool, show_more_done):
             if evaluations.cells is None:
                 reason = evaluations.reason(int(np.argmax(evaluations.failed)))

@@ -141,7 +141,8 @@ def study_or_case(
     """
     if isinstance(source, str | Path):
         # `os.path` accepts any text, unlike paths.
-        is_directory, is_study = os.path.isdir(source), str(source) in study_names()
+        names = study_names()
+        is_directory, is_study = os.path.isdir(source), str(source) in names
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
             raise InputError(
                 source, "is a study and has no solutions", "a directory that the command `study` has written"
@@ -151,7 +152,6 @@ def study_or_case(
         elif is_study and os.path.exists(os.path.join(source, MANIFEST)):
             warn(f"{source} is the study; the results in the directory of this name are ./{source}")
         elif not (is_study or os.path.lexists(source)):
-            names = study_names()
             raise InputError(
                 source,
                 f"is neither a results directory, a study nor a file{did_you_mean(source, names)}",

@@ -209,8 +209,8 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
-    original, names = evaluator.characteristics.original, evaluator.characteristics.names
-    changed = [np.flatnonzero(flags).tolist() for flags in evaluator.characteristics.changed(settings)]
+    characteristics = evaluator.characteristics
+    changed = [np.flatnonzero(flags).tolist() for flags in characteristics.changed(settings)]
     causes: list[list[Cause]] = [[] for _ in settings]
     for size in range(max(map(len, changed), default=0) + 1):
         subsets = (
@@ -220,13 +220,13 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
             for columns in combinations(columns_changed, size)
         )
         while chunk := list(islice(subsets, MAX_SUBSETS)):
-            partial_settings = np.tile(original, (len(chunk), 1))
+            partial_settings = np.tile(characteristics.original, (len(chunk), 1))
             for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
                 partial[columns] = settings[row, columns]
             evaluations = evaluator.evaluate(partial_settings, f"subsets of {size} changes")
             for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
                 row, columns = chunk[index]
-                changes = {names[column]: float(settings[row, column]) for column in columns}
+                changes = {characteristics.names[column]: float(settings[row, column]) for column in columns}
                 outcome, degree = str(evaluations.outcome[index]), finite_or_none(evaluations.f_safe[index])
                 causes[row].append(Cause(changes=changes, outcome=outcome, safety_degree=degree))
     return causes

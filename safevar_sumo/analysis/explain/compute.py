@@ -169,9 +169,7 @@ def _is_assessed(study: Study, evaluations: Evaluations) -> BoolArray:
 
 
 def _choose_rows(population: Population, limit: int) -> Reasons:
-    """Choose the smallest robust failure, and those with the fewest changes, most severe, and with the smallest
-    changes.
-    """
+    """Choose the smallest robust failure, and a failure for each of `REASONS`."""
     reasons, failures, evaluator = Reasons(), population.evaluations.take(population.rows), population.evaluator
     if not population.rows:
         return reasons
@@ -291,6 +289,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     assert system.rater is not None
     cells = evaluator.simulate_cells(np.concatenate([original, settings]), "cells whose colour is worse")
     colours = system.rater.points(cells).colours.astype(int)
+    # Steps by which a colour is worse; the original is in row 0.
     losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
     comparisons = []
     for setting, loss in zip(settings, losses, strict=True):

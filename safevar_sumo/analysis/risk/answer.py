@@ -227,8 +227,9 @@ class Risk(Estimate):
             axis.set_title(escape_dollars(subtitle), fontsize=FONT_SIZE)
             axis.set(xlabel="share of the variance [-]", xlim=(0, 1))
             axis.grid(visible=False, axis="y")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=FONT_SIZE)
+        figure.legend(
+            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT_SIZE
+        )
         return figure
 
 

@@ -65,9 +65,9 @@ def find_safe_box(
 ) -> SafeBox:
     """The largest safe box, in which `columns` vary, around an original vehicle that is safe itself.
 
-    The box ends before all of `unsafe_settings`, shape (K, n), each of which is the nearest unsafe one in its
-    direction. Then it shrinks before the unsafe solutions of a search, `known`, shape (L, n), as before unsafe settings
-    that it finds itself.
+    The box ends before all of `unsafe_settings`, shape (K, n): scans found them, so that there is no need to look for
+    nearer ones on the way to them. From the unsafe solutions of a search, `known`, shape (L, n), it shrinks as from
+    unsafe settings that it finds itself.
 
     Notes
     -----
@@ -97,7 +97,7 @@ def find_safe_box(
         return min(factor, float(np.min(factors_of(first_unsafe)))) * STEP_BACK
 
     if len(unsafe_settings):
-        factor = min(factor, STEP_BACK * float(np.min(factors_of(unsafe_settings))))
+        factor = STEP_BACK * float(np.min(factors_of(unsafe_settings)))
     if len(known):
         factor = shrunk(known)
     seed, search, attempt = evaluator.study.search.seed, 0, 0

@@ -38,7 +38,6 @@ CAUSES_PER_ROUND = 4
 """Approximate number of unsafe settings of a search whose causes are sought."""
 ROUNDING = 1e-9
 """Rounding errors of a setting, as a share of the domain."""
-
 STAGE = "limits together"
 
 
@@ -241,7 +240,7 @@ class _BoxSearch:
                 length = sides[side, column] + WIDENING * self.width[column]
                 wider[side, column] = min(length, self.longest[side, column])
                 slab = np.concatenate([self.corner_settings(wider[np.newaxis])[0], self.points(wider, SLAB_POINTS)])
-                slab[:, column] = self.ends(wider)[side][column]
+                slab[:, column] = self.ends(wider)[side][column]  # moved to the new end
                 if len(self.known_inside(wider)) or len(self.find_unsafe(slab)):
                     break
                 sides = wider
@@ -325,7 +324,14 @@ def find_joint_limits(
         item.name: (max(low, item.lower), min(high, item.upper))
         for item, low, high in zip(evaluator.characteristics, *(end.tolist() for end in ends), strict=True)
     }
-    known_inside = int(search.hold(sides[np.newaxis], known).sum())
     return JointLimits(
-        limits, box, samples, len(unsafe_samples), failed, at_most, known_inside, kept, search.beyond(sides)
+        fixed=limits,
+        box=box,
+        samples=samples,
+        unsafe=len(unsafe_samples),
+        failed=failed,
+        at_most=at_most,
+        known_unsafe_inside=int(search.hold(sides[np.newaxis], known).sum()),
+        kept=kept,
+        beyond=search.beyond(sides),
     )

@@ -176,8 +176,8 @@ def scan_with_sets(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe,
         own_scan, intervals = of_characteristic[0], [each.safe for each in of_characteristic if each.safe is not None]
         if len(evaluators) > 1 and intervals:
             lows, highs = zip(*intervals, strict=True)
-            ranges = (min(lows), max(lows)), (min(highs), max(highs))
-            own_scan = replace(own_scan, across_fits=EndsAcrossFits(len(intervals), ranges))
+            across_fits = EndsAcrossFits(len(intervals), ((min(lows), max(lows)), (min(highs), max(highs))))
+            own_scan = replace(own_scan, across_fits=across_fits)
         scans.append(own_scan)
     return scans
 

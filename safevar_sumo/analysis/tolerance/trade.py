@@ -106,18 +106,11 @@ def find_trade(evaluator: Evaluator, names: Sequence[str], unsafe: Unsafe, limit
     others[1:, [characteristics.names.index(name) for name in fixed]] = corners
 
     def safe_intervals(column: int, settings: FloatArray) -> list[Interval | None]:
-        """The interval of a characteristic that is safe with each of the `others`, for each group of as many
-        settings.
-        """
-        safe = [scan_of_column.safe for scan_of_column in scan(evaluator, [column] * len(settings), unsafe, settings)]
-        intervals: list[Interval | None] = []
-        for start in range(0, len(safe), len(others)):
-            ends = [interval for interval in safe[start : start + len(others)] if interval is not None]
-            intervals.append(None)
-            if len(ends) == len(others):
-                lows, highs = zip(*ends, strict=True)
-                intervals[-1] = max(lows), min(highs)
-        return intervals
+        """Where a characteristic is safe with all of a group of `len(others)` settings, for each group."""
+        scans = scan(evaluator, [column] * len(settings), unsafe, settings)
+        ends = np.array([each.safe or (np.nan, np.nan) for each in scans]).reshape(-1, len(others), 2)
+        lows, highs = ends[..., 0].max(axis=1).tolist(), ends[..., 1].min(axis=1).tolist()  # NaN if one is NaN
+        return [None if np.isnan(low) else (low, high) for low, high in zip(lows, highs, strict=True)]
 
     (ends,) = safe_intervals(first, others)
     values = [] if ends is None else np.union1d(np.linspace(*ends, TRADE_VALUES), others[0, first]).tolist()
