@@ -171,11 +171,12 @@ def load_runs(directory: str | Path) -> StoredResults:
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
         failures += [
-            Failure(algorithm, run, positions[i], evaluations.reason(i))
-            for i in np.flatnonzero(evaluations.failed).tolist()
+            Failure(algorithm, run, positions[row], evaluations.reason(row))
+            for row in np.flatnonzero(evaluations.failed).tolist()
         ]
         if budget in content.results:
-            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget][0])))
+            solution_positions, _ = content.results[budget]
+            solutions_of_runs.append(((algorithm, run), content.take_positions(solution_positions)))
     frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)  # behind algorithm and run
     solutions = solutions_frame(characteristics, solutions_of_runs)
