@@ -95,17 +95,15 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             children = self._draw_children(parents, problem.population, problem, rng)
             evaluated = yield problem.characteristics.filter(children[: problem.evaluations - used])
             batches.append(evaluated)
-            numbers = used + np.arange(len(evaluated))
-            settings[numbers] = evaluated.settings
-            valid = problem.scoring.valid(evaluated)
-            if valid.any():
+            settings[used : used + len(evaluated)] = evaluated.settings
+            is_valid = problem.scoring.valid(evaluated)
+            valid, numbers = evaluated.take(is_valid), used + np.flatnonzero(is_valid)
+            if len(valid):
                 # Collisions by their largest change; other settings, all worse, by the first objective:
-                severity = -problem.scoring.values(evaluated)[:, 0]
-                quality[numbers[valid]] = np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, severity)[
-                    valid
-                ]
-                cells = self._cell_numbers(evaluated, problem)[valid, np.newaxis]
-                archive.add(numbers[valid, np.newaxis].astype(float), quality[numbers[valid]], cells)
+                severity = -problem.scoring.values(valid)[:, 0]
+                quality[numbers] = np.where(valid.collided, QUALITY_OFFSET - valid.f_diff, severity)
+                cells = self._cell_numbers(valid, problem)[:, np.newaxis]
+                archive.add(numbers[:, np.newaxis].astype(float), quality[numbers], cells)
             used += len(evaluated)
         evaluations = Evaluations.concatenate(batches)
         atlas = evaluations.take(_elites_in(archive))
@@ -131,12 +129,12 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         children = np.where(changed, np.clip(mutated_values, characteristics.lower, characteristics.upper), parents)
         new_values = rng.uniform(characteristics.lower, characteristics.upper, parents.shape)
         added_columns = rng.integers(0, size, number)
-        rows = np.flatnonzero(rng.random(number) < self.added)
-        children[rows, added_columns[rows]] = new_values[rows, added_columns[rows]]
+        added_rows = np.flatnonzero(rng.random(number) < self.added)
+        children[added_rows, added_columns[added_rows]] = new_values[added_rows, added_columns[added_rows]]
         # One of the parent's changes, each as likely as the others:
         removed_columns = np.argmax(np.where(changed, rng.random(parents.shape), -1.0), axis=1)
-        rows = np.flatnonzero(rng.random(number) < self.removed)
-        children[rows, removed_columns[rows]] = characteristics.original[removed_columns[rows]]
+        removed_rows = np.flatnonzero(rng.random(number) < self.removed)
+        children[removed_rows, removed_columns[removed_rows]] = characteristics.original[removed_columns[removed_rows]]
         return problem.repaired(children)
 
     def _cell_numbers(self, evaluated: Evaluations, problem: Problem) -> IntArray:

@@ -116,11 +116,11 @@ class RecordedWorld:
         if not len(scenes):
             return {}
         motion, (length, width, is_person) = self._motion[self.sample, scenes, actors], self._sizes[scenes, actors].T
-        others = self._others = Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
-        is_open = is_open.reshape(-1, self._size)[scenes]
-        beside_person = is_open & (is_person != 0)[:, np.newaxis]
-        first_hits = self._overlap(self._last_fronts, beside_person, scenes, others, is_person)
-        second_hits = self._overlap(self.vehicle_positions(VUT), is_open, scenes, others, is_person)
+        self._others = Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
+        is_beside = is_open.reshape(-1, self._size)[scenes]
+        is_beside_person = is_beside & (is_person != 0)[:, np.newaxis]
+        first_hits = self._overlap(self._last_fronts, is_beside_person, scenes, is_person != 0)
+        second_hits = self._overlap(self.vehicle_positions(VUT), is_beside, scenes, is_person != 0)
         # In the order of the bodies, and for each body of the checks, of which `first` takes a vehicle's first hit:
         bodies, checks, vehicles_in_scene = np.argwhere(np.stack([first_hits, second_hits], axis=1)).T
         vehicles, first = np.unique(scenes[bodies] * self._size + vehicles_in_scene, return_index=True)
@@ -128,20 +128,18 @@ class RecordedWorld:
         self._struck = dict(zip(vehicles.tolist(), bodies[first].tolist(), strict=True))
         return dict(zip(vehicles.tolist(), speeds.tolist(), strict=True))
 
-    def _overlap(
-        self, fronts: FloatArray, candidates: BoolArray, scenes: IntArray, others: Body, is_person: FloatArray
-    ) -> BoolArray:
-        """Which of the candidates, shape (M, size), overlap the M bodies `others`, which are in these scenes.
+    def _overlap(self, fronts: FloatArray, candidates: BoolArray, scenes: IntArray, is_person: BoolArray) -> BoolArray:
+        """Which of the candidates, shape (M, size), overlap the M bodies `_others`, which are in these scenes.
 
         Two rectangles overlap if no edge of either separates them. Two parallel vehicles must overlap by more than a
         millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         if not np.count_nonzero(candidates):
             return candidates
-        direction, length, width = self._scene.along, self._scene.length, self._scene.width
+        direction, length, width, others = self._scene.along, self._scene.length, self._scene.width, self._others
         normal, other_normals = _left_of(direction), _left_of(others.along)
         cosine, sine = np.abs(others.along @ direction), np.abs(other_normals @ direction)
-        min_overlap = np.where((is_person != 0) | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
+        min_overlap = np.where(is_person | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
         # From a vehicle's front to where it is if the vehicle's middle is the other body's middle.
         to_other = (others.middle + direction * (length / 2))[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scenes]
         for axis, joint_extent in (
@@ -160,19 +158,17 @@ class RecordedWorld:
         """First and last coordinate, along the way, of a vehicle's front while the vehicle is beside an actor, with a
         margin; shape (2, T, K, A) [m].
         """
-        (x, y, east, north, _), (length, width, _), (along_x, along_y) = (
-            self._motion.T,
-            self._sizes.T,
-            self._scene.along,
-        )
+        x, y, east, north, _ = self._motion.T
+        length, width, _ = self._sizes.T[..., np.newaxis]
+        along_x, along_y = self._scene.along
         cosine, sine = along_x * east + along_y * north, along_x * north - along_y * east
-        middle = along_x * x + along_y * y - cosine * (length[..., np.newaxis] / 2)
-        half = (np.abs(cosine) * length[..., np.newaxis] + np.abs(sine) * width[..., np.newaxis]) / 2 + EXTENT_MARGIN
+        middle = along_x * x + along_y * y - cosine * (length / 2)
+        half = (np.abs(cosine) * length + np.abs(sine) * width) / 2 + EXTENT_MARGIN
         return np.array([(middle - half).T, (middle + half + self._scene.length).T])
 
     def _adjacent_pairs(self, is_open: BoolArray) -> IntArray:
-        """Numbers (scene, actor) of the M actors that vehicles of open runs are beside, now or one step ago; shape (M,
-        2).
+        """Numbers (scene, actor), shape (M, 2), of the actors that vehicles of open runs are beside, now or one step
+        ago.
         """
         coordinates, last_coordinates = self.vehicle_positions(VUT) @ self._scene.along, self._last_coordinates
         self._last_coordinates = coordinates

@@ -67,9 +67,10 @@ class TraciController(Ads):
         return _Memory(nominal, traffic, drivers, initial_trim=None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        initial_trim = trim_at(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
-        accelerations = np.zeros(len(memory.drivers))
-        if memory.initial_trim is not None:  # `start` recorded the first step
+        initial_trim, accelerations = memory.initial_trim, np.zeros(len(memory.drivers))
+        if initial_trim is None:  # `start` recorded the first step
+            initial_trim = trim_at(memory.nominal, seen)
+        else:
             memory.traffic.record_step()
         with substitute_traci():
             for i, (view, commands, step) in enumerate(memory.drivers):
@@ -104,7 +105,6 @@ class _Memory(NamedTuple):
 
 _active_view: TraciView | None = None
 """The view of the vehicle whose controller runs at the moment."""
-
 
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""

@@ -155,7 +155,7 @@ def real_traci() -> Api:
 
 
 def refused(domain: str, name: str, problem: str) -> InputError:
-    """The error for a call of a controller."""
+    """The error for a controller's call of a function, of traci itself if `domain` is ""."""
     legal = "the body of your script's loop, without this call, as a function step(traci, vehicle_id), with calls of "
     return InputError(f"traci.{domain}.{name}".replace("..", "."), problem, legal + ", ".join(CALLS.get(domain, CALLS)))
 
@@ -211,7 +211,10 @@ class SensedTraffic:
                 actor: {name: get(copied_id(copy, actor)) for name, get in getters} for actor in names[copy, domain]
             }
         own, leader = actors["vehicle"].pop(VUT), api.vehicle.getLeader(vut, LEADER_RANGE)
-        return Snapshot(own, actors, (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None)
+        if not leader or not leader[0]:  # without a leader, libsumo and traci return None or ("", -1)
+            return Snapshot(own, actors, None)
+        leader_id, gap = leader
+        return Snapshot(own, actors, (copy_and_name(leader_id)[1], float(gap)))
 
 
 def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
@@ -223,14 +226,14 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     for domain, members in snapshot.actors.items():
         actors[domain] = {}
         for name, values in members.items():
-            # TraCI's position of a vehicle is that of its front, of a person that of the middle.
+            # A position is that of the front; of a vehicle, the rear may be nearer.
             length, heading = values["getLength"] if domain == "vehicle" else 0.0, math.radians(values["getAngle"])
             front, position = values["getPosition"], own["getPosition"]
             rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
             if min(math.dist(position, front), math.dist(position, rear)) <= reach:
                 actors[domain][name] = values if scale == 1 else {**values, **_scaled(own, values, scale)}
-    leader = snapshot.leader if snapshot.leader and snapshot.leader[0] in actors["vehicle"] else None
-    return Snapshot(own, actors, leader and (leader[0], leader[1] * scale))
+    leader_name, gap = snapshot.leader or ("", 0.0)
+    return Snapshot(own, actors, (leader_name, gap * scale) if leader_name in actors["vehicle"] else None)
 
 
 def _scaled(own: Values, values: Values, scale: float) -> Values:
