@@ -32,7 +32,7 @@ class Tables(dict[str, "pd.DataFrame"]):
         return {answer.name: answer.notes for answer in self.answers}
 
     def _repr_markdown_(self) -> str:
-        from safevar_sumo.analysis.research_questions.tables import as_markdown
+        from safevar_sumo.analysis.research_questions.formats import as_markdown
 
         return as_markdown(self.answers)
 

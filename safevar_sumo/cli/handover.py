@@ -17,7 +17,7 @@ from rich.console import Console
 from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.analysis.research_questions.answer import QUESTION_NAMES, answer_questions
 from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
-from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS
+from safevar_sumo.analysis.research_questions.formats import ENDINGS, FORMATS
 from safevar_sumo.cli.arguments import (
     as_it_is_now,
     as_it_is_now_option,

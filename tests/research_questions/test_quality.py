@@ -20,6 +20,7 @@ from hypothesis import given, strategies as st
 
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.formats import as_json, as_latex, as_markdown, as_text
 from safevar_sumo.analysis.research_questions.fronts import (
     compute_attainment,
     compute_convergence,
@@ -38,7 +39,6 @@ from safevar_sumo.analysis.research_questions.statistics import (
     magnitude_of,
     signed_rank_test,
 )
-from safevar_sumo.analysis.research_questions.tables import as_json, as_latex, as_markdown, as_text
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import made_up, made_up_study, row
 from tests.research_questions.test_questions import three_algorithms

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, VERMILION, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.answer import WEATHER, TableAnswer
+from safevar_sumo.analysis.research_questions.formats import as_json
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
-from safevar_sumo.analysis.research_questions.tables import as_json
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
 from safevar_sumo.analysis.words import number_of, two_decimals
 from safevar_sumo.metrics import Unsafe

@@ -12,7 +12,8 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Interval
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, escape_dollars, new_figure
-from safevar_sumo.analysis.research_questions.tables import LATEX_NEEDS, Table, markdown_table, render_latex
+from safevar_sumo.analysis.research_questions.formats import LATEX_NEEDS, markdown_table, render_latex
+from safevar_sumo.analysis.research_questions.tables import Table
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, JsonObject
