@@ -26,7 +26,7 @@ from safevar_sumo.search import Nsga2, Problem
 from safevar_sumo.study import SAFETY_DEGREE, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
-TREES = 300
+TREES, POPULATION = 300, 50
 Evaluate = Callable[[FloatArray], Evaluations]
 
 
@@ -40,7 +40,9 @@ def predict(forest: RandomForestRegressor, characteristics: CharacteristicSet, s
 def search(evaluate: Evaluate, characteristics: CharacteristicSet, evaluations: int, runs: int) -> Evaluations:
     """The solutions of several runs of NSGA-II, which request their evaluations together."""
     original = evaluate(characteristics.original[np.newaxis])
-    problem = Problem(characteristics=characteristics, original=original, evaluations=evaluations)
+    problem = Problem(
+        characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION
+    )
     searches = [Nsga2().search(problem, np.random.default_rng(run)) for run in range(runs)]
     requests, solutions = [next(run) for run in searches], list[Evaluations]()
     while not solutions:
