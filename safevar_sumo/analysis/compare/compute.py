@@ -63,13 +63,13 @@ def compare_systems(
     originals = [of_side.evaluate_original() for of_side in evaluators]
     both_rated = all(map(is_rated, studies))
     unsafe = stated[0] if stated else _default_criterion(both_rated, evaluations, originals)
-    is_valid = np.logical_and.reduce([of_side.valid for of_side in evaluations])
+    is_valid = np.logical_and.reduce([runs.valid for runs in evaluations])
     tested = frame.copy()
-    for side, of_side in zip("ab", evaluations, strict=True):
-        frame[f"outcome_{side}"] = of_side.outcome
-        frame[f"{SAFETY_DEGREE}_{side}"] = of_side.f_safe
-        frame[f"unsafe_{side}"] = unsafe.of(of_side)
-        tested[side] = of_side.column(RATING_POINTS.name if both_rated else SAFETY_DEGREE)
+    for side, runs in zip("ab", evaluations, strict=True):
+        frame[f"outcome_{side}"] = runs.outcome
+        frame[f"{SAFETY_DEGREE}_{side}"] = runs.f_safe
+        frame[f"unsafe_{side}"] = unsafe.of(runs)
+        tested[side] = runs.column(RATING_POINTS.name if both_rated else SAFETY_DEGREE)
     p, a12, unit, number = _test(tested[is_valid])
     side_a, side_b = (
         _side(of_side, original, unsafe, both_rated) for of_side, original in zip(evaluators, originals, strict=True)
@@ -106,7 +106,7 @@ def _common_domain(evaluators: tuple[Evaluator, Evaluator], orders: list[list[in
     """The ends of the domain that both systems have, in the order of A's characteristics; `orders` are their columns in
     each system's order.
     """
-    sets = [(system.characteristics, np.argsort(order)) for system, order in zip(evaluators, orders, strict=True)]
+    sets = [(of_side.characteristics, np.argsort(order)) for of_side, order in zip(evaluators, orders, strict=True)]
     lower = np.max([characteristics.lower[order] for characteristics, order in sets], axis=0)
     upper = np.min([characteristics.upper[order] for characteristics, order in sets], axis=0)
     if (lower > upper).any():

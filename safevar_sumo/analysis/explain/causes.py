@@ -307,8 +307,9 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
         Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause;
         and `share`, their share of all failures.
     """
-    keys = [{cause_key(characteristics, cause) for cause in of_failure} for of_failure in causes]
-    counts = Counter(key for of_failure in keys for key in of_failure)
+    counts = Counter[tuple[str, ...]]()
+    for of_failure in causes:
+        counts.update({cause_key(characteristics, cause) for cause in of_failure})
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])

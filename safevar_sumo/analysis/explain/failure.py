@@ -150,9 +150,8 @@ class Explanation:
             table = WholeTable(
                 "characteristic", right=("original", "here", "limit (all scaled)", "limit (this one only)")
             )
-            columns = cause.changes, cause.boundary, cause.alone
             for item in changed:
-                texts = (item.text(values[item.name]) for values in columns)
+                texts = (item.text(values[item.name]) for values in (cause.changes, cause.boundary, cause.alone))
                 table.add_row(item.name + unit_text(item.unit, " [{}]"), f"{item.original:g}", *texts)
             yield table
             yield meanings(changed)

@@ -244,9 +244,8 @@ def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArr
     """
     for search_round in range(SEARCH_ROUNDS):
         nearest = response.nearest_failure
-        # Slightly nearer to the origin, with a standard deviation that halves from round to round.
-        centres = nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
-        points_around = centres + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**search_round
+        nearer = nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
+        deviations = rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**search_round
         response(nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis])
-        response(points_around)
+        response(nearer + deviations)
     return response.nearest_failure

@@ -91,8 +91,10 @@ class Tolerance:
             if self.together is not None:
                 interval = self.together.box[item.name]
             elif factor:
-                below, above = item.original - item.lower, item.upper - item.original
-                interval = item.original - factor * below, item.original + factor * above
+                interval = (
+                    item.original - factor * (item.original - item.lower),
+                    item.original + factor * (item.upper - item.original),
+                )
             rows.append(
                 LimitRow(
                     scan=scan,

@@ -135,8 +135,8 @@ def sobol_and_corners(
 ) -> FloatArray:
     """Settings at Sobol points of a box, and at as many of its corners, where all changes add up."""
     sobol = sobol_points(number, len(columns), seed)
-    corners = np.round(sobol)
-    return settings_in_box(evaluator, columns, *ends, np.concatenate([sobol, corners]))
+    points = np.concatenate([sobol, np.round(sobol)])  # a rounded point is a corner
+    return settings_in_box(evaluator, columns, *ends, points)
 
 
 def random_settings(

@@ -38,15 +38,16 @@ def describe_failure(run: Evaluations, points: Sequence[Point], unsafe: Unsafe) 
     point = points[0] if run.worst_points is None else points[int(run.worst_points[0])]
     scenario, degree = point.scenario, float(run.f_safe[0])
     speed = "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
-    if unsafe.points is not None:
-        return {"point": "", "outcome": str(run.outcome[0]), "description": f"the car {unsafe.in_words}"}
-    if run.collided[0]:
+    name = point.name
+    if unsafe.points is not None:  # points are of the whole matrix
+        name, text = "", f"the car {unsafe.in_words}"
+    elif run.collided[0]:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
         impact = "" if speed or impact_speed < 1 else f" with {impact_speed:.2g} km/h"
         text = f"the car hits {scenario.obstacle()}{speed or impact}"
     else:
         text = f"the car keeps only {distance_in_words(scenario, degree)} from {scenario.obstacle()}{speed}"
-    return {"point": point.name, "outcome": str(run.outcome[0]), "description": text}
+    return {"point": name, "outcome": str(run.outcome[0]), "description": text}
 
 
 @dataclass(frozen=True, kw_only=True)
