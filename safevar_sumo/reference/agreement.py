@@ -87,11 +87,9 @@ class Agreement:
         """Sentences about collisions, and about errors by the safety degree here."""
         counts, speeds = self.collisions, {side: two_decimals(speed) for side, speed in self.collision_speed.items()}
         lines = [
-            f"Collisions: {counts['reference']} in the reference, {counts['here']} here, {counts['both']} in "
-            "both: precision "
-            f"{two_decimals(self.precision)}, recall {two_decimals(self.recall)}; their mean speed is "
-            f"{speeds['reference']} m/s in "
-            f"the reference, {speeds['here']} m/s here."
+            f"Collisions: {counts['reference']} in the reference, {counts['here']} here, {counts['both']} in both: "
+            f"precision {two_decimals(self.precision)}, recall {two_decimals(self.recall)}; their mean speed is "
+            f"{speeds['reference']} m/s in the reference, {speeds['here']} m/s here."
         ]
         if self.undecided["within_repeats"] is not None:
             lines.append(

@@ -34,7 +34,7 @@ UNCOMPARED_COLUMNS = ["method", "n1", "n2"]
 
 
 class ComparedTable(NamedTuple):
-    """A table, and notes on it.
+    """A table of a research question with both sides, and notes on it.
 
     The columns of the frame are the quantities here, then those published; its index has the keys. It is empty if one
     side has no rows.
@@ -112,23 +112,20 @@ CHARACTERISTICS_SHOWN = 3
 """Number of the characteristics that are changed most often that a conclusion names."""
 RULES = (
     f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, if both effect sizes are of "
-    "the same magnitude "
-    "(Kitchenham's negligible, small, medium, large), and if they lie on the same side of 0.5 unless they are "
-    "negligible or not "
-    f"significant; else *{IN_DIRECTION}* if they lie on the same side of 0.5; else *{DIFFERS}*.",
+    "the same magnitude (Kitchenham's negligible, small, medium, large), and if they lie on the same side of 0.5 "
+    f"unless they are negligible or not significant; else *{IN_DIRECTION}* if they lie on the same side of 0.5; else "
+    f"*{DIFFERS}*.",
     f"Numbers of changes (RQ3.1): *{HOLDS}* if the most frequent number is the same, *{IN_DIRECTION}* if the means "
     "differ by at most 1.",
     f"Orders (RQ3.2, weather): *{HOLDS}* from a rank correlation of {MIN_RHO:g}, *{IN_DIRECTION}* from "
     f"{MIN_RHO_IN_DIRECTION:g}.",
     f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * MIN_SHARE:.0f} % of the characteristics that lean to "
-    "one direction "
-    f"in the published results (by {100 * MIN_LEAN:.0f} % of their changes) lean to it here, "
+    f"one direction in the published results (by {100 * MIN_LEAN:.0f} % of their changes) lean to it here, "
     f"*{IN_DIRECTION}* from {100 * MIN_SHARE_IN_DIRECTION:.0f} %.",
     f"Shares and means (collisions, safety): *{HOLDS}* within a factor of {MAX_FACTOR:g}, *{IN_DIRECTION}* if both "
     "have the same sign.",
     f"Combinations: *{HOLDS}* if the most frequent one is the same, *{IN_DIRECTION}* if it is among the combinations "
-    "shown on the other "
-    "side, or shares three of its four characteristics with the most frequent published one.",
+    "shown on the other side, or shares three of its four characteristics with the most frequent published one.",
 )
 
 

@@ -1,5 +1,5 @@
-"""Effects of characteristics on the safety degree, in a reference and here, and the share of rows within the model's
-uncertainty.
+"""Effects of characteristics on the safety degree, in a reference and here, and the share of published rows within the
+model's uncertainty.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ class Effect(NamedTuple):
 
 
 def linear_effects(characteristics: CharacteristicSet, settings: FloatArray, values: FloatArray) -> FloatArray:
-    """Change of `values`, shape (rows,), over each whole domain, shape (n,), in their unit, by linear regression on all
-    characteristics that the settings, shape (rows, n), vary; NaN if undefined.
+    """How much `values`, shape (rows,), change over the whole domain of each characteristic, shape (n,), in their unit.
+
+    By linear regression on all characteristics that the settings, shape (rows, n), vary; NaN where undefined.
     """
     defined, effects = np.isfinite(values), np.full(settings.shape[1], np.nan)
     shares = (settings[defined] - characteristics.original) / (characteristics.upper - characteristics.lower)
@@ -79,10 +80,9 @@ class Coverage(NamedTuple):
         held_back = "none of them" if self.held_back is None else f"{self.held_back:.0%} of the rows"
         return (
             f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is "
-            f"{self.width:.2f} m wide "
-            f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back} held back; "
-            f"{self.needed:.2f} m more on each side would "
-            f"cover {BAND_SHARE:.0%} of {'these rows' if self.held_back is None else 'the rows held back'}."
+            f"{self.width:.2f} m wide (median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back} held "
+            f"back; {self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of "
+            f"{'these rows' if self.held_back is None else 'the rows held back'}."
         )
 
 
@@ -120,8 +120,9 @@ def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
-    """Margin on each side with which the band holds the share `BAND_SHARE` of new rows of each file [m per domain width
-    of distance from the original].
+    """The margin on each side with which the band would hold the share `BAND_SHARE` of new rows of each file.
+
+    Its unit is m per domain width of distance from the original.
 
     The method is split conformal prediction (Lei et al. 2018), file by file; the largest margin counts. The score of a
     row is its distance from the band, divided by its `error_distance` from the original setting.
