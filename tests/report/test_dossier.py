@@ -19,11 +19,13 @@ import pytest
 
 from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.report.dossier import FIRST_SENTENCE, MEASURES, _Dossier, value_at
-from safevar_sumo.report.measurements import count_constants, measure_validation
+from safevar_sumo.report.measurements import check_study, count_constants, measure_validation
 from safevar_sumo.report.pack import read_pack
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
-from tests.in_process import run
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool, run
 
 HERE, THERE = np.array([2.0, 4.0, 6.0, 9.0]), np.array([1.0, 4.0, 8.0, 8.0])
 """Errors 1, 0, -2, 1; means 5.25 and 5.25."""
@@ -97,6 +99,15 @@ def test_constants_are_counted_by_origin() -> None:
     assert count_constants(load_study("native"))["fitted"] == 0
 
 
+def test_the_original_vehicle_is_simulated_with_half_and_with_double_the_time_step() -> None:
+    system = assemble(load_study("native"))
+    setting = system.characteristics.original[np.newaxis]
+    checks = check_study(load_study("native"), setting, InlinePool())
+    for name, step in (("half_step", 0.05), ("double_step", 0.2)):
+        expected = evaluate(assemble(load_study("native", step_length=step)), setting).f_safe[0]
+        assert checks[name]["original"] == expected != checks["original"]["safety_degree"]
+
+
 def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
     alone = {"characteristic": "decel", "unit": "m/s^2", "safe": [4.80012, 9.49999]}
     record = {
@@ -141,7 +152,7 @@ def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Packed:
     names = list(manifest["study"]["vehicle"]["characteristics"])
     rows = frame[names].assign(SaftyDegree=frame["safety_degree"] * 1.1, TET=0.5, TIT=0.1, Dece=3.0)
     rows.to_csv(folder / "rows.csv", index=False)
-    manifest["study"]["evidence"] = {"threshold": {"rmse": 0.5, "pearson": 1.1}}
+    manifest["study"]["evidence"] = {"threshold": {"rmse": 100.0, "pearson": 1.1}}
     (folder / "results" / "slippery" / "manifest.json").write_text(json.dumps(manifest))
     pack = folder / "pack.zip"
     flags = ("--explain", "--tolerance", "--risk", "--reference", str(folder / "rows.csv"))
@@ -180,7 +191,7 @@ def test_the_dossier_has_its_sections_and_never_a_verdict(packed: Packed) -> Non
     ]
     assert all(section["statements"] for section in dossier["sections"])
     text = json.dumps(dossier)
-    assert "at most 0.5, which it" in text
+    assert "at most 100, which it keeps" in text
     assert "at least 1.1, which it does not keep" in text
     assert page.index(FIRST_SENTENCE) < page.index("<h2>")
     assert not re.search("compliant|https?://|<script|src=", page)
