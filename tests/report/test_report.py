@@ -28,6 +28,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, input as report_input, make_report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
+from safevar_sumo.report.sections import make_verdict
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
@@ -159,6 +160,13 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
         other = make_report([slippery], only=["verdict", "causes"], jobs=1)
     assert re.search(r"the outcome was collision and is \w+ now", other)
     assert Outline(other).open == []
+
+
+def test_a_verdict_is_bad_from_the_first_failure_on() -> None:
+    data: Any = SimpleNamespace(directory=Path("its results"), point="")
+    for failures in (0, 1):
+        explained: Any = SimpleNamespace(no_verdict="", verdict=["So."], choices=[], counts="All.", failures=failures)
+        assert make_verdict(data, explained)["is_bad"] is bool(failures)
 
 
 def test_only_some_sections(slippery: Path) -> None:
