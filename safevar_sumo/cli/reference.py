@@ -247,7 +247,7 @@ def replicate(
     cases, data = load_cases(directories), dict[str, list[ReferenceData]]()
     for reference in references:
         index, path = find_owner(reference, [case.study for case in cases])
-        data.setdefault(cases[index].name, []).append(read_reference(path, cases[index].characteristics))
+        data.setdefault(cases[index].name, []).append(read_rows(path, cases[index].characteristics))
     page = replication.replicate(cases, load_cases(published), data)
     if out is None:
         click.echo(page, nl=False)

@@ -123,11 +123,12 @@ def simulate_command(
         for remark in remarks_on_sets(target.study):
             print_note(remark)
     simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
-    if target.row is not None and not changes:
-        from safevar_sumo.replay.comparison import list_differences
+    if target.row is not None and not changes and point is None:  # results belong to the whole matrix
+        from safevar_sumo.replay.comparison import list_differences, why_different
 
         for difference in list_differences(simulation.evaluation, target.row):
-            print_warning(f"{target.handle} of {study}: {difference}; have versions or code changed since the study?")
+            why = why_different(is_imported="run" not in target.row)
+            print_warning(f"{target.handle} of {study}: {difference}; {why}")
     if trace is not None:
         with whole_file(trace, "--trace") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")

@@ -7,6 +7,7 @@ in most files, `Dece`. There is no run column.
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -100,6 +101,9 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     if missing_columns or table.empty:
         problem = f"lacks the columns {', '.join(missing_columns)}" if missing_columns else "has no rows"
         raise InputError(path, problem, "the format of the published package")
+    counts = Counter(_plain_name(str(column)) for column in table)
+    if doubled := ", ".join(column for column in columns.values() if counts[_plain_name(column)] > 1):
+        raise InputError(path, f"has more than one column for {doubled}", "each column once")
     numbers = {
         name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
         for name, column in columns.items()
@@ -122,7 +126,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
 
 
 def _plain_name(name: str) -> str:
-    key = name.replace("_", "").lower()
+    key = name.removesuffix(".1").replace("_", "").lower()  # pandas calls a second column of a name NAME.1
     return ALIASES.get(key, key)
 
 

@@ -262,3 +262,10 @@ def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
         if name != RATING_POINTS.name and not np.array_equal(stored, values[0], equal_nan=True):
             differences.append(f"{name} was {stored:.6g} and is {values[0]:.6g} now")
     return differences
+
+
+def why_different(*, is_imported: bool) -> str:
+    """Why replays of solutions may differ from the results."""
+    if is_imported:
+        return "the results are imported: another simulator made them"
+    return "the driving system, another model or this program has changed since"

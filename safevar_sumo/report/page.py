@@ -37,6 +37,7 @@ from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
+from safevar_sumo.replay.comparison import why_different
 from safevar_sumo.report.input import ReportInput, page_options, read_inputs
 from safevar_sumo.report.sections import (
     GENERAL_LIMITS,
@@ -309,11 +310,9 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         if name in sections
     }
     different = [solution["handle"] for solution in replays if solution["differences"]]
+    why = why_different(is_imported=not data.case.has_runs)
     if different:
-        warn(
-            f"{data.directory}: simulated again with different results: {', '.join(different)}; "
-            "have versions or code changed since the study?"
-        )
+        warn(f"{data.directory}: simulated again with different results: {', '.join(different)}; {why}")
     statistics = figure_data(explained.figure(), explained.necessity) if explained and explained.analysed else None
     makers: dict[str, Callable[[], Any]] = {
         "tested": lambda: describe_tested_system(data),
@@ -331,6 +330,7 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
         "picture": _picture("failure", data.draw_failure(choices[0])) if choices and "verdict" in sections else None,
         "sheet": _picture("limits", answers["tolerance"].sheet.figure()) if "tolerance" in answers else None,
         "different": different,
+        "why_different": why,
         "agreement": describe_agreement(data.case.study),
         "no_verdict": why_no_verdict(data.system),
         "later_changes": data.later_changes,

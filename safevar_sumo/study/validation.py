@@ -103,8 +103,8 @@ def schema_mistakes(source: object, raw: Any, table: type, prefix: str) -> Itera
             message = error.message.removeprefix(repr(value)).strip()
             quoted = f" = {short_text(value)}" if message != error.message else ":"
             hint = ""
-            if error.validator == "required" and error.absolute_path:  # a table with a mistyped name is a new one
-                *parents, name = error.absolute_path
+            *parents, name = error.absolute_path or [0]
+            if error.validator == "required" and isinstance(name, str):  # a table with a mistyped name is a new one
                 hint = did_you_mean(name, {*reduce(getitem, parents, raw)} - {name})
             yield InputError(source, f"{_path_text(path)}{quoted} {message}".removeprefix(": ") + hint)
 

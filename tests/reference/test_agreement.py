@@ -149,16 +149,23 @@ def test_both_published_formats_are_read(
     assert data.skipped == 1
 
 
+PUBLISHED_HEADER = ",".join([*SUN_COLUMNS, "SaftyDegree", "TET", "TIT"])
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("", "is not CSV"),
-        (",".join([*SUN_COLUMNS, "SaftyDegree", "TET", "TIT"]) + "\n", "has no rows"),
+        (PUBLISHED_HEADER + "\n", "has no rows"),
         ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
         (",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n", "lacks the columns SaftyDegree, TET, TIT"),
         ("mass,radius\n1,2,3\n", "more values than the header"),
         ("mass,radius\n1,2\n1,2,3\n", "is not CSV: .*line 3"),
         ('a,b\n"1\n', "is not CSV"),
+        *(
+            (f"{PUBLISHED_HEADER},{name}\n{','.join(['1'] * 16)}\n", f"more than one column for {column}\n")
+            for name, column in (("Mass", "Mass"), ("SaftyDegree", "SaftyDegree"), ("radius ", "radius"))
+        ),
     ],
 )
 def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, expected: str) -> None:

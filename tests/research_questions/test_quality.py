@@ -32,6 +32,7 @@ from safevar_sumo.analysis.research_questions.fronts import (
     reference_front,
 )
 from safevar_sumo.analysis.research_questions.statistics import (
+    ALPHA,
     EXACT_TEST,
     compare_samples,
     correct_by_holm,
@@ -280,3 +281,10 @@ def test_every_rendering_has_every_effect() -> None:
     answers = answer_questions([three_algorithms()])
     for output in (render(answers) for render in (as_text, as_markdown, as_latex)):
         assert all(f"{effect:.3f}" in output for answer in answers for effect in answer.frame.get("effect_size", ()))
+
+
+def test_significant_ranks_stand_out() -> None:
+    (answer,) = answer_questions([three_algorithms()], "rq2-ranks")
+    number = answer.frame.groupby("metric")["p_holm"].first().lt(ALPHA).sum()
+    assert number
+    assert (as_text([answer]).count("* "), as_latex([answer]).count(r"\textbf")) == (number, number)

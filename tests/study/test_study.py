@@ -92,6 +92,7 @@ OF_FORM = [
     ),
     ("[variation.mass]\ndistribution = 'lognormal'\nsigma = 1e300", "variation.mass.sigma"),
     ('[[correlations]]\nbetween = ["mass", "radius"]\nvalue = 1.5', "correlations"),
+    ('[[matrix.tests]]\nweathers = ["fog"]', "matrix.tests[0]: 'name' is a required property"),
     ('extends = "euro_ncap_rating"\n[matrix]\nprotocol = "euro_ncap_2023"', "protocol"),
 ]
 """A text in a study that extends `smoke`, or a whole one, and what the error says."""

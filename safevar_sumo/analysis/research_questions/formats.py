@@ -28,7 +28,8 @@ def as_text(answers: Sequence[TableAnswer]) -> str:
     """Text for a terminal: aligned columns, bold cells with an asterisk."""
     texts = []
     for table in chain.from_iterable(map(lay_out, answers)):
-        cells = table.frame.map(lambda cell: f"{cell}*" if isinstance(cell, BoldText) else f"{cell} ")
+        frame = table.frame.rename(lambda label: f"{label}*" if isinstance(label, BoldText) else label)
+        cells = frame.map(lambda cell: f"{cell}*" if isinstance(cell, BoldText) else f"{cell} ")
         body = [] if cells.empty else [re.sub(" +$", "", cells.to_string(), flags=re.MULTILINE), ""]
         texts.append("\n".join([table.title, "", *body, *table.notes, ""]))
     return "\n".join(texts)
