@@ -301,7 +301,7 @@ def status_view(progress: Status, rate: float | None) -> Group:
     front = nondominated_points(progress.points)
     front_table = WholeTable(
         right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
-        title=f"Front so far: {len(front)} points, the most severe ones",
+        title=f"Front of safety degree and changes so far: {len(front)} points, the most severe ones",
     )
     by_safety_degree = front[:, 0].argsort(kind="stable")
     for f_safe, f_diff, number in front[by_safety_degree][:MAX_FRONT_ROWS].tolist():

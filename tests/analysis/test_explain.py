@@ -177,10 +177,11 @@ def test_where_nothing_collides_the_verdict_says_so_first(case: Case, least: flo
         f"No collision in {len(distinct)} vehicles; the worst stops {few['f_safe'].min():.2f} m short of the "
         f"pedestrian, the original {degree:.2f} m, with the weather 'wet leaves'. "
     )
-    below = int((distinct["f_safe"] < degree / 2).sum())
+    below, collisions = int((distinct["f_safe"] < degree / 2).sum()), (case.evaluations["outcome"] == "collision").sum()
     assert count == (
         f"{below} of {len(distinct)} different vehicles are unsafe: safety degree below {degree / 2:.3g} m "
-        "(half of the original's, a screening limit)."
+        "(half of the original's, a screening limit). "
+        f"The search also simulated {collisions} collisions, which its objectives leave out."
     )
     assert ("Nothing unsafe was found." in first) is (below == 0)
     assert more.endswith(f": python -m safevar_sumo {'explain' if below else 'tolerance'} out")

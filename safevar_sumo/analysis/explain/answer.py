@@ -49,6 +49,8 @@ class Explained(Answer):
         Number of evaluated settings, of failures among these, and of failures that the statistics cover.
     otherwise
         Number of solutions with another outcome than the recorded one.
+    left_out
+        Number of collisions that the search simulated, if no solution is one.
     preventability
         Shares of the collisions among the evaluated settings that reference drivers avoid.
     no_verdict
@@ -68,6 +70,7 @@ class Explained(Answer):
     failures: int
     analysed: int
     otherwise: int
+    left_out: int
     preventability: Preventability
     no_verdict: str = ""
     across_fits: AcrossFits | None = None
@@ -96,6 +99,9 @@ class Explained(Answer):
         counts = f"{self.failures} of {vehicles} are unsafe: {self.unsafe.description}."
         if self.otherwise:
             counts += f" {number_of(self.otherwise, 'setting')} with another outcome than recorded."
+        if self.left_out:
+            collisions = number_of(self.left_out, "collision")
+            counts += f" The search also simulated {collisions}, which its objectives leave out."
         if self.across_fits:
             counts += f" {self.across_fits}"
         return counts

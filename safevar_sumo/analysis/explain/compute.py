@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import Case
+from safevar_sumo.analysis.case import Case, are_collisions
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
@@ -81,6 +81,9 @@ def explain_failures(
     distinct = count_distinct_causes(characteristics, sample_causes)
     if not options.solutions:
         reasons = _add_distinct_causes(population, sample, reasons, causes, distinct["cause"], options.top)
+    left_out = 0
+    if isinstance(source, Case) and not study.origin.point and not population.evaluations.collided.any():
+        left_out = int(are_collisions(source.evaluations).sum())
     models = evaluator.for_sets(options.fits if statistics and len(population.evaluations) else 0)
     preventability = assess_preventability(
         evaluator, population.evaluations.take(_is_assessed(study, population.evaluations))
@@ -100,6 +103,7 @@ def explain_failures(
         failures=len(population.rows),
         analysed=len(sample),
         otherwise=population.otherwise,
+        left_out=left_out,
         preventability=preventability,
         no_verdict=evaluator.no_verdict,
         across_fits=measure_across_fits(models, population.evaluations, population.unsafe, necessity, preventability)
