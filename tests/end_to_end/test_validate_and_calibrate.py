@@ -127,7 +127,10 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
     frame = pd.read_csv("imported/solutions.csv")
     assert frame["algorithm"].value_counts().to_dict() == {"nsga2": 40, "rs": 40}
     assert "run" not in frame
-    assert "### RQ1" in run("replicate", "imported", "--published", "imported").stdout
+    pd.read_csv(data).assign(mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)).to_csv("heavy.csv", index=False)
+    output = run("replicate", "imported", "--published", "imported", "--reference", "heavy.csv")
+    assert "### RQ1" in output.stdout
+    assert "1 rows with values outside the domains are left out" in output.stderr
     original = CharacteristicSet.of(load_study("sun")).original
     changed = frame.iloc[:, 1:13].to_numpy() != original
     assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, "changes below the threshold are put back"

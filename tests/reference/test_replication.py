@@ -75,13 +75,6 @@ def test_what_differs_is_marked_by_the_rules() -> None:
     assert verdicts["RQ3.3", "avgSD_mD"] in (HOLDS, IN_DIRECTION)
 
 
-def test_published_rows_outside_the_domains_are_told(sides: Path, tmp_path: Path) -> None:
-    path = rows(tmp_path / "rows.csv", ("mass",), 2.0, 0)
-    path.write_text(path.read_text().replace("5800.0", "9e9", 1))
-    result = typed("replicate", sides / "one", "--published", sides / "other", "--reference", path)
-    assert "1 rows with values outside the domains are left out" in result.stderr
-
-
 def test_what_ships_is_what_the_trust_page_says() -> None:
     lines = (Path(__file__).parents[2] / "docs/trust.md").read_text()
     shown = re.findall(r"^\| \w+, [\w\- ]+ \| (\d+) \| (\d+) \| (\d+) \| [\d.]+ \| [\d.]+ \|", lines, re.MULTILINE)
