@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 
@@ -26,7 +27,7 @@ from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
-from safevar_sumo.report import SECTIONS, input as report_input, make_report
+from safevar_sumo.report import SECTIONS, input as report_input, make_report, page as report_page
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
 from safevar_sumo.report.sections import make_verdict
 from safevar_sumo.results.manifest import write_manifest
@@ -175,6 +176,14 @@ def test_only_some_sections(slippery: Path) -> None:
     assert '<th class="span"' not in page, "its table has one level of headings"
     with pytest.raises(InputError, match="no section 'risks'"):
         make_report([slippery], only=["risks"])
+
+
+def test_an_answer_without_rows_has_no_figure(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = SimpleNamespace(sentences=lambda: ["So rare."], to_frame=pd.DataFrame)
+    monkeypatch.setattr(report_page, "answer_question", lambda *_, **__: answer)
+    page = make_report([slippery], only=["risk", "rules"])
+    assert page.count("So rare.") == 2
+    assert "<figure" not in page
 
 
 @pytest.mark.slow
