@@ -18,7 +18,7 @@ from safevar_sumo.scenarios.euro_ncap import BODIES
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 
 SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
-"""Distances from the vehicle's path at which a pedestrian stops [m]: the ends, and steps between them."""
+"""Distances from the vehicle's path at which a pedestrian stops [m]."""
 LEADS = (1.5, 2.0)
 """Times by which a pedestrian is at the place of the impact before the vehicle [s]: the path is clear half a second
 later.

@@ -78,49 +78,52 @@ def network_remarks(name: str, *, sumo_drives: bool) -> list[str]:
         return []
     network = open_network(name)
     file = network.path(TRAFFIC_FILE)
-    attributes = [
-        f"{name} = {value}"
+    unused_attributes = [
+        f"{attribute} = {value}"
         for element in parse_xml(file).findall(f"*[@id='{VUT}']")
-        for name, value in element.items()
-        if name in SETTING_ATTRIBUTES
-        or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and value != NO_EFFECT.get(name))
+        for attribute, value in element.items()
+        if attribute in SETTING_ATTRIBUTES
+        or (DRIVER_ATTRIBUTES.fullmatch(attribute) and not sumo_drives and value != NO_EFFECT.get(attribute))
     ]
-    warnings = _warnings_file(network).read_text(encoding="utf-8")
-    remarks = [f"{network.folder}: {warnings}"] if warnings else []
-    if attributes:
-        unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}"
-        remarks.insert(0, f"{unused}; the study's vehicle and ADS determine how it drives")
+    remarks = []
+    if unused_attributes:
+        unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(unused_attributes))}"
+        remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
+    if warnings := _warnings_file(network).read_text(encoding="utf-8"):
+        remarks.append(f"{network.folder}: {warnings}")
     return remarks
 
 
 def _refuse(file: Path, legal: str, problems: Mapping[str, bool]) -> None:
     """Raise an `InputError` for the first problem that is true."""
-    for problem in filter(problems.__getitem__, problems):
-        raise InputError(file, problem, legal)
+    for problem, is_true in problems.items():
+        if is_true:
+            raise InputError(file, problem, legal)
 
 
 @lru_cache(maxsize=100)
 def _check_files(network: Network) -> None:
     options = {"step-length": "1", "route-files": TRAFFIC_FILE, **options_of(network.path(OPTIONS_FILE))}
-    problems = {
+    is_illegal = {
         "step-length": not SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP,
         "remote-port": "remote-port" in options,  # SUMO would wait for a client
         "route-files": options["route-files"] != TRAFFIC_FILE,
     }
-    texts = {f"{name} = {options.get(name)!r}": is_illegal for name, is_illegal in problems.items()}
-    _refuse(network.path(OPTIONS_FILE), LEGAL_OPTIONS, texts)
+    problems = {f"{name} = {options.get(name)!r}": is_true for name, is_true in is_illegal.items()}
+    _refuse(network.path(OPTIONS_FILE), LEGAL_OPTIONS, problems)
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>')
     routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
+    subject, others_have_its_type = f"vehicle {VUT!r}:", len(traffic.findall(f"*[@type='{VUT}']")) > 1
     problems = {
-        f"type = {vut.get('type')!r}": vut.get("type") != VUT or len(traffic.findall(f"*[@type='{VUT}']")) > 1,
-        f"depart = {vut.get('depart')!r}": parse_seconds(vut.get("depart", "")) != 0,
-        "has a stop": any(route.find("stop") is not None for route in routes),
+        f"{subject} type = {vut.get('type')!r}": vut.get("type") != VUT or others_have_its_type,
+        f"{subject} depart = {vut.get('depart')!r}": parse_seconds(vut.get("depart", "")) != 0,
+        f"{subject} has a stop": any(route.find("stop") is not None for route in routes),
     }
-    _refuse(file, LEGAL_VUT, {f"vehicle {VUT!r}: {problem}": is_illegal for problem, is_illegal in problems.items()})
+    _refuse(file, LEGAL_VUT, problems)
     _check_lanes(file, routes, parse_xml(built_network(network)))
     _refuse_random_types(file, traffic)
     _warnings_file(network)

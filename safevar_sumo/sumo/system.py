@@ -215,13 +215,13 @@ def assemble(study: Study, source: str = "") -> System:
     if isinstance(ads, TraciController) and isinstance(vehicle, GuardedVehicle):
         vehicle.require_sensors()
     measuring = measuring_of(study, Lookup(source, study.origin.places))
-    tables_by_metric = {
+    tables_of_metrics = {
         "published": study.published,
         "repeatability": study.repeatability,
         "model_error": study.model_error,
         "fit.weights": study.fit.weights,
     }
-    for key, table in tables_by_metric.items():
+    for key, table in tables_of_metrics.items():
         for name in (name for name in table if name not in measuring.metrics):
             raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
@@ -266,13 +266,12 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
         step = getattr(controller, "step", None) if is_class else controller
         if not callable(step) or not (is_class or parameters or accepts(step, 2)):
             raise InputError(lookup.source, f"{name} cannot be called as step(traci, vehicle_id)", CONTROLLER_FORMS)
-        if not is_class:
+        create: Callable[[], Any]
+        if is_class:
+            create = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
+        else:
             check_parameters(controller, (None, None), parameters, name, "ads.parameters", lookup.source)
-        create = (
-            partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
-            if is_class
-            else partial(partial, controller, **parameters)
-        )
+            create = partial(partial, controller, **parameters)  # the function with its parameters
         create()  # so that wrong parameters raise errors here
     return TraciController(create, member.guard or Guard(lookup.source, name))
 
