@@ -5,12 +5,13 @@ type them.
 from __future__ import annotations
 
 import io
+import json
 import os
 import sys
 from concurrent.futures import Future
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -35,10 +36,13 @@ class InlinePool:
     def carry(self, job: Job, report: Report) -> Future[None]:
         future: Future[None] = Future()
         try:
-            future.set_result(carry_out_job(job, report, evaluate_batch))
+            future.set_result(self.work(job, report))
         except Exception as error:
             future.set_exception(error)
         return future
+
+    def work(self, job: Job, report: Report) -> None:
+        carry_out_job(job, report, evaluate_batch)
 
     def close(self) -> None: ...
 
@@ -90,6 +94,11 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
             del sys.modules[name]
     assert code == expect, f"{code}\n{out.getvalue()}\n{err.getvalue()}"
     return CommandOutput(out.getvalue(), err.getvalue())
+
+
+def json_of(*arguments: str) -> Any:
+    """The JSON that a command prints."""
+    return json.loads(run(*arguments, "--json").stdout)
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:

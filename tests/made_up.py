@@ -30,6 +30,11 @@ def made_up_runs(
     return SimulationRuns(trace=trace, encounter=encounter, outcome=outcome, collision_speed=crash)
 
 
+def original_of(system: Any) -> FloatArray:
+    """The original vehicle as the only row of settings."""
+    return np.asarray(system.characteristics.original[np.newaxis])
+
+
 def made_up_evaluations(safety: Any, **columns: Any) -> Evaluations:
     """Vehicles of these safety degrees: collisions where these are 0 or less."""
     values = np.asarray(safety, dtype=float)

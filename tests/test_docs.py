@@ -16,12 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.cli.program import commands
-from safevar_sumo.report import input as report_input
 from safevar_sumo.results.manifest import (
     KEYS_WITHOUT_EFFECT_ON_EVALUATIONS,
     KEYS_WITHOUT_EFFECT_ON_RESULTS,
@@ -142,21 +138,6 @@ def test_every_file_of_code_that_is_named_exists() -> None:
             r"(?<![\w/.])((?:[a-z_]+/)*(?:[a-z_]+/[a-z_]+|test_\w+)\.py)\b", (ROOT / file).read_text()
         ):
             assert name in made or any(path.as_posix().endswith(f"/{name}") for path in there), f"{file}: {name}"
-
-
-def test_the_numbers_of_a_reports_questions_are_those_that_the_page_about_it_gives() -> None:
-    paragraph = re.search(
-        r"A report asks all questions.*?\n\n", (ROOT / "docs" / "gallery.md").read_text(), flags=re.DOTALL
-    )
-    assert paragraph is not None
-    numbers = (
-        report_input.SAMPLED_VEHICLES,
-        RiskOptions.samples,
-        RulesOptions.samples,
-        report_input.EXPLAIN_SIMULATIONS,
-        ExplainOptions.limit,
-    )
-    assert re.findall(r"\d+,\d+", paragraph[0]) == [f"{number:,}" for number in numbers]
 
 
 def test_the_page_on_results_lists_every_key_that_may_change() -> None:

@@ -5,7 +5,6 @@ known.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
 
 import msgspec
 import numpy as np
@@ -16,6 +15,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool
 from tests.made_up import made_up_evaluations
 
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
@@ -33,12 +33,10 @@ def made_up_study(n: int) -> Study:
     )
 
 
-class Plant:
+class Plant(InlinePool):
     """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all others have the safety
     degree `degree`.
     """
-
-    workers = 1
 
     def __init__(
         self,
@@ -52,11 +50,8 @@ class Plant:
         self._failing = failing or nowhere
         self.seen: set[bytes] = set()
 
-    def carry(self, job: Batch, report: Report) -> Future[None]:
+    def work(self, job: Batch, report: Report) -> None:
         report(self.evaluate(job.settings))
-        future: Future[None] = Future()
-        future.set_result(None)
-        return future
 
     def evaluate(self, settings: FloatArray) -> Evaluations:
         collides = np.asarray(self._region(settings), dtype=bool)
@@ -73,8 +68,6 @@ class Plant:
             f_diff=self._characteristics.largest_change(settings),
             f_num_diff=self._characteristics.number_changed(settings),
         )
-
-    def close(self) -> None: ...
 
 
 def made_up_evaluator(n: int, region: Region) -> Evaluator:

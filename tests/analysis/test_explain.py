@@ -99,12 +99,12 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_num_diff"].where(case.solutions["f_safe"] > 1).idxmin()  # few changes have few subsets
     handle = str(handles_of(case.solutions)[safe])
-    (one,) = explain_failures(
-        case, ExplainOptions(solutions=(handle,), unsafe="collision", fits=0), Evaluator(case.study, InlinePool())
-    ).explanations
+    evaluator = Evaluator(case.study, InlinePool())
+    options = ExplainOptions(solutions=(handle,), unsafe="collision", fits=0)
+    (one,) = explain_failures(case, options, evaluator).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("requested",))
     with pytest.raises(InputError, match="nsga2:7:0"):
-        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), Evaluator(case.study, InlinePool()))
+        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), evaluator)
 
 
 def printed(explained: Explained, *, full: bool) -> str:
@@ -148,11 +148,9 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
     """It is the answer of `explain` without the other fitted models: the same failures, the same cause of each."""
-    alone = explain_failures(case, ExplainOptions(fits=0), Evaluator(case.study, InlinePool()))
-    original = Evaluator(case.study, InlinePool()).evaluate_original()
-    paragraph, count, *others, more = summarise_failures(
-        case, original, Evaluator(case.study, InlinePool()), "my results"
-    )
+    evaluator = Evaluator(case.study, InlinePool())
+    alone = explain_failures(case, ExplainOptions(fits=0), evaluator)
+    paragraph, count, *others, more = summarise_failures(case, evaluator.evaluate_original(), evaluator, "my results")
     assert_tells_a_manager(paragraph, explained)
     assert [paragraph, count] == alone.sentences()[:2]
     for failure in explained.choices:
@@ -167,11 +165,11 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
 @pytest.mark.parametrize(("least", "most"), [(0.6, 2.0), (0.3, 2.0), (0.6, 0.9)])
 def test_where_nothing_collides_the_verdict_says_so_first(case: Case, least: float, most: float) -> None:
     """Half of the original's distance is a screening limit: what is below it is no failure, whatever its robustness."""
-    original = Evaluator(case.study, InlinePool()).evaluate_original()
+    evaluator = Evaluator(case.study, InlinePool())
+    original = evaluator.evaluate_original()
     degree = float(original.f_safe[0])
     few = case.solutions[case.solutions["f_safe"].between(least * degree, most * degree)].reset_index(drop=True)
-    screened = replace(case, solutions=few)
-    first, count, *_, more = summarise_failures(screened, original, Evaluator(case.study, InlinePool()), "out")
+    first, count, *_, more = summarise_failures(replace(case, solutions=few), original, evaluator, "out")
     distinct = few.drop_duplicates(list(case.characteristics.names))
     assert first.startswith(
         f"No collision in {len(distinct)} vehicles; the worst stops {few['f_safe'].min():.2f} m short of the "
@@ -257,20 +255,20 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
 
 def test_necessary_and_changed_over_failures() -> None:
     evaluator = made_up_evaluator(3, lambda settings: box(settings) | (settings[:, 2] > 9))
-    settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
+    settings, members = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]]), evaluator.characteristics
     causes = find_minimal_causes(evaluator, settings, COLLISION)
-    frame = necessity_frame(
-        evaluator.characteristics, evaluator.characteristics.changed(settings), causes, 3
-    ).set_index("characteristic")
+    frame, of_four = (
+        necessity_frame(members, members.changed(settings), causes, number).set_index("characteristic")
+        for number in (3, 4)
+    )
     assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
     assert frame["necessary"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 1 / 3})
     assert frame["necessary_lower"].equals(frame["necessary"]), "of all failures the shares are exact"
-    members = evaluator.characteristics
-    sampled = necessity_frame(members, members.changed(settings), causes, 4).set_index("characteristic").loc["c"]
+    sampled = of_four.loc["c"]
     ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (1, 3)), (0.975, (2, 2)))]
     assert sampled[["necessary_lower", "necessary_upper"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
-    distinct = count_distinct_causes(evaluator.characteristics, causes)
-    assert list(zip(distinct["cause"], distinct["failures"], strict=True)) == [(("a up", "b down"), 2), (("c up",), 1)]
+    distinct = count_distinct_causes(members, causes)
+    assert distinct[["cause", "failures"]].to_numpy().tolist() == [[("a up", "b down"), 2], [("c up",), 1]]
 
 
 def test_conclusions_across_fitted_models() -> None:

@@ -13,7 +13,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 import safevar_sumo as sv
@@ -113,7 +112,7 @@ def test_limits_are_rounded_to_the_safe_side() -> None:
 
 
 def test_a_notebook_shows_the_sentences_and_tables_of_the_terminal() -> None:
-    study = msgspec.structs.replace(made_up_study(2), title="a < b & <script>")
+    study = load_study(made_up_study(2), title="a < b & <script>")
     result = risk(study, unsafe="collision", samples=2000, pool=Plant(study, box))
     page = result._repr_html_()
     assert page == answer_as_html(result)

@@ -17,7 +17,7 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.analysis.repair import attack, compute, smallest
-from safevar_sumo.analysis.repair.answer import NotRepairable, write_repair
+from safevar_sumo.analysis.repair.answer import write_repair
 from safevar_sumo.analysis.repair.problem import Parameter, RepairProblem
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
@@ -244,8 +244,6 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_sea
     assert kept.worst_today == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     assert f"has a safety degree of {kept.worst_today:.2f} m, and 5 fresh worn cars, 0 unsafe" in kept.verdict
     assert "  not searched       no simulation reads colour" in list(replace(kept, unread=("colour",)).sentences())
-    some_lost = replace(kept, not_repairable=(NotRepairable({"decel": 5.0}, "", 0.5),))
-    assert "keeps this promise (decel >= 7 m/s^2, decel <= 9.5 m/s^2) wherever any driving" in some_lost.verdict
     name = kept.parameters[0].name
     changed: Any = SimpleNamespace(values={name: kept.parameters[0].today})
     # A study that results alone hold has no file to extend.
@@ -273,13 +271,6 @@ def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, c
         sv.repair(planted, change=[change], pool=InlinePool())
 
 
-def test_every_changeable_parameter_is_a_number_of_its_driving_system() -> None:
-    assert {"aeb", "world_on_rails", "apollo", "idm", "acc", "rss", "fuzzy_safety"} <= CHANGEABLE.keys() <= ADS.keys()
-    for ads, table in CHANGEABLE.items():
-        assert set(table) <= set(ADS[ads].__struct_fields__)
-        assert all(row.lower < row.upper and row.unit and row.meaning for row in table.values())
-
-
 @pytest.mark.parametrize("model", CHANGEABLE)
 def test_one_driving_system_drives_vehicles_with_different_parameters(model: str) -> None:
     shipped = {"world_on_rails": "sun", "apollo": "lgsvl"}
@@ -287,11 +278,9 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     study = sv.load_study("wear", ads={"model": model, "parameters": parameters})
     names, system = tuple(CHANGEABLE[model]), replace(assemble(study), matrix=assemble(study).points[-1:])
     ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
-    values = (
-        np.clip(np.random.default_rng(1).random((3, len(names))), 0.02, 0.98) @ np.diag(np.diff(ends)[:, 0])
-        + ends[:, 0]
-    )
-    settings = np.tile(system.characteristics.original, (len(values), 1))
+    low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
+    values = np.random.default_rng(1).uniform(low, high, (3, len(names)))
+    settings = np.tile(system.characteristics.original, (3, 1))
     together = evaluate(replace(system, ads=VariedAds(system.ads, names, values)), settings)
     for row, one in enumerate(values):
         ads = ADS[model](**{**parameters, **dict(zip(names, one.tolist(), strict=True))})

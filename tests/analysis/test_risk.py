@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import scipy
@@ -20,7 +19,6 @@ from safevar_sumo.analysis.risk.variation import VariationModel
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
-from safevar_sumo.study.characteristics import Distribution, Uniform
 from tests.analysis.known_regions import (
     Plant,
     Region,
@@ -77,14 +75,10 @@ def test_sobol_indices_of_ishigamis_function() -> None:
 def test_words_of_a_risk_claim_nothing_that_is_not_there() -> None:
     """Everything varies as specified, so there are no others; no fleet is certain to fail; 99.9 % is not 100 %."""
     normal = {"distribution": "normal", "deviation": 1.0}
-    variation = msgspec.convert({"a": normal, "b": normal}, dict[str, Distribution])
-    study = msgspec.structs.replace(made_up_study(2), variation=variation)
+    study = load_study(made_up_study(2), variation={"a": normal, "b": normal})
     result = risk(study, unsafe="collision", samples=200, confidence=0.999, pool=Plant(study, box))
-    result = replace(result, probability=0.009)
-    printed = " ".join(map(str, result.sentences()))
+    printed = " ".join(map(str, replace(result, probability=0.009).sentences()))
     assert "They vary as the study specifies: a normal; b normal." in printed
-    without = " ".join(map(str, replace(result, study=made_up_study(2)).sentences()))
-    assert "They vary uniformly over the whole domain." in without
     assert "at least one is unsafe with probability above 0.99." in printed
     assert "with 99.9 % confidence" in printed
 
@@ -163,10 +157,7 @@ def curved(radius: float) -> Limit:
 
 
 def rare(limit: Limit, n: int, seed: int = 1, **options: object) -> Risk:
-    study = made_up_study(n)
-    study = msgspec.structs.replace(
-        study, search=msgspec.structs.replace(study.search, seed=seed), variation={"a": Uniform()}
-    )
+    study = load_study(made_up_study(n), search={"seed": seed}, variation={"a": {"distribution": "uniform"}})
     plant = Plant(study, lambda settings: limit(of_normal(settings)) < 0, lambda settings: limit(of_normal(settings)))
     return risk(study, unsafe="collision", pool=plant, progress=passes_no_end, **{"rare": True, **options})  # type: ignore[arg-type]
 

@@ -15,6 +15,7 @@ from safevar_sumo.study import load_study
 from tests.analysis.known_regions import Plant, made_up_study, nowhere
 
 NAMES = "abcdefghijkl"
+SLOW = pytest.mark.slow
 
 
 def closed_form(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -55,15 +56,9 @@ def linear(slopes: list[float], deviations: list[float], correlations: dict[tupl
     [
         ([1.0, 1.0], [0.5, 1.0], {(0, 1): -0.7}),
         ([1.0, 1.0, 1.0], [0.5, 0.5, 1.0], {(1, 2): 0.9}),
-        pytest.param(
-            [1.0, -1.0, 2.0, 1.0, 0.5, 0.7], [0.5] * 6, {(0, 1): 0.5, (2, 3): -0.6, (4, 5): 0.8}, marks=pytest.mark.slow
-        ),
         *(
             pytest.param(
-                [1.0, -1.0, 2.0, 1.5] * (d // 4),
-                [0.5] * d,
-                {(0, 1): 0.5, (2, 3): -0.6, (4, 7): 0.8},
-                marks=pytest.mark.slow,
+                [1.0, -1.0, 2.0, 1.5] * (d // 4), [0.5] * d, {(0, 1): 0.5, (2, 3): -0.6, (4, 7): 0.8}, marks=SLOW
             )
             for d in (8, 12)
         ),
@@ -82,9 +77,8 @@ def test_effects_of_correlated_normal_values_are_those_of_the_closed_form(
     np.testing.assert_allclose(effects, expected, rtol=0.02)
     assert effects.sum() == pytest.approx(expected.sum(), rel=0.02)
     assert frame["share"].groupby("output").sum().to_list() == [pytest.approx(1, abs=1e-12)] * 2
-    entry = result.to_dict()
-    assert entry["sensitivity"] == []
-    assert [row["effect"] for row in entry["shapley"]] == effects.to_list()
+    assert result.to_dict()["sensitivity"] == []
+    assert [row["effect"] for row in result.to_dict()["shapley"]] == effects.to_list()
     assert result.figure().axes
 
 

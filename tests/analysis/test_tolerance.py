@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import scipy
@@ -176,7 +175,7 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
         monkeypatch.setattr(boxes, name, value)
     q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
     for seed in range(seeds):
-        seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
+        seeded = load_study(study, search={"seed": seed})
         evaluator = Evaluator(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
         result = boxes.find_safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)), np.zeros((0, 2)))
         wrong += result.unsafe_at_most < q
@@ -313,14 +312,14 @@ def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, c
     done = run("tolerance", str(study), *flags, expect=code)
     _, decel, gain, joint = json.loads(done.stdout)
     keys = "characteristic unit original alone together specified kept margin first_failure"
-    assert list(decel["limit"]) == keys.split()
-    assert decel["limit"]["specified"] == {"low": float(limit), "high": None, "source": "workshop"}
-    assert decel["limit"]["margin"] == pytest.approx(float(limit) - decel["limit"]["alone"][0])
-    assert (decel["limit"]["kept"], joint["joint"]["kept"]) == ((code == 0),) * 2
-    assert gain["limit"]["kept"]
+    specified, low = decel["limit"], float(limit)
+    assert list(specified) == keys.split()
+    assert specified["specified"] == {"low": low, "high": None, "source": "workshop"}
+    assert specified["margin"] == pytest.approx(low - specified["alone"][0])
+    assert [specified["kept"], joint["joint"]["kept"], gain["limit"]["kept"]] == [code == 0, code == 0, True]
     keys = "fixed box samples unsafe at_most known_unsafe_inside kept"
     assert list(joint["joint"]) == keys.split()
-    assert joint["joint"]["box"]["decel"][0] == float(limit)
+    assert joint["joint"]["box"]["decel"][0] == low
     assert ("failed: limit of decel: outside by" in done.stderr) == (code == 3)
 
 
@@ -336,22 +335,16 @@ def test_a_trade_follows_the_line_between_safe_and_unsafe() -> None:
     for result, room, last in ((free, 6.0, 8.0), (held, 3.0, 6.5)):
         assert result.trade is not None
         values = list(result.trade.curve)
-        assert (values[0], values[-1]) == (0.0, pytest.approx(last, abs=1e-4))
+        assert (values[0], values[-1], len(values)) == (0.0, pytest.approx(last, abs=1e-4), 11)
         assert 5.0 in values
-        assert len(values) == 11
         for value, ends in result.trade.curve.items():
             assert ends == (0.0, pytest.approx(min(10.0, 5 + room - 2 * (value - 5)), abs=1e-4))
-    record = json.loads(json.dumps(free.to_dict(), allow_nan=False))
-    assert list(record["trade"]) == ["characteristics", "units", "fixed", "curve"]
-    del record["trade"]
-    assert json.dumps(record) == json.dumps(plain.to_dict()), "all else stays"
+    record = free.to_dict()
+    assert list(record.pop("trade")) == ["characteristics", "units", "fixed", "curve"]
+    assert json.dumps(record, allow_nan=False) == json.dumps(plain.to_dict()), "all else stays"
     assert held.trade is not None
     assert held.trade.to_dict()["fixed"] == {"c": [None, 6.0]}
-    assert [str(cell) for column in held.trade.table().columns for cell in list(column.cells)[-2:]] == [
-        *("5.7", "6.5"),
-        *("0.0*", "0.0*"),
-        *("6.4", "5.0"),
-    ]
+    assert [str([*column.cells][-1]) for column in held.trade.table().columns] == ["6.5", "0.0*", "5.0"]
     assert held.figure().axes[0].get_xlabel() == "b [N m]"
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import warnings
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.analysis.subject import study_or_case
 from safevar_sumo.study import load_study, tables_of
-from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
+from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -73,17 +72,6 @@ def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond(value: flo
         sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
 
 
-def test_undefined_physics_are_reported_and_not_taken_for_a_standing_vehicle() -> None:
-    system = assemble(sv.load_study("smoke"))
-    settings = system.characteristics.original[np.newaxis].copy()
-    settings[0, system.characteristics.names.index("radius")] = 1e200
-    with (
-        warnings.catch_warnings(action="error"),
-        pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with radius = 1e\+200\n"),
-    ):
-        simulate(system, settings)
-
-
 def test_evaluate_is_simulate_row_by_row() -> None:
     asked = pd.DataFrame({"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc"))
     frame = sv.evaluate("sun", asked, jobs=1)
@@ -106,14 +94,6 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
     assert stages[-1] == ("settings", 3, 3)
-
-
-def test_a_criterion_is_a_number_a_word_or_an_object() -> None:
-    criteria: list[sv.Criterion] = [1.5, "below=1.5", sv.Unsafe(below=1.5)]
-    assert {sv.Unsafe.parse(criterion) for criterion in criteria} == {sv.Unsafe(1.5)}
-    assert sv.Unsafe.parse("collision") == sv.Unsafe()
-    with pytest.raises(sv.InputError, match=r"unsafe: 'above=2'"):
-        sv.tolerance("sun", unsafe="above=2")
 
 
 def test_compare_needs_a_study_and_changes_alone() -> None:

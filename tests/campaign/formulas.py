@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from safevar_sumo.campaign import Campaign, RunKey, RunProgress, all_runs, run_campaign
@@ -17,6 +16,7 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool
 from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
@@ -40,7 +40,7 @@ class Death(BaseException):
     """The end of a worker that carries a share."""
 
 
-class FormulaPool:
+class FormulaPool(InlinePool):
     """Computes in this process, or in a thread for each worker; fails after `limit` batches."""
 
     def __init__(self, workers: int = 1, limit: int | None = None) -> None:
@@ -59,16 +59,9 @@ class FormulaPool:
         return evaluated(settings)
 
     def carry(self, job: Job, report: Report) -> Future[None]:
-        if self._threads:
-            return self._threads.submit(self._carry, job, report)
-        future: Future[None] = Future()
-        try:
-            future.set_result(self._carry(job, report))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+        return self._threads.submit(self.work, job, report) if self._threads else super().carry(job, report)
 
-    def _carry(self, job: Job, report: Report) -> None:
+    def work(self, job: Job, report: Report) -> None:
         try:
             carry_out_job(job, report, self.evaluate)
         except Death as death:
@@ -98,7 +91,7 @@ class EventLog:
 
 
 def with_search(study: Study, **changes: object) -> Study:
-    return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
+    return load_study(study, search=changes)
 
 
 def carried_out(

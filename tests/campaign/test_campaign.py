@@ -8,7 +8,6 @@ import dataclasses
 from collections import Counter
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -27,8 +26,7 @@ from tests.campaign.formulas import SUN, Death, EventLog, FormulaPool, carried_o
 
 @pytest.fixture
 def study() -> Study:
-    smoke = load_study("smoke")
-    return msgspec.structs.replace(smoke, search=msgspec.structs.replace(smoke.search, algorithms=sorted(ALGORITHMS)))
+    return load_study("smoke", search={"algorithms": sorted(ALGORITHMS)})
 
 
 @pytest.mark.slow

@@ -19,22 +19,20 @@ from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.local import LocalPool, local_pool
 from safevar_sumo.campaign.pool import (
     Batch,
-    Job,
     PoolLostError,
-    Report,
     WorkerLostError,
     defer_interrupts,
     evaluate_batches,
     wait_for_next,
 )
-from safevar_sumo.campaign.worker import carry_out_job, reproduction_command
+from safevar_sumo.campaign.worker import reproduction_command
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import Death, evaluated
+from tests.campaign.formulas import Death, FormulaPool, evaluated
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = Task(study=load_study("smoke")).packed
@@ -129,12 +127,11 @@ def settings(number: int) -> np.ndarray:
     return rows
 
 
-class Told:
+class Told(FormulaPool):
     """Fails with what `fault` answers to (settings, how often they were tried before); a worker dies of some faults."""
 
-    workers = 1
-
     def __init__(self, fault: Callable[[np.ndarray, int], Exception | None]) -> None:
+        super().__init__()
         self.fault = fault
         self.tried: list[int] = []
         self._times = Counter[bytes]()
@@ -146,16 +143,6 @@ class Told:
         if error is not None:
             raise Death(str(error)) if isinstance(error, WorkerLostError) else error
         return evaluated(settings)
-
-    def carry(self, job: Job, report: Report) -> Future[None]:
-        future: Future[None] = Future()
-        try:
-            future.set_result(carry_out_job(job, report, self.evaluate))
-        except Death as death:
-            future.set_exception(WorkerLostError(str(death)))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 def tried(pool: Told, settings: np.ndarray, study: Study = STUDY) -> Evaluations:

@@ -14,7 +14,6 @@ from pathlib import Path
 from unittest.mock import patch
 
 import click
-import msgspec
 import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
@@ -187,8 +186,7 @@ def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, m
 
 @pytest.fixture
 def study() -> Study:
-    rain = load_study("rain")
-    return msgspec.structs.replace(rain, search=msgspec.structs.replace(rain.search, runs=2, evaluations=1000))
+    return load_study("rain", search={"runs": 2, "evaluations": 1000})
 
 
 @pytest.fixture

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
-import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,7 +24,7 @@ from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import refused, run
+from tests.in_process import json_of, refused, run
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 
@@ -49,7 +47,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
-    output = json.loads(run("validate", "sun", str(data), "--json").stdout)
+    output = json_of("validate", "sun", str(data))
     assert output["rows"] == 40
     assert output["spearman"] == pytest.approx(dict.fromkeys(COLUMNS, 1.0))
     assert output["mean_absolute_error"] == pytest.approx(dict.fromkeys(COLUMNS, 0.0), abs=1e-12)
@@ -92,16 +90,6 @@ def test_the_best_so_far_is_saved_now_and_then_and_if_a_calibration_is_interrupt
     assert Path("best.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# ")
     assert told in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
-
-
-@pytest.mark.slow
-def test_the_published_landscape_is_searched_without_a_simulation(data: Path) -> None:
-    script = Path(__file__).parents[2] / "docs" / "landscape.py"
-    command = [sys.executable, script, "sun", data, "--runs", "1", "--evaluations", "100"]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[1:]
-    rows, published = {line[:25].strip(): line[25:].split() for line in lines}, pd.read_csv(data)["SaftyDegree"]
-    assert rows["safety degree, mean [m]"][0] == f"{published.mean():.2f}"
-    assert rows["collisions [%]"][0] == f"{100 * (published <= 0).mean():.1f}0"
 
 
 @pytest.fixture(scope="module")

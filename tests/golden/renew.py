@@ -13,7 +13,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pandas as pd
 
 from safevar_sumo.campaign.identity import identity_of
@@ -35,11 +34,8 @@ FILE = Path(__file__).with_name("golden.json")
 
 def small(name: str) -> Study:
     """A shipped study with a search that takes a second."""
-    study = load_study(name)
-    search = msgspec.structs.replace(
-        study.search, algorithms=["nsga2", "rs", "safe_fuzzer"], population=10, evaluations=40, runs=1
-    )
-    return msgspec.structs.replace(study, search=search)
+    search = {"algorithms": ["nsga2", "rs", "safe_fuzzer"], "population": 10, "evaluations": 40, "runs": 1}
+    return load_study(name, search=search)
 
 
 def computed(name: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import pytest
 from safevar_sumo import testing
 from safevar_sumo.plugins.check import check
 from safevar_sumo.study import study_names
-from tests.in_process import run
+from tests.in_process import json_of, run
 
 SIX = Path(__file__).parent / "six"
 SCALAR = """import random
@@ -251,7 +251,7 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     text = run("check", "mine:Mine", expect=1).stdout.replace("\n", "")
     assert "mine.py:11: contract: returned brake = 100.0 from drive" in text
     (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
-    assert json.loads(run("check", "mine:Mine", "--study", "mine.toml", "--json").stdout)["findings"] == []
+    assert json_of("check", "mine:Mine", "--study", "mine.toml")["findings"] == []
 
 
 def test_an_authors_test_class_has_a_test_for_each_check(in_tmp: Path) -> None:

@@ -13,6 +13,7 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from tests.made_up import original_of
 from tests.plugins.conftest import ADS, SCALAR, Mine
 
 CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
@@ -20,7 +21,7 @@ CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
 
 def throttle(study: Path) -> float:
     system = assemble(load_study(str(study)))
-    evaluate(system, system.characteristics.original[None])
+    evaluate(system, original_of(system))
     driver = system.ads.start(1, system.nominal, 0.05)[0]
     return float(driver.drive(None)[0])
 
@@ -123,7 +124,7 @@ ROWS = "\n".join(
 
 
 def failing(system: object) -> str:
-    settings = np.repeat(system.characteristics.original[None], 3, axis=0)  # type: ignore[attr-defined]
+    settings = np.repeat(original_of(system), 3, axis=0)  # type: ignore[attr-defined]
     with pytest.raises(UserCodeError) as caught:
         evaluate(system, settings)  # type: ignore[arg-type]
     assert len(str(caught.value).splitlines()) <= 2
@@ -165,7 +166,7 @@ def test_ctrl_c_passes(mine: Mine) -> None:
     try:
         handler = signal.signal(signal.SIGINT, signal.default_int_handler)
         with pytest.raises(KeyboardInterrupt):
-            evaluate(ctrl_c, ctrl_c.characteristics.original[None])
+            evaluate(ctrl_c, original_of(ctrl_c))
     finally:
         signal.signal(signal.SIGINT, handler)
 
@@ -248,7 +249,7 @@ def vehicle(method: str, body: str) -> str:
 def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
     def tried() -> None:
         system = mine(vehicle(method, body), VEHICLE.format(ROWS))
-        evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))
+        evaluate(system, np.repeat(original_of(system), 3, axis=0))
 
     with pytest.raises(UserCodeError) as caught:
         tried()

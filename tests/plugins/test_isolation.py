@@ -22,7 +22,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import GuardedVehicle
-from tests.in_process import InlinePool, SilentObserver, refused, run
+from tests.in_process import InlinePool, SilentObserver, json_of, refused, run
 from tests.plugins.conftest import ADS as USES_ADS, Mine
 from tests.scenarios.holding import Pedals
 
@@ -153,7 +153,7 @@ def six(in_tmp: Path) -> None:
 
 
 def test_members_of_user_code_are_simulated_and_scored(six: None) -> None:
-    output = json.loads(run("simulate", "six/mine.toml", "--set", "grip=5", "--json").stdout)
+    output = json_of("simulate", "six/mine.toml", "--set", "grip=5")
     assert output["jerk"] > 0
     assert output["mean_change"] == pytest.approx(3 / 8 / 3)
 

@@ -4,7 +4,6 @@ process.
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +23,7 @@ from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import TwoWorkers, run, searched
+from tests.in_process import TwoWorkers, json_of, run, searched
 from tests.sumo.test_recording import still as still
 
 STUDY = load_study("euro_ncap_rating")
@@ -120,12 +119,12 @@ def test_a_rating_has_a_page_and_is_packed_and_made_again(in_tmp: Path) -> None:
     run("report", "results", "--out", "it.html")
     assert re.findall("<h([1-6])", Path("it.html").read_text()) == ["1", "2", "3", "3"]
     run("evidence", "results", "--out", "it.zip", "--rating")
-    result = json.loads(run("verify", "it.zip", "--json").stdout)
+    result = json_of("verify", "it.zip")
     assert result["same"] == result["claims"]
     assert "answer rating" in {claim["claim"] for claim in result["table"]}
 
 
 @pytest.mark.slow
 def test_a_rating_begins_with_the_reason_and_a_robot_drives_who_does_nothing(still: str) -> None:
-    rated = json.loads(run("rating", still, "--json").stdout)
+    rated = json_of("rating", still)
     assert rated.get("driven", True) is (rated["variants"][0]["points"] == 0)  # 0 points: everything collides

@@ -159,12 +159,14 @@ def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     race, _ = race_in(Bowl(bottom=1.0), 8, 800)
     race.run([CmaSearch(race, np.array([place, 0.6]), 0.3, 3) for place in (0.9, 0.5)])
     assert race.best_place == pytest.approx([0.2, 0.2], abs=0.01)
-    bounds = [FreeParameter(lower=0.0, upper=upper, unit="-", meaning="place") for upper in (1.0, 10.0)]
-    parameters = [FittedParameter("a", (0,), bounds[0]), FittedParameter("b", (1,), bounds[1])]
+    parameters = [
+        FittedParameter(name, (i,), FreeParameter(lower=0.0, upper=upper, unit="-", meaning="place"))
+        for i, (name, upper) in enumerate((("a", 1.0), ("b", 10.0)))
+    ]
     profiles = Profiles.of(parameters, FitSpace(parameters, []), [race], 0.04)
-    for (low, high), whole in ((profiles.interval(0), 0.4), (profiles.interval(1), 4.0)):
-        assert 0 <= low < 0.3 * whole, "no more than what is as good, and most of it"
-        assert 0.7 * whole < high <= whole
+    for i, whole in enumerate((0.4, 4.0)):
+        low, high = profiles.interval(i)
+        assert 0 <= low < 0.3 * whole < 0.7 * whole < high <= whole, "no more than what is as good, and most of it"
     assert list(profiles.spread(1)) == ["b"]
     sets = profiles.spread(0)["a"]
     assert len(sets) == 20

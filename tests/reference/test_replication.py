@@ -4,15 +4,13 @@ rows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from safevar_sumo.reference.agreement import rank_correlation, shipped_totals_of
+from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.reference.conclusions import (
     DIFFERS,
     HOLDS,
@@ -73,16 +71,6 @@ def test_what_differs_is_marked_by_the_rules() -> None:
     assert verdicts["RQ3.2", "changed most often"] == DIFFERS
     assert verdicts["RQ3.3", "avgSD_cS"] == UNDECIDED, "nothing collides there"
     assert verdicts["RQ3.3", "avgSD_mD"] in (HOLDS, IN_DIRECTION)
-
-
-def test_what_ships_is_what_the_trust_page_says() -> None:
-    lines = (Path(__file__).parents[2] / "docs/trust.md").read_text()
-    shown = re.findall(r"^\| \w+, [\w\- ]+ \| (\d+) \| (\d+) \| (\d+) \| [\d.]+ \| [\d.]+ \|", lines, re.MULTILINE)
-    ships = [
-        one.collisions.values() for name in ("sun", "rain") for one in shipped_totals_of(load_study(name)).values()
-    ]
-    assert len(shown) == 4
-    assert set(shown) <= {tuple(map(str, counts)) for counts in ships}
 
 
 PUBLISHED_EFFECTS = {

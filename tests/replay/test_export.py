@@ -83,9 +83,6 @@ def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Co
         front = 0.0 if track.is_person else box.center.x + box.boundingbox.length / 2
         assert np.abs(x + front * np.cos(heading) - track.x[samples, row]).max() < 0.01
         assert np.abs(y + front * np.sin(heading) - track.y[samples, row]).max() < 0.01
-        if name == "vut":
-            travelled = comparison.runs.trace.position[samples, row]
-            assert np.abs(np.hypot(x - x[0], y - y[0]) - (travelled - travelled[0])).max() < 0.01
 
 
 def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[Path, Comparison]) -> None:
@@ -189,8 +186,6 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
     walker.get_location.return_value = carla.Location()
     assert script.play(world, scene, None) is None
     assert vehicle.apply_control.call_count == world.tick.call_count == len(scene["pedals"]) + script.SETTLING
-    (physics,), _ = vehicle.apply_physics_control.call_args
-    assert physics.mass == pytest.approx(scene["physics"]["mass"])
     assert walker.set_transform.call_count == len(scene["pedals"])
     assert vehicle.destroy.called
 

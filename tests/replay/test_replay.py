@@ -13,23 +13,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
-from click.testing import CliRunner, Result
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from safevar_sumo.analysis.case import Case, load_cases
-from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene, find_ffmpeg
 from safevar_sumo.replay.comparison import COLOURS, Comparison, compare_setting, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.scene import FlatScene, lay_out_scene
-from safevar_sumo.results import handles_of
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import refused
 
@@ -37,22 +32,6 @@ from tests.in_process import refused
 @pytest.fixture
 def case(slippery: Path) -> Case:
     return load_cases([slippery])[0]
-
-
-def simulated(*arguments: str) -> Result:
-    return CliRunner().invoke(commands, ["simulate", *arguments])
-
-
-@pytest.mark.slow
-def test_the_command_replays_every_solution_of_solutions_csv(slippery: Path) -> None:
-    frame = pd.read_csv(slippery / "solutions.csv")
-    for handle, (_, row) in list(zip(handles_of(frame), frame.iterrows(), strict=True))[::4]:
-        done = simulated(str(slippery), "--solution", str(handle), "--json")
-        output = json.loads(done.stdout)
-        assert done.stderr == ""
-        assert output["solution"] == str(handle)
-        assert output["outcome"] == row["outcome"]
-        assert [output[name] for name in METRICS] == [None if np.isnan(row[name]) else row[name] for name in METRICS]
 
 
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:

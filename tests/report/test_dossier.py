@@ -25,7 +25,7 @@ from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, run
+from tests.in_process import InlinePool, json_of, run
 
 HERE, THERE = np.array([2.0, 4.0, 6.0, 9.0]), np.array([1.0, 4.0, 8.0, 8.0])
 """Errors 1, 0, -2, 1; means 5.25 and 5.25."""
@@ -200,7 +200,7 @@ def test_the_dossier_has_its_sections_and_never_a_verdict(packed: Packed) -> Non
 @pytest.mark.slow
 def test_the_pack_with_all_sections_verifies(packed: Packed, in_tmp: Path) -> None:
     _, folder, _ = packed
-    result = json.loads(run("verify", str(folder / "pack.zip"), "--json").stdout)
+    result = json_of("verify", str(folder / "pack.zip"))
     assert result["same"] == result["claims"]
     names = {claim["claim"] for claim in result["table"]}
     solutions = {f"solution {handle}" for handle in handles_of(pd.read_csv(folder / "results/slippery/solutions.csv"))}

@@ -18,7 +18,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.report.pack import DESCRIPTION, Description, _check_entries, describe, read_pack, write_pack
 from safevar_sumo.shipped import NETWORKS
 from tests.analysis.test_repair import planted as planted
-from tests.in_process import refused, run
+from tests.in_process import json_of, refused, run
 
 MINE = """
 from pathlib import Path
@@ -143,14 +143,6 @@ def test_a_changed_digit_differs_and_is_named(
 
 
 @pytest.mark.slow
-def test_digits_beyond_the_last_bit_are_damage(bare: Path, tmp_path: Path) -> None:
-    path = changed(
-        bare, tmp_path / "it.zip", "manifest.json", lambda text: text.replace(".5,", ".5000000000000000001,", 1)
-    )
-    refused("verify", path, message=("1-slippery is damaged", "manifest.json was edited"))
-
-
-@pytest.mark.slow
 def test_what_no_claim_covers_is_damage(bare: Path, tmp_path: Path) -> None:
     description, files = read_pack(bare)
     for name in ("1-slippery/answers/risk.json", "2-other/manifest.json"):
@@ -159,9 +151,8 @@ def test_what_no_claim_covers_is_damage(bare: Path, tmp_path: Path) -> None:
     write_pack(tmp_path / "it.zip", msgspec.structs.replace(description, studies=[]), {})
     refused("verify", str(tmp_path / "it.zip"), message=("holds no study",))
     for name in ("solutions.csv", "manifest.json", "checks.json"):
-        for text in (b"[" * 100_000, b"", b"a,b\n1,2\n", b"\xff\xfe"):
-            write_pack(tmp_path / "it.zip", description, {**files, f"1-slippery/{name}": text})
-            refused("verify", str(tmp_path / "it.zip"), message=("1-slippery is damaged",))
+        write_pack(tmp_path / "it.zip", description, {**files, f"1-slippery/{name}": b"[" * 100_000})
+        refused("verify", str(tmp_path / "it.zip"), message=("1-slippery is damaged",))
 
 
 @pytest.fixture
@@ -236,7 +227,7 @@ def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(mine: 
     shutil.rmtree(mine.parent)
     code = ("mine.py", "limits.txt", "roads/scenario.sumocfg")  # SUMO's options may name outputs
     refused("verify", "it.zip", message=("would run code", *code, "--run-code"))
-    result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
+    result = json_of("verify", "it.zip", "--run-code")
     assert result["same"] == result["claims"] > 4
     path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
     refused("verify", path, "--run-code", message=("code/limits.txt is not the file of the study's identity",))
@@ -251,7 +242,7 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     Path("planted.toml").write_text(re.sub(r"(always|colour) = \{ .*\n", "", study))  # which it keeps already
     run("study", "planted.toml", "--out", "results", "--quiet", "--jobs", "1")
     run("evidence", "results", "--out", "it.zip", "--repair")
-    result = json.loads(run("verify", "it.zip", "--run-code", "--json").stdout)
+    result = json_of("verify", "it.zip", "--run-code")
     assert result["same"] == result["claims"]
     assert "answer repair" in {claim["claim"] for claim in result["table"]}
 
@@ -280,12 +271,12 @@ def test_a_study_that_names_code_outside_the_pack_is_user_code_too(bare: Path, t
 @pytest.mark.slow
 def test_a_sample_of_the_claims(bare: Path) -> None:
     assert "5 claims: 5 same, 0 differ, 0 cannot be made here." in run("verify", str(bare), "--sample", "5").stdout
-    assert json.loads(run("verify", str(bare), "--sample", "3", "--json").stdout)["claims"] == 3
+    assert json_of("verify", str(bare), "--sample", "3")["claims"] == 3
 
 
 @pytest.mark.slow
 def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
-    result = json.loads(run("verify", str(bare), "--search", "--sample", "3", "--json").stdout)
+    result = json_of("verify", str(bare), "--search", "--sample", "3")
     assert result["table"][-1]["claim"] == "search"
     assert result["same"] == result["claims"] == 4
     path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"evaluations":(\d+)'))

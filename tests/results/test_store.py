@@ -29,6 +29,7 @@ from safevar_sumo.results import (
 )
 from safevar_sumo.results.manifest import differences, identity_digest
 from safevar_sumo.study import Study, load_study
+from tests.campaign.formulas import with_search
 from tests.in_process import refused, run
 from tests.made_up import made_up_evaluations
 
@@ -63,10 +64,6 @@ def wide(study: Study) -> Evaluations:
 @pytest.fixture
 def study() -> Study:
     return load_study("smoke")
-
-
-def with_search(study: Study, **changes: int) -> Study:
-    return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
 
 
 def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
@@ -122,7 +119,7 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
     for other in (
         msgspec.structs.replace(study, title="Another title", published={}, calibration={}),
         with_search(study, time_limit=7, runs=3, evaluations=900),
-        msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["rs"])),
+        with_search(study, algorithms=["rs"]),
     ):
         directory = ResultsDirectory(tmp_path, other)
         assert identity_digest(directory.manifest) == identity_digest(ResultsDirectory(tmp_path, study).manifest)

@@ -23,7 +23,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from tests.made_up import made_up_runs
+from tests.made_up import made_up_runs, original_of
 from tests.scenarios.holding import at_contact, driven
 
 
@@ -113,7 +113,7 @@ def test_a_skewed_crossing_is_refused(tmp_path: Path) -> None:
         load_study("rain", scenario={"model": "crossing", "parameters": {"network": network}}, title="", published={})
     )
     with pytest.raises(InputError, match=r"lane 'footpath_0' leads [\d.]+ m along the road"):
-        simulate(system, system.characteristics.original[np.newaxis])
+        simulate(system, original_of(system))
 
 
 STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5

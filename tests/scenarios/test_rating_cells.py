@@ -15,6 +15,7 @@ from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
+from tests.made_up import original_of
 from tests.scenarios.holding import CARLA, Hold, at_contact, driven
 from tests.sumo.test_recording import assert_same
 
@@ -128,9 +129,7 @@ def edge_cells() -> Iterator[Cell]:
 def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
-    for cell, there in zip(
-        cells, simulate_all_points(system, system.characteristics.original[np.newaxis]), strict=True
-    ):
+    for cell, there in zip(cells, simulate_all_points(system, original_of(system)), strict=True):
         run, scenario = there.runs, cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
         assert set(run.contact.side) == {"front"}, scenario
@@ -170,7 +169,7 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
     n, arrival = 30, scenario.duration - scenario.time_after
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
-    settings = np.repeat(system.characteristics.original[np.newaxis], n, axis=0)
+    settings = np.repeat(original_of(system), n, axis=0)
     assert set(assert_same(system, settings)) > {Outcome.COLLISION}
 
 

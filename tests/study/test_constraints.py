@@ -4,7 +4,6 @@ refused.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import region_of
-from tests.in_process import run
+from tests.in_process import json_of, run
 from tests.search.problems import SUN
 
 ROUND = """
@@ -85,11 +84,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert len(frame) > 200
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
     below = ("--unsafe", "below=2.5", "--fits", "0")
-    explained = json.loads(run("explain", "out", *below, "--top", "2", "--limit", "500", "--json").stdout)
-    tolerance = json.loads(
-        run(
-            "tolerance", "bound.toml", *below, "--pairs", "--json", "--characteristics", "tireFric,mass,maxBrakeTorque"
-        ).stdout
+    explained = json_of("explain", "out", *below, "--top", "2", "--limit", "500")
+    tolerance = json_of(
+        "tolerance", "bound.toml", *below, "--pairs", "--characteristics", "tireFric,mass,maxBrakeTorque"
     )
     boundaries = [cause["boundary"] for one in explained[:-1] for cause in one["minimal_causes"]]
     nearest = [pair["nearest"] for pair in tolerance["pairs"] if pair["nearest"]]

@@ -133,6 +133,8 @@ OTHERS = [
     ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
     ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
     ("[fit.weights]\ntett = 1", "fit.weights.tett is no metric; did you mean 'tet'?"),
+    ('weather = "fogg"', "did you mean 'fog'?"),
+    ('[ads]\nmodel = "world_on_rail"', "did you mean 'world_on_rails'?"),
     ("[ads.parameters]\nnothing = 3", "mine.toml: ads.parameters.nothing: there is no such key"),
     ("[ads.parameters]\nthrottle = [true, 0.2, 0.3]", "ads.parameters.throttle[0] = True is not of type 'number'"),
     ('[scenario.parameters]\nnetwork = "nope"', "mine.toml: scenario.parameters.network: there is no network 'nope'"),

@@ -19,6 +19,7 @@ from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import Body, find_touches
+from tests.made_up import original_of
 from tests.scenarios.holding import Pedals
 
 BASE = load_study("euro_ncap_pedestrian")
@@ -79,7 +80,7 @@ def run(
     scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN
 ) -> SimulationRuns:
     system = replace(system, scenario=scenario, ads=ads or HOLDS_HALF)
-    return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
+    return simulate(system, original_of(system) if settings is None else settings)
 
 
 def with_max_rpm(*values: float) -> FloatArray:
@@ -132,7 +133,7 @@ def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_unless_it_col
     tests = [MatrixTest(name="CCRs", parameters={"test": "CCRs", "grade": 20.0}, over={"speed": [10, 50]})]
     steep = assemble(msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests)))
     steep = replace(steep, vehicle=WEAK.vehicle)
-    original = SUN.characteristics.original[np.newaxis]
+    original = original_of(SUN)
     assert [str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)] == [
         "stopped",
         "invalid-test",

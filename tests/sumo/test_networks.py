@@ -46,9 +46,6 @@ def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
         InputError, match="netconvert refuses the network: Edge's 'road' to-node 'nowhere' is not known"
     ):
         copied_network(open_network(str(mine)), 1)
-    (mine / "network.edg.xml").write_text("<edges>")
-    with pytest.raises(InputError, match="tags were ended"):
-        copied_network(open_network(str(mine)), 1)
 
 
 CAR = '<vType id="car" speedDev="0" sigma="0"/><vType id="walker" vClass="pedestrian" speedDev="0"/>'
@@ -225,12 +222,6 @@ def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> N
     before = open_network(str(mine / "town.net.xml")).digests
     rewritten(mine / "town.net.xml", "<location", "<!-- --><location")
     assert open_network(str(mine / "town.net.xml")).digests != before
-
-
-def test_a_network_lies_beside_its_study(mine: Path) -> None:
-    study = mine.parent / "it.toml"
-    study.write_text('extends = "smoke"\nname = "it"\n[scenario.parameters]\nnetwork = "mine"\n')
-    assert assemble(load_study(str(study))).scenario.network == str(mine)
 
 
 def load_original(study: str) -> np.ndarray:

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import platformdirs
 import pytest
@@ -27,7 +26,7 @@ from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.recorded_world import distance_covered
 from safevar_sumo.sumo.recording import record_scenes
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import run
+from tests.in_process import json_of, run
 from tests.scenarios.holding import Pedals
 
 CLAIM = """
@@ -96,15 +95,10 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 
 def test_contacts_are_those_that_sumo_finds() -> None:
     """Vehicles that brake at various gaps: they hit with the front, a corner or the side, or miss."""
-    study, rng, outcomes = load_study("sun"), np.random.default_rng(6), []
-    for gap in rng.uniform(3.0, 9.0, 6):
-        ads = {
-            **study.ads.parameters,
-            "brake_gap": float(gap),
-            "brake_gap_before": 1.0,
-            "first_command": float(rng.uniform(0, 1.5)),
-        }
-        system = assemble(msgspec.structs.replace(study, ads=msgspec.structs.replace(study.ads, parameters=ads)))
+    rng, outcomes = np.random.default_rng(6), []
+    for gap in rng.uniform(3.0, 9.0, 6).tolist():
+        ads = {"brake_gap": gap, "brake_gap_before": 1.0, "first_command": rng.uniform(0, 1.5)}
+        system = assemble(load_study("sun", ads={"parameters": ads}))
         outcomes += assert_same(system, drawn(system, 40, 6))
     assert 40 < outcomes.count(Outcome.COLLISION) < 220
 
@@ -249,7 +243,7 @@ def still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def begins_with_the_reason(*command: str) -> None:
     assert run(*command).stdout.splitlines()[0] == STANDS
-    answer = json.loads(run(*command, "--json").stdout)
+    answer = json_of(*command)
     assert (answer["driven"] if isinstance(answer, dict) else answer[-1]["summary"]["driven"]) is False
 
 
@@ -260,21 +254,9 @@ def test_an_answer_begins_with_the_reason(still: str) -> None:
 
 @pytest.mark.slow
 def test_every_command_begins_with_the_reason(still: str) -> None:
-    for command in (
-        ("tolerance", still, "--characteristics", "mass"),
-        ("risk", still, "--samples", "100"),
-        ("explain", still),
-        ("simulate", still, "--set", "mass=2400..2600"),
-    ):
+    for command in (("explain", still), ("simulate", still, "--set", "mass=2400..2600")):
         begins_with_the_reason(*command)
-    assert (
-        run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.splitlines()[0] == STANDS
-    )
-    begins_with_the_reason("opinion", "results")
-    run("check", still, expect=1)
+    assert run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.startswith(STANDS)
     run("report", "results", "--only", "tested,verdict", "--out", "page.html")
     page = Path("page.html").read_text()
     assert 0 < page.index(STANDS) < page.index("<main")
-    assert "driven" not in json.loads(
-        run("tolerance", "smoke", "--characteristics", "mass", "--fits", "0", "--json").stdout
-    )
