@@ -109,7 +109,7 @@ def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, di
     )
     return {
         f"edge/lane[@id='{lane}']": {
-            "shape": " ".join(",".join(map(repr, frame.point(*end))) for end in ends),
+            "shape": " ".join(",".join(map(repr, frame.point(*point))) for point in ends),
             "length": repr(math.dist(*ends)),
         }
         for lane, ends in ((ENTRY_LANE, (begin, entry)), (JUNCTION_LANE, (entry, exit_)), (EXIT_LANE, (exit_, end)))
