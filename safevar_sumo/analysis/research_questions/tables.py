@@ -184,7 +184,7 @@ def lay_out(answer: TableAnswer) -> list[Table]:
     notes = []
     if "method" in frame:
         for method in frame["method"].dropna().unique():
-            p_value = "p with e" if method == EXACT_TEST and "p_holm" not in frame else "p"
+            p_value = "p with e" if method == EXACT_TEST else "p"
             notes.append(f"{p_value}: {method}.")
     notes += NOTES.get(answer.name, ())
     if "metric" in frame:
@@ -244,6 +244,7 @@ def _mark_tests(cells: pd.DataFrame, answer: TableAnswer) -> pd.DataFrame:
         has_few_runs = np.array([pair in few_runs for pair in zip(frame["setting"], frame[algorithm], strict=True)])
         p_column, is_significant = "p_value", (frame["p_value"] < ALPHA) & ~has_few_runs
         is_bold_effect = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
+    if "method" in frame:
         cells["p_value"] += np.where(frame["method"] == EXACT_TEST, "e", "")
     for column, is_bold in ((p_column, is_significant), ("effect_size", is_bold_effect)):
         if column in cells:
