@@ -13,8 +13,10 @@ import pytest
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo import batch
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.world import Contacts
 from tests.made_up import original_of
 from tests.scenarios.holding import CARLA, Hold, at_contact, driven
 from tests.sumo.test_recording import assert_same
@@ -166,11 +168,22 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
     """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and the corners, and
     passed targets.
     """
+    assert set(hit_at_any_time(scenario)) > {Outcome.COLLISION}
+
+
+def hit_at_any_time(scenario: Any) -> list[str]:
+    """The outcomes of such vehicles, which are the same in SUMO."""
     n, arrival = 30, scenario.duration - scenario.time_after
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
-    settings = np.repeat(original_of(system), n, axis=0)
-    assert set(assert_same(system, settings)) > {Outcome.COLLISION}
+    return assert_same(system, np.repeat(original_of(system), n, axis=0))
+
+
+def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In SUMO, persons move first. In a test, contacts of the side would not count."""
+    monkeypatch.setattr(batch, "Contacts", lambda n, _: Contacts(n, np.zeros(n, dtype=bool)))
+    scenario = Crossing(test="CPFA", speed=30, impact_location=-30)
+    assert hit_at_any_time(scenario).count(Outcome.COLLISION) > 5
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
