@@ -6,7 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from safevar_sumo.analysis.case import Case, build_case
 from safevar_sumo.records import Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
+from safevar_sumo.results import record, solutions_frame
+from safevar_sumo.study import Study
+
+
+def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case:
+    """A case of one run of NSGA-II with these solutions, without evaluations."""
+    frame = solutions_frame(tuple(study.vehicle.characteristics), [(("nsga2", 0), solutions)])
+    return build_case(study, record(original, 0), frame, frame.iloc[:0], [("nsga2", 0)])
 
 
 def made_up_runs(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.study.file import drop_nulls
 from safevar_sumo.sumo.system import assemble
@@ -27,13 +27,13 @@ ANYTHING = st.recursive(
 )
 
 
-def paths(tables: dict[str, Any], before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+def paths(tables: JsonObject, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
     """Every key of nested tables."""
     inner = [path for key, value in tables.items() if isinstance(value, dict) for path in paths(value, (*before, key))]
     return [*((*before, key) for key in tables), *inner]
 
 
-def replaced(tables: dict[str, Any], path: tuple[str, ...], value: object) -> dict[str, Any]:
+def replaced(tables: JsonObject, path: tuple[str, ...], value: object) -> JsonObject:
     key, *rest = path
     return {**tables, key: value if not rest else replaced(tables[key], tuple(rest), value)}
 

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from safevar_sumo.ads import ADS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.plugins import Guard
-from safevar_sumo.records import Command, Nominal, Observation, SimulationRuns
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.study import ModelTable, load_study, study_names
 from safevar_sumo.sumo.system import assemble
@@ -37,11 +37,11 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def observation(time: float, speed: np.ndarray, gap: np.ndarray, lateral: np.ndarray) -> Observation:
+def observation(time: float, speed: FloatArray, gap: FloatArray, lateral: FloatArray) -> Observation:
     return Observation(time, speed, gap, speed, lateral, np.full_like(speed, 1.8), 1.0)
 
 
-def approach(ads: Ads, nominal: Nominal, speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
+def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> FloatArray:
     """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals are."""
     memory, pedals = ads.start(len(speed), nominal, STEP), []
     for step in range(80):
@@ -54,7 +54,7 @@ def approach(ads: Ads, nominal: Nominal, speed: np.ndarray, gap: np.ndarray) -> 
 @pytest.mark.slow
 @settings(max_examples=8)
 @given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
-def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray, gap: np.ndarray) -> None:
+def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: FloatArray, gap: FloatArray) -> None:
     for system in SYSTEMS.values():
         nominal = system.nominal
         together = approach(system.ads, nominal, speed, gap)

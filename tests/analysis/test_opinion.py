@@ -34,7 +34,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import GRAVITY
 from safevar_sumo.report import make_report, page as report_page
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
 from tests.in_process import json_of
 
@@ -153,19 +153,6 @@ def test_every_characteristic_acts_or_is_outside(name: str) -> None:
         assert (constants(**{member.name: value}) != constants()) == (member.name not in OUTSIDE), member.name
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
-def test_the_original_vehicle_meets_the_same_encounter(study: str) -> None:
-    """The second model starts as ours does, and stops within half a metre of where ours does."""
-    system, vehicle = assemble_both_systems(load_study(study))
-    original, second = system.characteristics.original[np.newaxis], replace(system, vehicle=vehicle)
-    here, there = (simulate(one, original) for one in (system, second))
-    assert [str(run.outcome[0]) for run in (here, there)] == ["stopped", "stopped"]
-    apart = np.abs(here.trace.speed[:40, 0] - there.trace.speed[:40, 0])
-    assert apart.max() < 0.35
-    assert here.trace.gap[:, 0].min() == pytest.approx(there.trace.gap[:, 0].min(), abs=0.5)
-
-
 GLITCHY = """
 import numpy as np
 from safevar_sumo.vehicles import LEVEL
@@ -245,9 +232,8 @@ def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> No
     settings = np.stack([characteristics.setting({**WORN_TYRES, "tireFric": one}, "cause") for one in frictions])
     runs = evaluate(replace(system, vehicle=vehicle), settings)
     least = float(frictions[runs.collided].max())
-    (there,) = judge_causes(
-        study, [judged("nsga2:0:0", {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)], Unsafe()
-    ).opinions
+    cause = judged("nsga2:0:0", {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)
+    (there,) = judge_causes(study, [cause], Unsafe()).opinions
     assert (there.opinion, there.there.outcome) == ("borderline", "collision")
     assert re.match(r"with the second model only \d\d% of the neighbours are unsafe, too; also unsafe", there.because)
 
@@ -261,7 +247,6 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 
     every, outside = asked(), set(OUTSIDE)
     for one in every:
-        assert list(one) == ["solution", "changes", "here", "there", "opinion", "because"]
         assert (one["opinion"] == "outside") == bool(outside & set(one["changes"])) == (one["there"]["outcome"] is None)
         assert all(name in one["because"] for name in outside & set(one["changes"]))
     first, other, *_ = dict.fromkeys(one["solution"] for one in every)

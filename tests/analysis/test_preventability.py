@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import scipy
 
-from safevar_sumo.analysis.case import build_case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import (
     MIN_PART,
@@ -36,13 +35,12 @@ from safevar_sumo.analysis.preventability import (
 )
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from tests.analysis.known_regions import box, made_up_evaluator
 from tests.in_process import InlinePool
-from tests.made_up import made_up_runs, original_of
+from tests.made_up import case_of, made_up_runs, original_of
 
 COLLISION = Unsafe()
 
@@ -190,7 +188,7 @@ def system() -> System:
 
 
 @pytest.fixture(scope="module")
-def weak(system: System) -> np.ndarray:
+def weak(system: System) -> FloatArray:
     """Half the brakes."""
     setting = system.characteristics.original.copy()
     setting[system.characteristics.names.index("maxBrakeTorque")] /= 2
@@ -198,13 +196,13 @@ def weak(system: System) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def failure(system: System, weak: np.ndarray) -> PointComparison:
+def failure(system: System, weak: FloatArray) -> PointComparison:
     (one,) = compare_at_points(system, original_of(system), weak, Unsafe())
     return one
 
 
 def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
-    system: System, weak: np.ndarray, failure: PointComparison
+    system: System, weak: FloatArray, failure: PointComparison
 ) -> None:
     at = next(point for point in system.points if point.name == failure[0].point)
     original = evaluate(system.at(at), original_of(system)).f_safe[0]
@@ -218,15 +216,14 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
 
 @pytest.mark.slow
 def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
-    system: System, weak: np.ndarray, failure: PointComparison
+    system: System, weak: FloatArray, failure: PointComparison
 ) -> None:
     """The original vehicle has one safety degree, that at its worst point; that at another point stands with the
     point's name.
     """
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
-    solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, original_of(system))
-    case = build_case(study, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
+    case = case_of(study, original, evaluate(system, weak))
     first, count, there, *_, more = summarise_failures(case, original, Evaluator(case.study, InlinePool()), "out")
     assert first == (
         "At the worst of 5 test points, the original vehicle passes with a safety degree of "
@@ -242,9 +239,10 @@ def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
 
 
 STEP, OBSTACLE = 0.002, 20.0
+Vehicle = tuple[float, float, float, float]
 
 
-def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
+def drive_of(*vehicles: Vehicle) -> SimulationRuns:
     """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an obstacle at 20 m."""
     time = np.arange(0, 8, STEP)
     drives = []
@@ -263,7 +261,7 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
     return made_up_runs(STEP, speed, gap, collision_speed, **columns)
 
 
-def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
+def compared(one: Vehicle, other: Vehicle) -> BrakingComparison:
     return compare_braking(drive_of(one, other), 1, np.ones(2))
 
 
@@ -281,7 +279,7 @@ SAME = (10.0, 15.0, 0.2, 6.0)
         ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12),  # which gains
     ],
 )
-def test_one_difference_is_one_part(other: tuple[float, float, float, float], part: str, lost: float) -> None:
+def test_one_difference_is_one_part(other: Vehicle, part: str, lost: float) -> None:
     comparison = compared(SAME, other)
     assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
     assert all(abs(value) < 0.05 for name, value in comparison.parts.items() if name != part)

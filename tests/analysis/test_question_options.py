@@ -133,4 +133,3 @@ def test_rules_have_a_picture() -> None:
     undefined = Rule({}, None, None, None, None)
     axis = replace(result, rules=[*result.rules, undefined]).figure().axes[0]
     assert [label.get_text() for label in axis.get_yticklabels()] == ["a above 7 N m\nb below 3 N m", "everywhere"]
-    assert replace(result, rules=[]).figure().axes

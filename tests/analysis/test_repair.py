@@ -21,7 +21,6 @@ from safevar_sumo.analysis.repair.answer import write_repair
 from safevar_sumo.analysis.repair.problem import Parameter, RepairProblem
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
-from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, TwoWorkers, run
@@ -249,7 +248,6 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_sea
     # A study that results alone hold has no file to extend.
     for study in (kept.study, replace_in(kept.study, name="lost")):
         write_repair(tmp_path / "it.toml", replace(kept, study=study, repairs=(changed,)))
-        assert (tmp_path / "it.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# The driving system of today")
         assert sv.load_study(tmp_path / "it.toml").ads.parameters[name] == kept.parameters[0].today
 
 

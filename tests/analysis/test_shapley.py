@@ -110,8 +110,3 @@ def test_one_characteristic_or_none_that_varies(varying: int) -> None:
     result = risk(study, samples=50, unsafe="below=5", pool=Plant(study, nowhere, lambda settings: settings[:, 0]))
     shares = result.to_frame()["share"][:2]
     assert shares.to_list() == pytest.approx([1.0, 0.0]) if varying else shares.isna().all()
-
-
-def test_independent_characteristics_have_sobol_indices_and_no_key_of_their_own() -> None:
-    result = linear([1.0, 1.0], [0.5, 1.0], {})
-    assert "shapley" not in result.to_dict()

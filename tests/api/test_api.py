@@ -13,7 +13,6 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.analysis.subject import study_or_case
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
@@ -45,7 +44,6 @@ def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) 
     )
     same = sv.load_study("mine.toml")
     assert (changed.weather, changed.search, changed.ads) == (same.weather, same.search, same.ads)
-    assert changed.search.evaluations == sv.load_study("rain").search.evaluations
     assert sv.load_study(changed, search={"seed": 7}).search.runs == 2
 
 
@@ -88,12 +86,10 @@ def test_evaluate_is_simulate_row_by_row() -> None:
 
 def test_a_value_that_is_missing_is_the_originals() -> None:
     """Mappings name only what is changed; an empty mapping is the original vehicle."""
-    stages: list[tuple[str, int, int]] = []
     asked: list[dict[str, float | None]] = [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}]
-    frame = sv.evaluate("sun", asked, jobs=1, progress=lambda *stage: stages.append(stage))
+    frame = sv.evaluate("sun", asked, jobs=1)
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
-    assert stages[-1] == ("settings", 3, 3)
 
 
 def test_compare_needs_a_study_and_changes_alone() -> None:
@@ -151,12 +147,9 @@ def test_parquet_holds_solutions_and_evaluations(results: sv.Results, tmp_path: 
 
 def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     again = sv.load(results.directory)
-    assert f"<p>&lt;Results of {results.study.name}" in again._repr_html_()
     pd.testing.assert_frame_equal(again.solutions, results.solutions)
     assert tables_of(again.study) == tables_of(load_study("smoke"))
-    assert again.original["outcome"] == "stopped"
     assert len(again.evaluations) > 300
-    assert set(again.finished) == {("nsga2", 0), ("nsga2", 1), ("rs", 0), ("rs", 1)}
     stored = pd.read_csv(results.directory / "solutions.csv")
     pd.testing.assert_frame_equal(again.solutions, stored, check_dtype=False)
 
@@ -181,12 +174,3 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     assert worst != points[-1].point.name  # the last one that is driven
     alone = sv.simulate(study_at(study, worst, "the test")).trace
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
-
-
-def test_results_with_the_name_of_a_study_are_not_passed_over_in_silence(
-    results: sv.Results, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(results.directory.parent)
-    Path("native").symlink_to(results.directory)
-    with pytest.warns(UserWarning, match=r"native is the study; the results .* are \./native"):
-        assert study_or_case("native") == sv.load_study("native")

@@ -12,7 +12,7 @@ from safevar_sumo.campaign import Campaign, RunKey, RunProgress, all_runs, run_c
 from safevar_sumo.campaign.pool import Job, PoolLostError, Report, WorkerLostError
 from safevar_sumo.campaign.worker import carry_out_job
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -22,7 +22,7 @@ from tests.made_up import made_up_evaluations
 SUN = CharacteristicSet.of(load_study("sun"))
 
 
-def evaluated(settings: np.ndarray) -> Evaluations:
+def evaluated(settings: FloatArray) -> Evaluations:
     """Settings are safer the nearer they are to the original, measured by the sum of all relative changes."""
     share = (settings - SUN.original) / (SUN.upper - SUN.lower)
     safety = 3.0 - 4.0 * np.add.accumulate(np.abs(share), axis=1)[:, -1]
@@ -49,7 +49,7 @@ class FormulaPool(InlinePool):
         self.sizes: list[int] = []
         self._threads = ThreadPoolExecutor(workers) if workers > 1 else None
 
-    def evaluate(self, packed_task: bytes, settings: np.ndarray) -> Evaluations:
+    def evaluate(self, packed_task: bytes, settings: FloatArray) -> Evaluations:
         if self._limit is not None:
             if not self._limit:
                 raise PoolLostError("broken down")

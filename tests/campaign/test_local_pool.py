@@ -27,7 +27,7 @@ from safevar_sumo.campaign.pool import (
 )
 from safevar_sumo.campaign.worker import reproduction_command
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.system import assemble
@@ -49,11 +49,11 @@ def pool() -> Iterator[LocalPool]:
         yield pool
 
 
-def evaluate(pool: LocalPool, settings: np.ndarray = ORIGINAL, packed_task: bytes = SMOKE) -> Evaluations:
+def evaluate(pool: LocalPool, settings: FloatArray = ORIGINAL, packed_task: bytes = SMOKE) -> Evaluations:
     return evaluate_batches([Batch(packed_task, settings)], pool)[0]
 
 
-def carry(pool: LocalPool, settings: np.ndarray) -> Future[None]:
+def carry(pool: LocalPool, settings: FloatArray) -> Future[None]:
     return pool.carry(Batch(SMOKE, settings), lambda message: None)
 
 
@@ -120,7 +120,7 @@ WITH_USER_CODE = msgspec.structs.replace(
 )
 
 
-def settings(number: int) -> np.ndarray:
+def settings(number: int) -> FloatArray:
     """Settings whose first value tells which it is."""
     rows = np.repeat(SUN.original[np.newaxis], number, axis=0)
     rows[:, 0] = 4300 + np.arange(number)
@@ -130,13 +130,13 @@ def settings(number: int) -> np.ndarray:
 class Told(FormulaPool):
     """Fails with what `fault` answers to (settings, how often they were tried before); a worker dies of some faults."""
 
-    def __init__(self, fault: Callable[[np.ndarray, int], Exception | None]) -> None:
+    def __init__(self, fault: Callable[[FloatArray, int], Exception | None]) -> None:
         super().__init__()
         self.fault = fault
         self.tried: list[int] = []
         self._times = Counter[bytes]()
 
-    def evaluate(self, packed_task: bytes, settings: np.ndarray) -> Evaluations:
+    def evaluate(self, packed_task: bytes, settings: FloatArray) -> Evaluations:
         self.tried.append(len(settings))
         error = self.fault(settings, self._times[settings.tobytes()])
         self._times[settings.tobytes()] += 1
@@ -145,7 +145,7 @@ class Told(FormulaPool):
         return evaluated(settings)
 
 
-def tried(pool: Told, settings: np.ndarray, study: Study = STUDY) -> Evaluations:
+def tried(pool: Told, settings: FloatArray, study: Study = STUDY) -> Evaluations:
     return evaluate_batches([Batch(Task(study=study).packed, settings)], pool)[0]
 
 
@@ -153,7 +153,7 @@ def died() -> WorkerLostError:
     return WorkerLostError("the worker process died (exit code -9)")
 
 
-def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
+def deadly(*values: float) -> Callable[[FloatArray, int], Exception | None]:
     return lambda rows, before: died() if np.isin(rows[:, 0], values).any() else None
 
 
@@ -175,7 +175,7 @@ def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault
 
 
 def test_twenty_failures_in_a_row_end_a_study_and_one_success_between_them_does_not() -> None:
-    def fault(rows: np.ndarray, before: int) -> Exception | None:
+    def fault(rows: FloatArray, before: int) -> Exception | None:
         return SimulationError("no place") if np.isin(rows[:, 0], 4301 + np.arange(20)).any() else None
 
     assert tried(Told(fault), settings(20)).failed.tolist() == [False] + [True] * 19
@@ -184,7 +184,7 @@ def test_twenty_failures_in_a_row_end_a_study_and_one_success_between_them_does_
 
 
 def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
-    def fault(rows: np.ndarray, before: int) -> Exception | None:
+    def fault(rows: FloatArray, before: int) -> Exception | None:
         return (
             UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError")
             if 4313 in rows[:, 0]

@@ -22,11 +22,12 @@ algorithms = ["nsga2", "rs", "safe_fuzzer"]
 evaluations = 150
 """
 TIMEOUT = 60.0  # s
-running: list[subprocess.Popen[str]] = []
+Process = subprocess.Popen[str]
+running: list[Process] = []
 """Processes that a test has started."""
 
 
-def started(*arguments: str, **options: object) -> subprocess.Popen[str]:
+def started(*arguments: str, **options: object) -> Process:
     """Start a command in its own process group, as a shell does."""
     running.append(
         subprocess.Popen(
@@ -41,7 +42,7 @@ def started(*arguments: str, **options: object) -> subprocess.Popen[str]:
     return running[-1]
 
 
-def until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
+def until(condition: Callable[[], bool], process: Process | None = None) -> None:
     """Wait for a condition, or for the end of the process that should fulfil it."""
     deadline = time.monotonic() + TIMEOUT
     while not condition() and (process is None or process.poll() is None):
@@ -54,7 +55,7 @@ def written(out: Path) -> int:
     return sum(path.stat().st_size for path in out.glob("runs/*-*.jsonl"))
 
 
-def workers_of(process: subprocess.Popen[str]) -> list[psutil.Process]:
+def workers_of(process: Process) -> list[psutil.Process]:
     """The worker processes of a command."""
     try:
         return [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
@@ -62,7 +63,7 @@ def workers_of(process: subprocess.Popen[str]) -> list[psutil.Process]:
         return []
 
 
-def left_of_group(process: subprocess.Popen[str]) -> list[str]:
+def left_of_group(process: Process) -> list[str]:
     """Command lines of the processes in a command's process group that still run."""
     command_lines: list[str] = []
     for member in psutil.process_iter() if os.name == "posix" else ():
@@ -74,7 +75,7 @@ def left_of_group(process: subprocess.Popen[str]) -> list[str]:
     return command_lines
 
 
-def ended(process: subprocess.Popen[str], expect: int) -> str:
+def ended(process: Process, expect: int) -> str:
     """Wait for a command's end; returns its text on stderr."""
     output, errors = process.communicate(timeout=TIMEOUT)
     assert process.returncode == expect, f"{process.returncode}\n{output}\n{errors}"
@@ -83,10 +84,11 @@ def ended(process: subprocess.Popen[str], expect: int) -> str:
     return errors
 
 
-def killed(process: subprocess.Popen[str]) -> None:
+def killed(process: Process) -> None:
     """Kill a process with SIGKILL."""
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=TIMEOUT)
+    until(lambda: not left_of_group(process))
 
 
 def study(*arguments: str, expect: int = 0) -> str:

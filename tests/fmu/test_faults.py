@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,11 +17,12 @@ from safevar_sumo.sumo.system import System
 from tests.fmu.exported import changed
 
 Make = Callable[..., System]
+Edit = Callable[[Path], object]
 OUT = """outputs = { brake = "pedal" }"""
 IN = """inputs = { gap = "gap" }"""
 
 
-def edited(old: str, new: str) -> Callable[[Path], object]:
+def edited(old: str, new: str) -> Edit:
     """Replaces text in a model description."""
 
     def edit(fmu: Path) -> None:
@@ -34,7 +34,7 @@ def edited(old: str, new: str) -> Callable[[Path], object]:
     return edit
 
 
-def with_step(step: str) -> Callable[[Path], object]:
+def with_step(step: str) -> Edit:
     """Requires a step, as FMI 2.0 does: the default step, if no other step will do."""
     handles_steps = 'canHandleVariableCommunicationStepSize="true"(.*?)<ModelVariables>'
     return edited(f"(?s){handles_steps}", f'\\1<DefaultExperiment stepSize="{step}"/><ModelVariables>')
@@ -92,9 +92,7 @@ def without_binaries(fmu: Path) -> None:
         (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="ell" '), IN + "\n" + OUT, "its unit is 'ell'"),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_one_line(
-    small: Make, edit: Callable[[Path], object], table: str, message: str
-) -> None:
+def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Edit, table: str, message: str) -> None:
     with pytest.raises(InputError) as error:
         small(table=table, edit=edit)
     assert message in error.value.problem
@@ -145,25 +143,3 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
     assert message in error.value.problem
     assert "\n" not in error.value.problem
     np.testing.assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault")
-
-
-def test_an_fmu_with_a_broken_library_is_named_and_leaves_no_folder(
-    small: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-
-    def broken(fmu: Path) -> None:
-        changed(
-            fmu,
-            copy := fmu.with_suffix(".copy"),
-            str,
-            other=lambda name, content: b"" if name.startswith("binaries") else content,
-        )
-        copy.replace(fmu)
-
-    system = small(edit=broken)
-    before = set(tmp_path.iterdir())
-    with pytest.raises(UserCodeError, match=r"^small.toml: ads.model = 'Small.fmu' raised in initialisation: "):
-        driven(system, [100.0])
-    assert set(tmp_path.iterdir()) - before <= {tmp_path / "cache"}

@@ -11,11 +11,11 @@ import json
 import tempfile
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results import CHOICES, RESULTS, load_runs
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
@@ -38,7 +38,7 @@ def small(name: str) -> Study:
     return load_study(name, search=search)
 
 
-def computed(name: str) -> dict[str, Any]:
+def computed(name: str) -> JsonObject:
     """The entry of a study: the original vehicle, and every algorithm's solutions."""
     study = small(name)
     with tempfile.TemporaryDirectory() as folder:
@@ -55,7 +55,7 @@ def computed(name: str) -> dict[str, Any]:
     }
 
 
-def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> dict[str, Any]:
+def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> JsonObject:
     """The numbers of solutions and of collisions, and the most severe solution: its objectives and its changes."""
     most_severe = rows.sort_values(CHOICES["most_severe"], kind="stable").iloc[0]
     values = {name: float(most_severe[name]) for name in CHOICES["most_severe"]}
@@ -68,7 +68,7 @@ def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> dict[str, A
     }
 
 
-def _rounded(values: dict[str, Any]) -> dict[str, Any]:
+def _rounded(values: JsonObject) -> JsonObject:
     """Round numbers to five digits, enough to see how much a value has changed."""
     return {name: float(f"{value:.5g}") if isinstance(value, float) else value for name, value in values.items()}
 

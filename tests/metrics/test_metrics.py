@@ -20,7 +20,7 @@ from safevar_sumo.metrics import (
     Unsafe,
     time_to_collision,
 )
-from safevar_sumo.records import Encounter, Evaluations, SimulationRuns
+from safevar_sumo.records import Encounter, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
@@ -40,7 +40,7 @@ def braking_run(speed: float, deceleration: float, gap: float, collision_speed: 
 RUN = braking_run(10, 5, 12)
 
 
-def meeting(**encounter: np.ndarray) -> SimulationRuns:
+def meeting(**encounter: FloatArray) -> SimulationRuns:
     """The same run with parts of another encounter."""
     return dataclasses.replace(RUN, encounter=RUN.encounter._replace(**encounter))
 
@@ -190,14 +190,14 @@ def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
 SAMPLED = 0.05
 
 
-def comfort(name: str, speed: np.ndarray, until: float = np.inf, collision_speed: float = np.nan) -> np.ndarray:
+def comfort(name: str, speed: FloatArray, until: float = np.inf, collision_speed: float = np.nan) -> FloatArray:
     v = speed.reshape(len(speed), -1)
     active = np.broadcast_to((np.arange(len(v)) * SAMPLED <= until)[:, np.newaxis], v.shape)
     runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=active)
     return OPTIONAL_METRICS[name](runs, THRESHOLDS)
 
 
-def sampled(speed: Callable[[np.ndarray], np.ndarray], seconds: float = 6.0) -> np.ndarray:
+def sampled(speed: Callable[[FloatArray], FloatArray], seconds: float = 6.0) -> FloatArray:
     return speed(np.arange(0, seconds + SAMPLED / 2, SAMPLED))
 
 

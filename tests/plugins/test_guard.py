@@ -66,8 +66,6 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
     ("model", "expected"),
     [
         ("os:system", "not a class"),
-        ("os:path", "is a module, not a class"),
-        ("subprocess:Popen", "has no method start(n, nominal, step)"),
         ("mine:Mine", "has no method drive(seen)"),
         ("mine:NotEnough", "has a method drive that does not take (seen, memory)"),
         ("mine:Scalar", "has a method drive that does not take (seen)"),
@@ -136,16 +134,12 @@ def failing(system: object) -> str:
     [
         ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"),
         ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
-        ("raise GeneratorExit", "raised in drive: GeneratorExit ("),
         ("raise BaseException(1, 2)", "raised in drive: BaseException: (1, 2) ("),
         (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("),
         ("pass", "returned None from drive"),
         ("return 0.5", "returned 0.5 from drive"),
-        ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
-        ("return '0.5', 0", "returned throttle = '0.5' from drive"),
         ("return 0, 2", "returned brake = 2.0 from drive"),
         ("return float('nan'), 0", "returned throttle = nan"),
-        ("return [0.1, 0.2], 0", "returned throttle of shape (2,)"),
     ],
 )
 def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder: Path) -> None:
@@ -220,11 +214,8 @@ def vehicle(method: str, body: str) -> str:
     [
         ("advance", "result = result._replace(speed=-result.speed - 1)", "returned speed = -"),
         ("advance", "result = result._replace(speed=result.speed * np.nan)", "returned speed = nan from advance"),
-        ("advance", "result = result._replace(speed=result.speed + np.inf)", "returned speed = inf from advance"),
-        ("advance", "result = result._replace(speed='fast')", "returned speed = 'fast' from advance"),
         ("advance", "result = result._replace(speed=np.zeros(7))", "returned speed of shape (7,) from advance"),
         ("advance", "result = None", "returned None from advance"),
-        ("at_rest", "result = result._replace(speed=None)", "returned speed = None from at_rest"),
         ("at_rest", "result = result._replace(speed=result.speed + 9)", "returned speed = 9.0 from at_rest"),
         ("sense", "result = result[0]", "from sense"),
         (
@@ -238,7 +229,6 @@ def vehicle(method: str, body: str) -> str:
             "returned speed = inf from sense",
         ),
         ("sumo_type", "result = result._replace(decel=0 * result.decel)", "returned decel = 0.0 from sumo_type"),
-        ("sumo_type", "result = result[0]", "from sumo_type"),
         (
             "sumo_type",
             "result = result._replace(max_speed=0 * result.max_speed + 2)",

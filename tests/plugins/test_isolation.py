@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -94,21 +95,20 @@ class Mine:
 """
 
 
+def search_all(folder: Path, out: Path) -> None:
+    """Carry out all runs of mine.toml."""
+    study = load_study(str(folder / "mine.toml"))
+    carry_out_runs(study, assemble(study), all_runs(study), out, InlinePool(), SilentObserver(), None)
+
+
 @pytest.mark.parametrize(("own", "shared"), [("Mine", True), ("self", False)])
 def test_an_algorithm_whose_runs_learn_from_each_other(
     own: str, shared: bool, mine: Mine, folder: Path, tmp_path: Path
 ) -> None:
-    system = mine(SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
-    study = load_study(str(folder / "mine.toml"))
-
-    def searched() -> object:
-        return carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
-
-    if shared:
-        with pytest.raises(UserCodeError, match=r"'mine:Mine' setting 11 is .* in another run .*mine.py:2"):
-            searched()
-    else:
-        searched()
+    mine(SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
+    learns = pytest.raises(UserCodeError, match=r"'mine:Mine' setting 11 is .* in another run .*mine.py:2")
+    with learns if shared else nullcontext():
+        search_all(folder, tmp_path / "out")
 
 
 GREEDY = """
@@ -141,10 +141,9 @@ class Mine:
 def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(
     module: str, problem: str, mine: Mine, folder: Path, tmp_path: Path
 ) -> None:
-    system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
-    study = load_study(str(folder / "mine.toml"))
+    mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     with pytest.raises(UserCodeError, match=problem):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
+        search_all(folder, tmp_path / "out")
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.case import build_case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures, summarise_failures
@@ -20,10 +19,10 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
-from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import TwoWorkers, json_of, run, searched
+from tests.made_up import case_of
 from tests.sumo.test_recording import still as still
 
 STUDY = load_study("euro_ncap_rating")
@@ -63,7 +62,6 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     assert scan.points is not None
     points = scan.points
     assert points[1.0] == max(points.values()) > points[0.5]
-    assert all(np.isfinite(list(points.values())))
     first = scan.first_loss()
     assert first is not None
     assert points[first] < points[1.0]
@@ -71,8 +69,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     record = result.to_dict()["alone"][0]
     assert record["any_lost"] == first
     assert record["points"][-1] == [1.0, points[1.0]]
-    assert any(str(part).startswith("brakeTorque: points are lost from") for part in result.sentences())
-    assert set(result.sheet.to_frame()["limit with all others at theirs"]) == {"-"}, "no box of a rating is sought"
+    assert "brakeTorque: points are lost from" in str([*result.sentences()])
     assert result.figure().get_axes()
 
 
@@ -82,15 +79,11 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
     original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
-    solutions = solutions_frame(members.names, [(("nsga2", 0), evaluations)])
-    case = build_case(STUDY, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
+    case = case_of(STUDY, original, evaluations)
     points = float(original.column("rating_points")[0])
-    lost = points - float(evaluations.column("rating_points")[1])
-    assert lost > 0
-    result = explain_failures(
-        case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), evaluator
-    )
-    (failure,) = result.explanations
+    assert points > evaluations.column("rating_points")[1]
+    options = ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}")
+    (failure,) = explain_failures(case, options, evaluator).explanations
     assert failure.points
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]

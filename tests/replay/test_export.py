@@ -16,6 +16,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.results import write_imported
 from safevar_sumo.study import load_study
@@ -118,7 +119,7 @@ def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
         assert "<Issue " not in report.read_text()
 
 
-ForCarla = tuple[Any, dict[str, Any], np.ndarray]
+ForCarla = tuple[Any, JsonObject, np.ndarray]
 
 
 @pytest.fixture

@@ -11,13 +11,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from safevar_sumo.analysis.tolerance import scans
+from safevar_sumo.records import JsonObject
 from safevar_sumo.report.dossier import FIRST_SENTENCE, MEASURES, _Dossier, value_at
 from safevar_sumo.report.measurements import check_study, count_constants, measure_validation
 from safevar_sumo.report.pack import read_pack
@@ -132,7 +132,7 @@ def test_tolerances_of_a_study_with_limits_are_stated_too() -> None:
     assert stated[1] == [*stated[0], text]
 
 
-Packed = tuple[dict[str, Any], Path, str]
+Packed = tuple[JsonObject, Path, str]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -166,7 +166,7 @@ def test_every_number_is_made_by_its_command(packed: Packed, monkeypatch: pytest
     dossier, folder, _ = packed
     monkeypatch.chdir(folder)
     assert dossier["first"] == FIRST_SENTENCE
-    outputs: dict[str, Any] = {}
+    outputs: JsonObject = {}
     statements = [statement for section in dossier["sections"] for statement in section["statements"]]
     for statement in statements:
         if statement["numbers"]:

@@ -173,8 +173,6 @@ def test_a_change_without_new_digests_is_damage(small: Path, tmp_path: Path, nam
 def test_packs_of_other_versions_and_missing_files_are_refused(small: Path, tmp_path: Path) -> None:
     path = changed(small, tmp_path / "it.zip", DESCRIPTION, lambda text: text.replace('"libsumo":"', '"libsumo":"0.'))
     refused("verify", path, message=(path, "made with libsumo 0.", "a pack of this version"))
-    path = changed(small, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"format":(\d+)'))
-    refused("verify", path, message=(path, "made with format"))
     with zipfile.ZipFile(small) as archive:
         texts = {entry.filename: archive.read(entry) for entry in archive.infolist()}
     digest = re.sub(rb'("a.csv": ")(.)', rb"\1x", texts[DESCRIPTION].replace(b"1/a", b"a"))

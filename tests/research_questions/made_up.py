@@ -9,6 +9,7 @@ import msgspec
 import pandas as pd
 
 from safevar_sumo.analysis.case import Case, build_case
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import CharacteristicTable, Study, load_study
 
 ORIGINAL = {"safety_degree": 2.0, "tet": 1.0, "tit": 0.5, "ave_dece": 6.0}
@@ -32,7 +33,7 @@ def made_up_study(
     return msgspec.structs.replace(smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes})
 
 
-def only(frame: pd.DataFrame, **wanted: Any) -> dict[str, Any]:
+def only(frame: pd.DataFrame, **wanted: Any) -> JsonObject:
     """The one row with these values."""
     result = frame[(frame[list(wanted)] == pd.Series(wanted)).all(axis=1)]
     assert len(result) == 1
@@ -48,7 +49,7 @@ def row(
     tit: float | None = 0.75,
     ave_dece: float | None = 5.0,
     f_diff: float | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """A solution; a safety degree of 0 or less is a collision, without TET and TIT."""
     crash = sd <= 0
     changes = [abs(value - original) / original for value, original in zip(values, UNCHANGED, strict=True)]

@@ -268,13 +268,6 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     assert "*" in as_text([imported]).replace("(or *)", ""), "the runs of imported solutions are unknown"
 
 
-@pytest.mark.parametrize("question", ["rq1-runs", "rq2-runs"])
-def test_a_large_effect_of_too_few_runs_does_not_stand_out(question: str) -> None:
-    document = as_latex(answer_questions(CASES["one"], question))
-    assert "& large &" in document
-    assert r"\textbf" not in document
-
-
 def test_every_rendering_has_every_effect() -> None:
     answers = answer_questions([three_algorithms()])
     for output in (render(answers) for render in (as_text, as_markdown, as_latex)):

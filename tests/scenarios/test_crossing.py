@@ -23,7 +23,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from tests.made_up import made_up_runs, original_of
+from tests.made_up import made_up_runs
 from tests.scenarios.holding import at_contact, driven
 
 
@@ -78,12 +78,11 @@ TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}
 """Direction of a rotated road that led east before."""
 
 
-def moved(folder: Path, network: str, forth: tuple[float, float], skew: float = 0.0) -> str:
-    """A rotated copy of a network, with its southern end shifted to the right by `skew` [m]."""
+def moved(folder: Path, network: str, forth: tuple[float, float]) -> str:
+    """A rotated copy of a network."""
 
     def place(match: re.Match[str]) -> str:
         x, y = float(match[1]), float(match[2])
-        x += skew if y < -10 else 0
         return f'x="{x * forth[0] - y * forth[1]}" y="{x * forth[1] + y * forth[0]}"'
 
     shutil.copytree(NETWORKS / network, folder / "mine")
@@ -105,15 +104,6 @@ def test_a_turned_road_changes_nothing(study: str, forth: tuple[float, float], t
         assert np.allclose(getattr(here.trace, name), getattr(there.trace, name), atol=0.02), name
     way, same = (run.trace.position[-1] - run.trace.position[0] for run in (here, there))
     assert np.allclose(way, same, atol=0.02), "a position is along the way"
-
-
-def test_a_skewed_crossing_is_refused(tmp_path: Path) -> None:
-    network = moved(tmp_path, "crossing", (1.0, 0.0), skew=4.0)
-    system = assemble(
-        load_study("rain", scenario={"model": "crossing", "parameters": {"network": network}}, title="", published={})
-    )
-    with pytest.raises(InputError, match=r"lane 'footpath_0' leads [\d.]+ m along the road"):
-        simulate(system, original_of(system))
 
 
 STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5

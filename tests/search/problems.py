@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -15,10 +15,10 @@ from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
-Evaluate = Callable[[CharacteristicSet, np.ndarray], Evaluations]
+Evaluate = Callable[[CharacteristicSet, FloatArray], Evaluations]
 
 
-def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: np.ndarray) -> Evaluations:
+def evaluated(characteristics: CharacteristicSet, settings: FloatArray, safety: FloatArray) -> Evaluations:
     """Vehicles that stop, whatever their safety degree."""
     return made_up_evaluations(
         safety,
@@ -30,7 +30,7 @@ def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: 
     )
 
 
-def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+def sphere(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
     """The nearer a setting is to the lower ends of the domains, the safer it is."""
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
@@ -63,7 +63,7 @@ def searched(
     evaluate: Evaluate = sphere,
     algorithm: Algorithm | None = None,
     region: FeasibleRegion | None = None,
-) -> tuple[Evaluations, list[np.ndarray]]:
+) -> tuple[Evaluations, list[FloatArray]]:
     """Run an algorithm to its end; returns its result and all populations that it requested."""
     search = begun(name, seed, evaluations, characteristics, algorithm, region)
     populations = [next(search)]

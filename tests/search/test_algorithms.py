@@ -11,7 +11,7 @@ import pytest
 from deap import tools
 from hypothesis import given, strategies as st
 
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
 from safevar_sumo.search.baselines import _Ranges
 from safevar_sumo.search.evolution import Individual, Operators, Reproduction, fitness_class, run_tournament
@@ -44,7 +44,7 @@ def test_a_run_is_the_same_for_the_same_seed_and_another_for_another(name: str) 
 
 
 def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
-    def failing(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+    def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
         good, fails = sphere(characteristics, settings), settings[:, 0] < 5800
         outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
         metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
@@ -73,7 +73,7 @@ def test_a_generation_is_fifty_and_changes_between_one_and_all() -> None:
 def test_safe_fuzzer_ends_after_five_generations_without_improvement() -> None:
     single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),))
 
-    def constant(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+    def constant(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
         return evaluated(characteristics, np.full_like(settings, 6.0), np.ones(len(settings)))
 
     _, asked = searched("safe_fuzzer", 4, 5000, single, constant)
@@ -203,7 +203,7 @@ def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes(
 ) -> None:
     """Every setting with more changes than `most` collides."""
 
-    def colliding(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+    def colliding(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
         good = sphere(characteristics, settings)
         outcome = np.where(good.f_num_diff > most, Outcome.COLLISION.value, good.outcome).astype("U16")
         return dataclasses.replace(good, outcome=outcome)

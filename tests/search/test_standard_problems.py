@@ -26,7 +26,7 @@ from pymoo.operators.mutation.pm import PM
 from pymoo.optimize import minimize
 
 from safevar_sumo.metrics import PUBLISHED_SCORING
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search import ALGORITHMS, Problem
 from safevar_sumo.search.evolution import Individual, fitness_class
 from safevar_sumo.search.genetic import select_archive
@@ -36,12 +36,12 @@ from tests.search.problems import evaluated
 EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 
 
-def zdt3(x: np.ndarray) -> np.ndarray:
+def zdt3(x: FloatArray) -> FloatArray:
     first, g = x[:, 0], 1 + 9 * x[:, 1:].mean(axis=1)
     return np.stack([first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))], axis=1)
 
 
-def dtlz2(x: np.ndarray) -> np.ndarray:
+def dtlz2(x: FloatArray) -> FloatArray:
     g, angles = 1 + ((x[:, 2:] - 0.5) ** 2).sum(axis=1), x[:, :2] * np.pi / 2
     return np.stack(
         [
@@ -57,7 +57,7 @@ class StandardProblem(NamedTuple):
     """The number of variables in [0, 1], the objectives, and the reference point of the hypervolume."""
 
     variables: int
-    objectives: Callable[[np.ndarray], np.ndarray]
+    objectives: Callable[[FloatArray], FloatArray]
     reference: tuple[float, ...]
 
 
@@ -66,7 +66,7 @@ PROBLEMS = {"zdt3": StandardProblem(30, zdt3, (11.0, 11.0)), "dtlz2": StandardPr
 
 
 class Unfiltered(CharacteristicSet):
-    def filter(self, settings: np.ndarray) -> np.ndarray:
+    def filter(self, settings: FloatArray) -> FloatArray:
         return settings
 
 
@@ -81,14 +81,14 @@ class StandardScoring:
     def __post_init__(self) -> None:
         self.objectives = [None] * len(self.problem.reference)
 
-    def values(self, evaluations: Evaluations) -> np.ndarray:
+    def values(self, evaluations: Evaluations) -> FloatArray:
         return self.problem.objectives(evaluations.settings - 1)
 
-    def valid(self, evaluations: Evaluations) -> np.ndarray:
+    def valid(self, evaluations: Evaluations) -> FloatArray:
         return np.ones(len(evaluations), dtype=bool)
 
 
-def front_of_ours(name: str, standard: StandardProblem, seed: int) -> np.ndarray:
+def front_of_ours(name: str, standard: StandardProblem, seed: int) -> FloatArray:
     unit = Unfiltered(
         tuple(
             Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0)
@@ -112,19 +112,19 @@ def front_of_ours(name: str, standard: StandardProblem, seed: int) -> np.ndarray
             return scoring.values(end.value)
 
 
-def front_of_pymoo(standard: StandardProblem, seed: int) -> np.ndarray:
+def front_of_pymoo(standard: StandardProblem, seed: int) -> FloatArray:
     class Theirs(PymooProblem):
         def __init__(self) -> None:
             super().__init__(n_var=standard.variables, n_obj=len(standard.reference), xl=0.0, xu=1.0)
 
-        def _evaluate(self, x: np.ndarray, out: dict[str, np.ndarray], *args: Any, **kwargs: Any) -> None:
+        def _evaluate(self, x: FloatArray, out: dict[str, FloatArray], *args: Any, **kwargs: Any) -> None:
             out["F"] = standard.objectives(x)
 
     algorithm = SPEA2(pop_size=POPULATION, crossover=SBX(prob=0.9, eta=20), mutation=PM(eta=20))
     return np.asarray(minimize(Theirs(), algorithm, ("n_eval", EVALUATIONS), seed=seed).F)
 
 
-def front_of_jmetal(algorithm: Any, standard: StandardProblem, seed: int, **options: Any) -> np.ndarray:
+def front_of_jmetal(algorithm: Any, standard: StandardProblem, seed: int, **options: Any) -> FloatArray:
     class Theirs(FloatProblem):
         def __init__(self) -> None:
             super().__init__()
@@ -158,12 +158,12 @@ def front_of_jmetal(algorithm: Any, standard: StandardProblem, seed: int, **opti
     return np.array([solution.objectives for solution in search.result()])
 
 
-def front_of_mocell(standard: StandardProblem, seed: int) -> np.ndarray:
+def front_of_mocell(standard: StandardProblem, seed: int) -> FloatArray:
     neighbours, archive = C9(10, POPULATION // 10), CrowdingDistanceArchive(POPULATION)
     return front_of_jmetal(MOCell, standard, seed, neighborhood=neighbours, archive=archive)
 
 
-def front_of_nsga2(standard: StandardProblem, seed: int) -> np.ndarray:
+def front_of_nsga2(standard: StandardProblem, seed: int) -> FloatArray:
     """The published study used jMetalPy."""
     front = front_of_jmetal(NSGAII, standard, seed, offspring_population_size=POPULATION)
     return front[moocore.is_nondominated(front)]
@@ -180,7 +180,7 @@ def front_of_nsga2(standard: StandardProblem, seed: int) -> np.ndarray:
     ],
 )
 def test_hypervolumes_reach_those_of_the_second_implementation(
-    name: str, theirs: Callable[[StandardProblem, int], np.ndarray], problem: str
+    name: str, theirs: Callable[[StandardProblem, int], FloatArray], problem: str
 ) -> None:
     standard = PROBLEMS[problem]
     ours, others = (
@@ -193,7 +193,7 @@ def test_hypervolumes_reach_those_of_the_second_implementation(
     assert np.mean(ours) >= 0.98 * np.mean(others), (np.mean(ours), np.mean(others))
 
 
-def individuals(objectives: np.ndarray) -> list[Individual]:
+def individuals(objectives: FloatArray) -> list[Individual]:
     population = []
     for values in objectives.tolist():
         population.append(Individual(values))
@@ -201,7 +201,7 @@ def individuals(objectives: np.ndarray) -> list[Individual]:
     return population
 
 
-def random_front(seed: int) -> np.ndarray:
+def random_front(seed: int) -> FloatArray:
     """Two to four objectives, some of whole numbers, from one layer to many, with duplicates."""
     rng = np.random.default_rng(seed)
     size = int(rng.integers(1, 80))

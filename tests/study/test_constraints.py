@@ -102,15 +102,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     reported = [*settings_in([one for one in explained if "summary" not in one]), *nearest, *alone]
     assert [values for values in reported if not is_feasible(values)] == []
     assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
-    for question in (
-        "explain out --unsafe below=2.5 --fits 0 --limit 500",
-        "tolerance bound.toml --unsafe below=2.5 --fits 0 --characteristics mass",
-        "risk bound.toml --samples 200 --unsafe below=2.5",
-        "rules bound.toml --samples 200 --unsafe below=2.5",
-    ):
-        assert (
-            "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in run(*question.split()).stdout
-        ), question
+    for question in ("tolerance bound.toml --fits 0 --characteristics mass", "rules bound.toml --samples 200"):
+        said = run(*question.split(), "--unsafe", "below=2.5").stdout
+        assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in said, question
 
 
 def constrained(*constraints: Mapping[str, Any]) -> Study:

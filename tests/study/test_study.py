@@ -28,12 +28,7 @@ ALL_FIXED = "".join(
 )
 OF_FORM = [
     ("[search]\ntime_limit = inf", "search.time_limit = inf"),
-    ("[search]\ntime_limit = 0", "search.time_limit = 0"),
-    ("[metrics]\nttc = 2", "metrics.ttc: there is no such key"),
     ("[metrics]\nttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
-    ("[metrics]\nttc_threshold = nan", "metrics.ttc_threshold = nan"),
-    ("[metrics]\nttc_threshold = -1", "metrics.ttc_threshold = -1"),
-    ("[search]\npopulation = 1", "search.population = 1"),
     ("[search]\npopulation = 50.5", "search.population = 50.5"),
     ("[vehicle.characteristics.max_rpm]\noriginal = nan", "vehicle.characteristics.max_rpm.original = nan"),
     ("[vehicle.characteristics.max_rpm]\noriginal = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),
@@ -72,7 +67,6 @@ OF_FORM = [
     ),
     ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a' is not of type 'number'"),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]', "rating.claims.CCRs[0] = 3 is not of type 'string'"),
-    ("search = 3", "search = 3"),
     ("extends = 3", "extends"),
     ('extends = "native"\n[limits]\ndecel = 6', "limits.decel = 6\nexpected: a table of at_least, at_most, source"),
     (
@@ -84,7 +78,6 @@ OF_FORM = [
         "[[constraints]]\nsum = { mass = 1 }\nupper = 1",
         "constraints[0].upper: there is no such key\nexpected: one of at_least",
     ),
-    ("[variation.mass]\ndistribution = 'cauchy'", "cauchy"),
     ("[variation.mass]\ndistribution = 'normal'\ndeviation = -1", "deviation"),
     (
         "[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300",
@@ -121,10 +114,7 @@ OTHERS = [
     ('[vehicle]\nmodel = "tesla"', "vehicle: 'characteristics' is a required property"),
     ('extends = "mine.toml"', "extends = 'mine.toml' leads back to "),
     ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key"),
-    ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
-    ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
     ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
-    ('[ads.outputs]\nfoo = "bar"', "ads.outputs: 'world_on_rails' is no FMU"),
     ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
     (
         '[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
@@ -132,7 +122,6 @@ OTHERS = [
     ),
     ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
     ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
-    ("[fit.weights]\ntett = 1", "fit.weights.tett is no metric; did you mean 'tet'?"),
     ('weather = "fogg"', "did you mean 'fog'?"),
     ('[ads]\nmodel = "world_on_rail"', "did you mean 'world_on_rails'?"),
     ("[ads.parameters]\nnothing = 3", "mine.toml: ads.parameters.nothing: there is no such key"),
@@ -185,10 +174,11 @@ OTHERS = [
     ),
     ("[[constraints]]\nsum = { mass = 1 }", "neither at_least nor at_most"),
     ("[[constraints]]\nsum = { mass = 1 }\nat_least = 2\nat_most = 1", "at_least = 2 and at_most = 1"),
+    ("[variation.wings]\ndistribution = 'fixed'", "variation.wings"),
+    ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRx = ["Type"]', "CCRx"),
     ("[[constraints]]\nat_least = 2", "neither sum nor function"),
     ("[[constraints]]\nsum = { mass = 1 }\nfunction = 'a:b'\nat_most = 2", "both sum and function"),
     ("[[constraints]]\nfunction = 'no_such_module:f'\nat_most = 2", "constraints[0].function = 'no_such_module:f'"),
-    ("[variation.wings]\ndistribution = 'fixed'", "variation.wings"),
     ("[variation.mass]\ndistribution = 'normal'\ndeviation = 1\nmean = 9999", "variation.mass.mean = 9999"),
     ("[variation.mass]\ndistribution = 'uniform'\nlower = 2600\nupper = 2100", "lower = 2600 and upper = 2100"),
     ("[variation.mass]\ndistribution = 'triangular'\nlower = 2100\nmode = 2050", "variation.mass.mode = 2050"),
@@ -210,7 +200,6 @@ OTHERS = [
         "[[correlations]]\nbetween = ['radius', 'tireFric']\nvalue = -0.9",
         "contradict each other",
     ),
-    ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRx = ["Type"]', "CCRx"),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Typo"]', "Typo"),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Trajectory/Heading"]', "is simulated"),
     ('extends = "euro_ncap_rating"\n[matrix]\nprotocol = ""', "tests, or a protocol"),
@@ -229,7 +218,6 @@ OTHERS = [
     ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nover = { spede = [1] }', "spede"),
     ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nover = { speed = [-1] }', "speed"),
     ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nweathers = ["sunny"]', "sunny"),
-    ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nmodel = "nothing"', "nothing"),
 ]
 """Mistakes that only the other keys, files or models show."""
 VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
@@ -337,10 +325,7 @@ def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> No
         ("decel > 6", "'decel > 6'"),
         ("decel >= 6 m/s^2", "'decel >= 6 m/s^2'"),
         ("6 <= decel", "'6 <= decel'"),
-        ("5 <= decel <= 6", "'5 <= decel <= 6'"),
         ("decel >= nan", "'decel >= nan'"),
-        ("decel >= 1_0", "'decel >= 1_0'"),
-        (">= 6", "'>= 6'"),
         ("", "''"),
         ("decl >= 6", "decl: there is no such characteristic; did you mean 'decel'?"),
         ("decel >= 6, decel >= 7", "decel >= is given twice\nexpected: each limit once"),

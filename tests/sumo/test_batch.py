@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.records import Outcome, Trace, differences
+from safevar_sumo.records import FloatArray, Outcome, Trace, differences
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
 from safevar_sumo.sumo.batch import _Outcomes
@@ -19,7 +19,7 @@ from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
 
 
-def drawn(system: System, n: int, seed: int) -> np.ndarray:
+def drawn(system: System, n: int, seed: int) -> FloatArray:
     characteristics = system.characteristics
     rng = np.random.default_rng(seed)
     return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
@@ -123,7 +123,7 @@ STEP = 0.05
 TIMES = np.arange(12) * STEP
 
 
-def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
+def observed(delay: float) -> tuple[FloatArray, FloatArray]:
     """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose scene changes
     linearly.
     """

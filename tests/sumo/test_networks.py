@@ -198,8 +198,7 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
         'id="departure" from="crossing" to="east" type="slow"',
     )
     check_network(str(mine), "study")
-    lane = roads(mine).find(".//lane[@id='0.departure_0']")
-    assert lane is not None
+    (lane,) = roads(mine).iterfind(".//lane[@id='0.departure_0']")
     assert [float(lane.attrib[name]) for name in ("speed", "width")] == [7, 3]
     assert open_network(str(mine)).digests != before
     first = copied_network(open_network(str(mine)), 1).network
@@ -219,9 +218,6 @@ def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> N
     shutil.copy(mine / "town.net.xml", mine / "village.net.xml")
     with pytest.raises(InputError, match=r"has town\.net\.xml and village\.net\.xml"):
         on("smoke", mine)
-    before = open_network(str(mine / "town.net.xml")).digests
-    rewritten(mine / "town.net.xml", "<location", "<!-- --><location")
-    assert open_network(str(mine / "town.net.xml")).digests != before
 
 
 def load_original(study: str) -> np.ndarray:

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Observation, Outcome, differences
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import study_at
@@ -152,23 +152,10 @@ def test_a_false_claim_that_no_actor_reacts_is_detected(reacting: Path, monkeypa
 
 
 STANDS = "The original vehicle never reaches the encounter (it gets 0.0 of 11.9 m): no verdict."
-SIMPLE_STUDIES = [name for name in study_names() if load_study(name).matrix is None]
 
 
 def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, object]]) -> str:
     return why_no_verdict(replace(assemble(load_study(study)), ads=Pedals(pedals)))
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name in SIMPLE_STUDIES else pytest.param(name, marks=pytest.mark.slow)
-        for name in study_names()
-        if name != "euro_ncap_rating"  # checked in some of its cells: tests/rating/test_questions.py
-    ],
-)
-def test_the_original_vehicle_of_every_shipped_study_drives_to_the_encounter(name: str) -> None:
-    assert why_no_verdict(assemble(load_study(name))) == ""
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import Command
+from safevar_sumo.records import Command, FloatArray
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import slope_of
@@ -28,11 +28,11 @@ class Drive(NamedTuple):
     step: float
 
     @property
-    def speed(self) -> np.ndarray:
+    def speed(self) -> FloatArray:
         return np.stack([state.speed for state in self.states])
 
     @property
-    def distance(self) -> np.ndarray:
+    def distance(self) -> FloatArray:
         speed = self.speed
         return np.concatenate(
             [np.zeros((1, speed.shape[1])), np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0)]
@@ -43,7 +43,7 @@ class Drive(NamedTuple):
 
 
 def prepare(
-    model: str, settings: np.ndarray, road: float = 1.0, step: float = STEP, grade: float = 0.0, wet: bool = False
+    model: str, settings: FloatArray, road: float = 1.0, step: float = STEP, grade: float = 0.0, wet: bool = False
 ) -> Any:
     """The constants of vehicles with these settings, shape (N, n)."""
     values = dict(zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(settings.T), strict=True))
@@ -52,7 +52,7 @@ def prepare(
 
 def drive(
     model: str,
-    settings: np.ndarray,
+    settings: FloatArray,
     pedals: Pedals,
     duration: float,
     step: float = STEP,
@@ -80,11 +80,11 @@ def _rolling(state: Any, prepared: Any, speed: float) -> Any:
     return state._replace(speed=state.speed + speed, **wheels)
 
 
-def original(model: str, n: int = 1) -> np.ndarray:
+def original(model: str, n: int = 1) -> FloatArray:
     return np.repeat(SYSTEMS[model].characteristics.original[np.newaxis], n, axis=0)
 
 
-def ends(model: str, name: str, points: int = 5) -> np.ndarray:
+def ends(model: str, name: str, points: int = 5) -> FloatArray:
     """`points` settings of the original vehicle with one characteristic spread over its domain."""
     characteristics = SYSTEMS[model].characteristics
     settings, column = original(model, points), characteristics.names.index(name)
@@ -92,7 +92,7 @@ def ends(model: str, name: str, points: int = 5) -> np.ndarray:
     return settings
 
 
-def drawn(model: str, n: int, seed: int) -> np.ndarray:
+def drawn(model: str, n: int, seed: int) -> FloatArray:
     characteristics = SYSTEMS[model].characteristics
     return np.random.default_rng(seed).uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.records import Command, Observation
+from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
@@ -38,7 +38,7 @@ from tests.vehicles.runs import (
 MODELS = sorted(VEHICLES)
 
 
-def kinetic_energy(model: str, run: Drive) -> np.ndarray:
+def kinetic_energy(model: str, run: Drive) -> FloatArray:
     """Kinetic energy of all moving parts [J], shape (T, N)."""
     p, states = run.prepared, run.states
     if isinstance(SYSTEMS[model].vehicle, Carla):
@@ -82,18 +82,18 @@ def test_energy_is_never_created(model: str) -> None:
 # Measurements in which a characteristic acts, over a grid of its domain.
 def speed_at(
     time: float, pedals: Callable[[float], tuple[float, float]] = full_throttle, road: float = 1.0
-) -> Callable[..., np.ndarray]:
+) -> Callable[..., FloatArray]:
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
 
-def stopping_distance(brake: float, road: float = 1.0, wet: bool = False) -> Callable[..., np.ndarray]:
+def stopping_distance(brake: float, road: float = 1.0, wet: bool = False) -> Callable[..., FloatArray]:
     return lambda model, population: drive(
         model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, wet=wet
     ).distance[-1]
 
 
-def coasting_loss(start: float, duration: float) -> Callable[..., np.ndarray]:
-    def measured(model: str, population: np.ndarray) -> np.ndarray:
+def coasting_loss(start: float, duration: float) -> Callable[..., FloatArray]:
+    def measured(model: str, population: FloatArray) -> FloatArray:
         run = drive(model, population, coasting_after(start), start + duration + 0.5)
         before, after = run.speed[run.at(start + 0.5)], run.speed[-1]
         return np.asarray((before - after) / before)
@@ -101,7 +101,7 @@ def coasting_loss(start: float, duration: float) -> Callable[..., np.ndarray]:
     return measured
 
 
-def lateral_error(model: str, population: np.ndarray) -> np.ndarray:
+def lateral_error(model: str, population: FloatArray) -> FloatArray:
     return np.abs(drive(model, population, half_throttle, 3).states[-1].lateral)
 
 
@@ -173,7 +173,7 @@ def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
         assert unseen.extended(np.array([5.0])).delayed().tolist() == [sensed]
 
 
-def sensed_gaps(model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
+def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
     """Five values of a characteristic, and the gaps that such vehicles report while an obstacle comes nearer at 10 m/s;
     shape (T, 5).
     """
