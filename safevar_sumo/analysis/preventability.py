@@ -2,8 +2,8 @@
 
 If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible
 moment avoids it, the vehicle is the cause. UN R157 means its driver for cars that cut in, cut out or brake on
-motorways; its use for pedestrians is ours. So the share of collisions that he avoids is a range: it is computed for a
-later reaction, too.
+motorways; its use for pedestrians is ours. How fast a driver reacts to a pedestrian is therefore uncertain: the share
+of collisions that the driver avoids is computed for a later reaction, too.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def assess_preventability(
     return Preventability(
         counts=Counter(by for by, _ in avoidances),
         collisions=len(distinct),
-        later=sum(later for _, later in avoidances),
+        later=sum(avoids_later for _, avoids_later in avoidances),
     )
 
 
@@ -159,10 +159,10 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
     """Who avoids collisions at one point; full braking is tried only if the competent driver collides."""
     approach = approach_parameters(system)
 
-    def drive(driver: str, rows: FloatArray, **parameters: float) -> Evaluations:
+    def drive(driver: str, settings: FloatArray, **parameters: float) -> Evaluations:
         ads = ModelTable(model=driver, parameters={**approach, **parameters})
         with_driver = evaluator.for_study(replace(evaluator.study, ads=ads))
-        return with_driver.evaluate(rows, "reference drivers in the same vehicle")
+        return with_driver.evaluate(settings, "reference drivers in the same vehicle")
 
     competent = drive("competent_driver", settings)
     later = drive("competent_driver", settings, reaction_time=LATER_REACTION)

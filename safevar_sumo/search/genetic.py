@@ -55,6 +55,7 @@ def _search_elitist(
     """Search with survivors, which `select` chooses from the previous survivors and their offspring.
 
     `select` also sets their `standing`. Its first number is below 1 for non-dominated survivors, who are the result.
+    `distinct` is explained in `Reproduction.draw_offspring`.
     """
     reproduction = Reproduction(operators, problem, rng)
     offspring, survivors, used = initial_population(problem, rng), list[Individual](), 0
@@ -112,8 +113,8 @@ def select_archive(individuals: list[Individual], size: int, *, normalised: bool
     individuals.
 
     An individual's fitness is the sum of the strengths of all that dominate it, plus the density 1 / (distance to its
-    k-th nearest individual + 2). The strength is the number of individuals that one dominates; k is the root of the
-    number of individuals, and counts from 0 as in pymoo.
+    k-th nearest individual + 2). An individual's strength is the number of individuals that it dominates; k is the root
+    of the number of individuals, and counts from 0 as in pymoo.
     """
     if not individuals:
         return []
@@ -253,7 +254,7 @@ def update_archive(archive: list[Individual], offspring: list[Individual], size:
     """Select the non-dominated individuals of archive and offspring, without duplicates, at most the `size` least
     crowded of them; sets their `standing`.
 
-    Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
+    The archive gets copies: archive and grid rank the same individual differently, and each writes its `standing`.
     """
     distinct = {individual.fitness.values: individual for individual in archive}
     for child in offspring:

@@ -81,7 +81,7 @@ def explain_failures(
     distinct = count_distinct_causes(characteristics, sample_causes)
     if not options.solutions:
         reasons = _add_distinct_causes(population, sample, reasons, causes, distinct["cause"], options.top)
-    left_out = 0
+    left_out = 0  # collisions that the search simulated, but its objectives leave out of the solutions
     if isinstance(source, Case) and not study.origin.point and not population.evaluations.collided.any():
         left_out = int(are_collisions(source.evaluations).sum())
     models = evaluator.for_sets(options.fits if statistics and len(population.evaluations) else 0)
@@ -218,7 +218,7 @@ def _explain_rows(
     evaluator, unsafe, failures = population.evaluator, population.unsafe, population.evaluations.take(list(reasons))
     characteristics, study, settings = evaluator.characteristics, evaluator.study, failures.settings
     described = describe_causes(evaluator, [cause for row in reasons for cause in causes[row]], unsafe)
-    of_causes: Sequence[Robustness | None] = [None] * len(described)
+    robustness_of_causes: Sequence[Robustness | None] = [None] * len(described)
     if is_rated(study):  # each neighbour is simulated in all cells, which takes too long for all causes
         comparisons = compare_at_cells(evaluator, population.original.settings, settings)
         robustnesses = estimate_robustness(evaluator, settings, _time_step(study), unsafe, STEP_FACTORS[:1])
@@ -226,10 +226,11 @@ def _explain_rows(
         comparisons = compare_at_points(assemble(study), population.original.settings, settings, unsafe)
         cause_settings = (cause.setting(characteristics) for cause in described)
         robustnesses = estimate_robustness(evaluator, np.array([*settings, *cause_settings]), _time_step(study), unsafe)
-        of_causes = robustnesses[len(settings) :]
-    complete_causes = (
+        robustness_of_causes = robustnesses[len(settings) :]
+    holding = count_holding(models, described, unsafe)
+    remaining_causes = (  # taken below, failure by failure
         replace(cause, neighbours=robustness, sets=len(models), holds=holds)
-        for cause, robustness, holds in zip(described, of_causes, count_holding(models, described, unsafe), strict=True)
+        for cause, robustness, holds in zip(described, robustness_of_causes, holding, strict=True)
     )
     is_assessed = _is_assessed(study, failures)
     avoidances = iter(classify_collisions(evaluator, failures.take(is_assessed)))
@@ -244,7 +245,7 @@ def _explain_rows(
                 setting=dict(zip(characteristics.names, settings[index].tolist(), strict=True)),
                 outcome=str(failures.outcome[index]),
                 safety_degree=finite_or_none(failures.f_safe[index]),
-                causes=tuple(islice(complete_causes, len(causes[row]))),
+                causes=tuple(islice(remaining_causes, len(causes[row]))),
                 robustness=robustnesses[index],
                 because=comparison,
                 points=points,
@@ -332,12 +333,12 @@ def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, 
     any_unsafe = bool(unsafe.rows(solutions).any())
     if system.matrix:
         distinct = solutions.drop_duplicates(names)
-        nearest = None
+        least_safe = None
         if not is_rated(study):
             _, solution = choose("most_severe")
-            nearest = evaluator.evaluate(solution[names].to_numpy(float), "worst points")
+            least_safe = evaluator.evaluate(solution[names].to_numpy(float), "worst points")
         lines = [
-            situation_in_words(system, original, nearest, len(distinct)),
+            situation_in_words(system, original, least_safe, len(distinct)),
             f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: "
             f"{unsafe.description}.",
         ]

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 class NotRepairable(NamedTuple):
     """A part of the promise that no driving system survives.
 
-    `limits` are the values of a minimal cause at which full braking at the first possible moment first fails, at a test
-    `point`; `share` of the first vehicles tried cannot be kept safe.
+    `limits` are, for each characteristic of a minimal cause, the value from which on even full braking at once fails at
+    the test `point`. `share` is that of the vehicles tried at the beginning that no driving system keeps safe.
     """
 
     limits: dict[str, float]
@@ -67,9 +67,9 @@ class Repair:
     price, proof
         What it costs on a new vehicle, and its proof on fresh wear.
     held_out
-        Counts of `safe` among `all`: `points` of the matrix left out at first; `weathers`; `second_vehicle`;
-        `fitted_sets`; None where there is nothing to check. `lost_on_new_car` counts the points that the new vehicle
-        passed before and fails with the repair.
+        By check the numbers `all` and `safe`, or None if there is nothing to check: `points` of the matrix that the
+        search left out at first, `second_vehicle`, `fitted_sets`; `weathers` has these numbers for each weather.
+        `lost_on_new_car` counts the points that the new vehicle passed before and fails with the repair.
     """
 
     values: dict[str, float]
@@ -98,7 +98,8 @@ class Repairs:
     Attributes
     ----------
     worst_today
-        Safety degree of today's driving system with the worst vehicle of the promise that was tried [m, or -m/s].
+        Safety degree of today's driving system with the worst vehicle of the promise that was tried [m]; below 0, minus
+        the speed of the impact [m/s].
     proof_of_today
         If today's system keeps the promise already: its proof on fresh wear.
     largest_promise
@@ -312,9 +313,8 @@ def _proof_in_words(proof: Proof) -> str:
 def _held_out_in_words(held_out: JsonObject) -> str:
     texts = []
     if held_out["points"]:
-        texts.append(
-            f"{held_out['points']['safe']} of {number_of(held_out['points']['all'], 'unseen test')} safe at once"
-        )
+        unseen = number_of(held_out["points"]["all"], "unseen test")
+        texts.append(f"{held_out['points']['safe']} of {unseen} safe before the search saw them")
     weathers = [f"{name} {count['safe']} of {count['all']}" for name, count in held_out["weathers"].items()]
     if weathers:
         texts.append(f"worst cars safe in other weathers: {', '.join(weathers)}")

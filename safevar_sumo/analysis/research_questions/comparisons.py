@@ -115,10 +115,10 @@ def compare_pairs(case: Case) -> pd.DataFrame:
 def rank_algorithms(case: Case) -> pd.DataFrame:
     """Mean ranks over runs of three algorithms or more, metric by metric, with Friedman's test.
 
-    Runs with the same number form a block; a block in which an algorithm has no value is left out. Rank 1 is the best,
-    `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of this case.
-    Mean ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test at 0.01; Demsar
-    2006).
+    Run i of every algorithm together form block i; a block in which an algorithm has no value is left out. Rank 1 is
+    the best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of
+    this case. Mean ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test at 0.01;
+    Demsar 2006).
     """
     _require_algorithms(case, 3)
     samples, frames = _samples(case, over_runs=True), []
@@ -182,7 +182,9 @@ def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
 
 
 def _test_pairs(case: Case, pairs: Iterable[tuple[str, str]], *, over_runs: bool = False) -> list[JsonObject]:
-    """A row for each pair and metric; `other` and `baseline`, of which frames take one, name the second algorithm."""
+    """A row for each pair and metric; `other` and `baseline` both hold the second algorithm, of which a frame takes
+    one.
+    """
     samples, rows = _samples(case, over_runs), []
     for (first, second), (metric, more_is_better) in product(pairs, _directions(case).items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, second)))

@@ -43,8 +43,8 @@ def as_markdown(answers: Sequence[TableAnswer]) -> str:
         if not frame.empty:
             columns = frame.columns
             if columns.nlevels > 1:
-                is_one_block = len(columns.unique(0)) == 1
-                columns = columns.get_level_values(1) if is_one_block else columns.map(": ".join)
+                has_one_heading = len(columns.unique(0)) == 1
+                columns = columns.get_level_values(1) if has_one_heading else columns.map(": ".join)
             rows = [[*frame.index.names, *map(str, columns)], *frame.reset_index().to_numpy().tolist()]
             body = [markdown_table(rows, frame.index.nlevels), ""]
         notes = (f"{_escaped_for_markdown(note)}  " for note in table.notes)
@@ -121,7 +121,7 @@ def as_csv(answers: Sequence[TableAnswer]) -> str:
 def as_json(answers: Sequence[TableAnswer]) -> str:
     """One list of records; with several tables, each record names its "table".
 
-    Undefined values are null, but a rank, which rq3.2 has for j = any alone, is left out where there is none.
+    Undefined values are null; only `rank`, which rq3.2 has just in its rows j = any, is left out of all other rows.
     """
     rows = []
     for name, frame, *_ in answers:

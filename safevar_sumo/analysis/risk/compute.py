@@ -64,7 +64,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     rng, requested, counts = np.random.default_rng(study.search.seed), options.samples, np.zeros(3, dtype=int)
 
     def simulate(settings: FloatArray) -> Evaluations:
-        """Simulate vehicles, and add to `counts`: of all, of those that could be simulated, and of the unsafe ones."""
+        """Simulate vehicles, and add their numbers to `counts`: all, those that could be simulated, the unsafe ones."""
         evaluations = evaluator.evaluate(settings, "sampling vehicles")
         counts[:] += len(settings), np.count_nonzero(evaluations.valid), np.count_nonzero(unsafe.of(evaluations))
         return evaluations
@@ -73,15 +73,15 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         load_openturns()  # raises if the module is missing
         requested = max(requested, PILOT_VEHICLES)
         remark = "the study has constraints, which only plain Monte Carlo supports" if evaluator.region else ""
-    # Without [variation] the answer is a share of the domain, which is counted as `rules` does unless the user requires
-    # a method for rare failures.
+    # Without [variation] the answer is the unsafe share of the domain: plain Monte Carlo as in `rules`, unless the user
+    # requires a method for rare failures.
     may_be_rare = options.method == "auto" and bool(study.variation) and options.width is None
     needs_pilot = options.requires_rare_method or (may_be_rare and options.samples >= 2 * PILOT_VEHICLES)
     if needs_pilot and not evaluator.region:
         probabilities = rng.random((PILOT_VEHICLES, len(evaluator.characteristics)))
         response = Response(evaluator, model.settings_of_normal, unsafe)
-        responses = response.record(scipy.stats.norm.ppf(probabilities), simulate(model.settings(probabilities)))
-        estimate_or_remark = _try_rare_method(response, responses, options, requested)
+        pilot_responses = response.record(scipy.stats.norm.ppf(probabilities), simulate(model.settings(probabilities)))
+        estimate_or_remark = _try_rare_method(response, pilot_responses, options, requested)
         if isinstance(estimate_or_remark, Estimate):
             return estimate_or_remark
         remark = estimate_or_remark
@@ -107,11 +107,13 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     )
 
 
-def _try_rare_method(response: Response, responses: FloatArray, options: RiskOptions, requested: int) -> Estimate | str:
+def _try_rare_method(
+    response: Response, pilot_responses: FloatArray, options: RiskOptions, requested: int
+) -> Estimate | str:
     """The estimate by a method for rare failures; without one, a remark why plain Monte Carlo has to continue, which
     may be empty.
 
-    `response` has simulated the vehicles of the pilot, `responses` are theirs.
+    `pilot_responses` are those of the pilot's vehicles, which `response` has recorded.
     """
     required, percent = options.requires_rare_method, f"{100 * RARE_BELOW:g} %"
     if not response.samples or response.failures >= RARE_BELOW * response.samples:
@@ -121,7 +123,7 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
         return f"{pilot}: plain Monte Carlo is used" if required else ""
     if not required and response.failures * requested / PILOT_VEHICLES >= ENOUGH_FAILURES:
         return ""
-    if is_plateau(responses):
+    if is_plateau(pilot_responses):
         return (
             "the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods "
             "for rare failures cannot approach failures; plain Monte Carlo is used"

@@ -60,13 +60,13 @@ class ToleranceOptions(Options):
     )
     trade: tuple[str, ...] | None = option(
         None,
-        "How far B may go at values of A, from the original to where A is unsafe by itself; others with limits are at "
-        "these.  [default: none]",
+        "How far B may go at values of A, from its original to where A alone is unsafe; other characteristics that "
+        "have a limit are held at it.  [default: none]",
         metavar="A,B",
         form="commas",
         python=(
-            "Two characteristics: find how far the second may go at values of the first, from the original to where "
-            "the first is unsafe by itself; others with limits are at these. By default none."
+            "Two characteristics: find how far the second may go at values of the first, from its original to where "
+            "the first alone is unsafe; other characteristics that have a limit are held at it. By default none."
         ),
     )
 

@@ -61,13 +61,17 @@ class SafeBox(NamedTuple):
 
 
 def find_safe_box(
-    evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray, known: FloatArray
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    unsafe: Unsafe,
+    unsafe_settings: FloatArray,
+    unsafe_solutions: FloatArray,
 ) -> SafeBox:
     """The largest safe box, in which `columns` vary, around an original vehicle that is safe itself.
 
     The box ends before all of `unsafe_settings`, shape (K, n): scans found them, so that there is no need to look for
-    nearer ones on the way to them. From the unsafe solutions of a search, `known`, shape (L, n), it shrinks as from
-    unsafe settings that it finds itself.
+    nearer ones on the way to them. From `unsafe_solutions`, shape (L, n), of a search the box shrinks as from unsafe
+    settings that are found here.
 
     Notes
     -----
@@ -87,8 +91,8 @@ def find_safe_box(
         return np.asarray(np.max(shares, axis=1, initial=0.0))
 
     def shrunk(settings: FloatArray) -> float:
-        """The factor of a box that ends before the first unsafe settings on the lines from the original to the nearest
-        of these unsafe settings.
+        """The factor of a box that ends before anything unsafe on the way from the original to the nearest ones of
+        these settings.
         """
         nearest = settings[np.argsort(factors_of(settings), kind="stable")[:MAX_LINES]]
         starts = np.tile(original, (len(nearest), 1))
@@ -98,13 +102,13 @@ def find_safe_box(
 
     if len(unsafe_settings):
         factor = STEP_BACK * float(np.min(factors_of(unsafe_settings)))
-    if len(known):
-        factor = shrunk(known)
-    seed, search, attempt = evaluator.study.search.seed, 0, 0
+    if len(unsafe_solutions):
+        factor = shrunk(unsafe_solutions)
+    seed, search_count, attempt = evaluator.study.search.seed, 0, 0
     while factor >= MIN_FACTOR:
         ends, stage = (original - factor * below, original + factor * above), f"all within {factor:.0%} of the domain"
         for point_count in (FIRST_SEARCH_POINTS, SECOND_SEARCH_POINTS):
-            settings = sobol_and_corners(evaluator, columns, ends, point_count, seed + search)
+            settings = sobol_and_corners(evaluator, columns, ends, point_count, seed + search_count)
             unsafe_inside = settings[unsafe.of(evaluator.evaluate(settings, stage))]
             if len(unsafe_inside):
                 break
@@ -115,7 +119,7 @@ def find_safe_box(
             )
             if not len(unsafe_inside):
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, at_most)
-        factor, search = shrunk(unsafe_inside), search + 1
+        factor, search_count = shrunk(unsafe_inside), search_count + 1
     return SafeBox(attempts=attempt)
 
 
@@ -186,8 +190,9 @@ def sample_box(
     The settings are drawn independently and uniformly, by a random generator that no search uses. Test k, k = 1, 2,
     ..., may be wrong with probability alpha_k = alpha / 2^k, alpha = 1 - `CONFIDENCE`: its bound is Clopper and
     Pearson's at confidence 1 - alpha_k. Box k depends on earlier samples alone, so given box k the bound fails with
-    probability at most alpha_k; all tests together fail with probability sum alpha_k <= alpha, whichever of them
-    accepts. Later tests draw more settings, so that the bound stays `MAX_UNSAFE_SHARE` if all of them are safe.
+    probability at most alpha_k. So the probability that any bound is wrong, and with it the bound of the box that
+    passes, is at most sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `MAX_UNSAFE_SHARE`
+    if all of them are safe.
     """
     error_probability = (1 - CONFIDENCE) / 2**attempt
     count = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))

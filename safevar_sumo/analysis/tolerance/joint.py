@@ -15,16 +15,16 @@ from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
 PARTS, ROUNDS = 8, 3
-"""Number of parts into which each of so many rounds divides the interval from a safe to an unsafe size of a box."""
+"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS` parts."""
 WIDENING = 0.04
 """Share of its domain by which a side of the box is widened in search of something unsafe."""
 MAX_GAP = 0.05
-"""Something unsafe, or the end of the domain, is at most this share of the domain beyond a free side: one widening, and
-a little more.
+"""A free side ends at most this share of the domain before something unsafe, or the domain's end; a little more than
+`WIDENING`.
 """
 SLAB_POINTS = 64
 """Number of Sobol points, and of corners, at which the room beside a box is searched."""
-MAX_ROUNDS = 40
+MAX_ATTEMPTS = 40
 """Maximum number of boxes that are searched for something unsafe, and of tests."""
 DEVIATIONS = tuple(0.35 * 0.8**k for k in range(14))
 """Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
@@ -60,7 +60,8 @@ class JointLimits(NamedTuple):
         False if settings within the limits are unsafe, all other characteristics as in the original. In the box, the
         other characteristics then keep their original values.
     beyond
-        An unsafe setting by the name of a characteristic: this one is just beyond the box, all others are in it.
+        By the name of a characteristic, an unsafe setting whose value of it is just beyond the box; all its other
+        values are in the box.
     """
 
     fixed: Mapping[str, Limit]
@@ -147,7 +148,7 @@ class _BoxSearch:
         extents = np.stack([-change, change], axis=1) - ROUNDING * self.width
         return np.array([(extents <= sides).all(axis=(1, 2)) for sides in boxes]).reshape(len(boxes), len(settings))
 
-    def known_inside(self, sides: FloatArray) -> FloatArray:
+    def unsafe_inside(self, sides: FloatArray) -> FloatArray:
         """The known unsafe settings that a box holds."""
         inside: FloatArray = self.unsafe_settings[self.hold(sides[np.newaxis], self.unsafe_settings)[0]]
         return inside
@@ -171,7 +172,7 @@ class _BoxSearch:
 
     def attack(self, sides: FloatArray) -> FloatArray:
         """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
-        known = self.known_inside(sides)
+        known = self.unsafe_inside(sides)
         return known if len(known) else self.find_unsafe(self.points(sides, FIRST_SEARCH_POINTS))
 
     def learn(self, settings: FloatArray) -> None:
@@ -210,7 +211,7 @@ class _BoxSearch:
         for _ in range(ROUNDS):
             shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
             boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * start, start)
-            safe_count = int(np.argmin([*self.are_safe(boxes), False]))  # of the smallest boxes
+            safe_count = int(np.argmin([*self.are_safe(boxes), False]))  # the smallest ones, before the first unsafe
             low, high = shares[safe_count], shares[min(safe_count + 1, PARTS)]
         best = np.where(self.is_free, low * start, start)
         for deviation in DEVIATIONS:
@@ -241,7 +242,7 @@ class _BoxSearch:
                 wider[side, column] = min(length, self.longest[side, column])
                 slab = np.concatenate([self.corner_settings(wider[np.newaxis])[0], self.points(wider, SLAB_POINTS)])
                 slab[:, column] = self.ends(wider)[side][column]  # moved to the new end
-                if len(self.known_inside(wider)) or len(self.find_unsafe(slab)):
+                if len(self.unsafe_inside(wider)) or len(self.find_unsafe(slab)):
                     break
                 sides = wider
         return sides
@@ -251,7 +252,7 @@ class _BoxSearch:
 
         If every search finds something, the box keeps all but the fixed sides at the original.
         """
-        for _ in range(MAX_ROUNDS):
+        for _ in range(MAX_ATTEMPTS):
             sides = self.largest(start)
             unsafe_inside = self.attack(sides)
             if not len(unsafe_inside):
@@ -268,7 +269,7 @@ class _BoxSearch:
         for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
             wider = sides.copy()
             wider[side, column] += MAX_GAP * self.width[column]
-            for setting in self.known_inside(wider)[:1]:
+            for setting in self.unsafe_inside(wider)[:1]:
                 beyond.setdefault(self.evaluator.characteristics.names[column], setting)
         return beyond
 
@@ -280,23 +281,22 @@ def find_joint_limits(
     limits: Mapping[str, Limit],
     scans: Sequence[OneAtATimeScan],
     unsafe_settings: FloatArray,
-    known: FloatArray,
+    unsafe_solutions: FloatArray,
 ) -> JointLimits:
     """The largest box by relative volume in which `columns` vary, and in which those of `limits` reach their limits.
 
-    The box holds none of `unsafe_settings`, shape (K, n), and none of the unsafe solutions of a search, `known`, shape
-    (L, n).
+    The box holds none of `unsafe_settings`, shape (K, n), and none of `unsafe_solutions`, shape (L, n), of a search.
 
     Notes
     -----
     A random search seeks the largest box that is safe at known corners, within what is safe alone. At first only one
-    corner is known, which joins the sides with the smaller margins. A search then attacks the box, at Sobol points and
-    at other corners. The causes of what is unsafe, as few changes as possible, are further corners, and the largest box
-    is sought anew, until no search finds anything. Sides that could go further are widened. At last independent
-    settings test the box (`sample_box`).
+    corner is known, at which every characteristic has gone towards its smaller margin. A search then attacks the box,
+    at Sobol points and at other corners. The causes of what is unsafe, as few changes as possible, are further corners,
+    and the largest box is sought anew, until no search finds anything. Sides that could go further are widened. At last
+    independent settings test the box (`sample_box`).
     """
     unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
-    search = _BoxSearch(unverified, columns, unsafe, limits, np.concatenate([unsafe_settings, known]))
+    search = _BoxSearch(unverified, columns, unsafe, limits, np.concatenate([unsafe_settings, unsafe_solutions]))
     start, corner = search.longest.copy(), np.zeros(len(search.original))
     for column, scan in zip(columns, scans, strict=True):
         original = search.original[column]
@@ -307,10 +307,10 @@ def find_joint_limits(
         if low_margin is not None and (high_margin is None or low_margin < high_margin):
             corner[column] = -1.0
     search.corners.append(corner)
-    for attempt in range(1, MAX_ROUNDS + 1):
-        # The last attempt tests the limits without room for the others, and counts them as not kept.
-        kept = attempt < MAX_ROUNDS and not len(search.attack(search.fixed))
-        sides = search.best(start) if kept else search.fixed
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        kept = not len(search.attack(search.fixed))
+        # The last attempt gives up: it tests the limits alone, with all others as in the original.
+        sides = search.best(start) if kept and attempt < MAX_ATTEMPTS else search.fixed
         ends, stream = search.ends(sides), (evaluator.study.search.seed, 1, attempt)
         unsafe_samples, samples, failed, at_most = sample_box(
             evaluator, columns, unsafe, ends, attempt, stream, "test of the limits together"
@@ -319,6 +319,8 @@ def find_joint_limits(
             break
         search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_samples])
         search.learn(unsafe_samples[:1])
+    else:
+        kept = False
     # Ends of the domain are stated exactly, not through their distance from the original.
     box = {
         item.name: (max(low, item.lower), min(high, item.upper))
@@ -331,7 +333,7 @@ def find_joint_limits(
         unsafe=len(unsafe_samples),
         failed=failed,
         at_most=at_most,
-        known_unsafe_inside=int(search.hold(sides[np.newaxis], known).sum()),
+        known_unsafe_inside=int(search.hold(sides[np.newaxis], unsafe_solutions).sum()),
         kept=kept,
         beyond=search.beyond(sides),
     )
