@@ -300,4 +300,5 @@ def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.M
     of_each = [ends(with_values(study, {gap: value}), 0).safe for value in gaps]
     low, high = zip(*(interval for interval in of_each if interval), strict=True)
     assert len({*low}) > 1, "the fits differ"
-    assert ends(study, 8).across_fits == (len(low), ((min(low), max(low)), (min(high), max(high))))
+    ranges = (min(low), max(low)), (min(high), max(high))
+    assert ends(study, 8).across_fits == (len(low), ranges, len(of_each) - len(low))

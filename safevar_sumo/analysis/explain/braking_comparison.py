@@ -8,8 +8,8 @@ speed is v - e, and the speed falls by d. After t the mean deceleration is a. Th
 and the margin is G - D. A difference of products is split exactly between the two factors,
 x2 y2 - x1 y1 = (x2 - x1) (y1 + y2) / 2 + (y2 - y1) (x1 + x2) / 2. So the lost margin, the original's margin minus the
 changed vehicle's, is a sum of parts, each with the sign of one difference: gap (G smaller), speed (v larger), delay (t
-larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller). If the obstacle moves
-on, v is the speed and a the deceleration relative to it, at its mean speed while the vehicle brakes.
+larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller). If the obstacle moves,
+v and a are relative to it; it counts as moving at its mean speed during the braking.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COAST_DECELERATION = 0.1
 MAX_OMITTED_REMAINDER = 0.05
 """A sentence leaves out the unexplained part of the lost margin if it is at most this long [m]."""
 OBSTACLE_DECIMALS = 6
-"""Decimals of an obstacle's speed, so that one that stands still has none."""
+"""Decimals of an obstacle's speed, so that rounding errors do not move one that stands."""
 CRUISE_SHARE = 0.9
 """A vehicle cruises at this share of its highest speed or more [-]."""
 REGULATION_SHARE = 0.05
@@ -37,7 +37,7 @@ MIN_PART = 0.005
 """Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
 PART_PHRASES = {
     "gap": ("gap", "m", "it begins to brake at a {} gap", "smaller", "larger"),
-    "speed": ("speed", "m/s at the command", "it is {}", "faster", "slower"),
+    "speed": ("closing_speed", "m/s at the command", "it is {}", "faster", "slower"),
     "delay": ("delay", "s after the command", "its brake pedal follows {}", "later", "sooner"),
     "slowing": ("speed_lost", "m/s", "it loses {} speed while the pedal moves", "less", "more"),
     "deceleration": ("deceleration", "m/s^2", "it decelerates {} with the pedal down", "less", "more"),
@@ -78,22 +78,25 @@ class Braking(NamedTuple):
     nearest_gap: float | None
 
     @property
+    def closing_speed(self) -> float:
+        return self.speed - self.obstacle_speed
+
+    @property
     def quantities(self) -> list[float]:
         """The quantities whose differences explain a lost margin."""
-        closing_speed = self.speed - self.obstacle_speed
-        return [self.gap, closing_speed, self.delay, self.speed_deficit, self.speed_lost, 1 / self.deceleration]
+        return [self.gap, self.closing_speed, self.delay, self.speed_deficit, self.speed_lost, 1 / self.deceleration]
 
     @property
     def remainder(self) -> float:
         """The part of the nearest gap that the margin does not explain [m], 0 on a collision.
 
-        The margin is the gap at the command minus the distance by which it shrinks, if the mean deceleration continues
-        after the run.
+        The margin is the gap at the command minus the distance in which it is closed, as if the vehicle went on braking
+        after the end of the run.
         """
         if self.nearest_gap is None:
             return 0.0
-        gap, speed, delay, deficit, lost, softness = self.quantities
-        return self.nearest_gap - (gap - (speed - deficit) * delay - (speed - lost) ** 2 * softness / 2)
+        gap, speed, delay, deficit, lost, inverse_deceleration = self.quantities
+        return self.nearest_gap - (gap - (speed - deficit) * delay - (speed - lost) ** 2 * inverse_deceleration / 2)
 
 
 class BrakingComparison(NamedTuple):
@@ -143,17 +146,17 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is nearest; None if it
     does not brake.
 
-    A braking manoeuvre begins where the brake command starts to rise to at least `REGULATION_SHARE` times the largest
-    command; it ends where the throttle or a smaller brake command regulates the speed again. The manoeuvre that counts
-    is
+    A braking manoeuvre has brake commands of at least `REGULATION_SHARE` times the largest one. It begins where the
+    command starts to rise towards that, and ends where the throttle or a smaller brake command regulates the speed
+    again. The manoeuvre that counts is
 
-    1. the one under way when the vehicle last cruises (at `CRUISE_SHARE` of its highest speed or more), as earlier
+    1. the one in which the speed falls below `CRUISE_SHARE` of the highest speed for the last time, as earlier
        manoeuvres, such as those of a cruise control after an overshoot, did not slow the vehicle down;
     2. otherwise the first one after that;
     3. otherwise none if the vehicle collides, and its last one if it does not.
     """
-    trace, nearest = runs.trace, runs.nearest(column)
-    active = trace.active[: None if nearest is None else nearest + 1, column]
+    trace, nearest_sample = runs.trace, runs.nearest(column)
+    active = trace.active[: None if nearest_sample is None else nearest_sample + 1, column]
     speed = np.where(active, trace.speed[: len(active), column], 0.0)
     brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
@@ -171,10 +174,10 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
 
 def measure_braking(runs: SimulationRuns, column: int) -> Braking | None:
     """The braking of vehicle `column`; None if it does not brake, or only coasts after the pedal has followed."""
-    onset, nearest, trace = brake_onset(runs, column), runs.nearest(column), runs.trace
+    onset, nearest_sample, trace = brake_onset(runs, column), runs.nearest(column), runs.trace
     if onset is None:
         return None
-    last = int(np.flatnonzero(trace.active[:, column])[-1]) if nearest is None else nearest
+    last = int(np.flatnonzero(trace.active[:, column])[-1]) if nearest_sample is None else nearest_sample
     position = trace.position[: last + 1, column]
     elapsed = trace.time[last] - trace.time[onset]
     obstacle_shift = position[last] + trace.gap[last, column] - position[onset] - trace.gap[onset, column]
@@ -190,7 +193,7 @@ def measure_braking(runs: SimulationRuns, column: int) -> Braking | None:
     if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
     initial_speed, delay = float(relative_speed[onset]), (followed - onset) * trace.step
-    has_collided = nearest is None or np.isfinite(runs.collision_speed[column])
+    has_collided = nearest_sample is None or np.isfinite(runs.collision_speed[column])
     mean_speed = float(relative_position[followed] - relative_position[onset]) / delay if delay else initial_speed
     return Braking(
         gap=float(trace.gap[onset, column]),
@@ -214,16 +217,16 @@ def compare_braking(runs: SimulationRuns, column: int, degrees: FloatArray, poin
     if original is None or changed is None:
         return BrakingComparison(original, changed, {}, endings, point)
     quantities = np.array([original.quantities, changed.quantities])
-    _, speed, delay, deficit, lost, softness = quantities.mean(axis=0)
-    more_gap, more_speed, more_delay, more_deficit, more_lost, more_softness = np.diff(quantities, axis=0)[0]
-    per_speed_after_delay = (speed - lost) * softness
+    _, speed, delay, deficit, lost, inverse_deceleration = quantities.mean(axis=0)
+    more_gap, more_speed, more_delay, more_deficit, more_lost, more_inverse = np.diff(quantities, axis=0)[0]
+    distance_per_speed_after_delay = (speed - lost) * inverse_deceleration
     speeds_after_delay = quantities[:, 1] - quantities[:, 4]  # closing speed - speed lost
     parts = {
         "gap": -more_gap,
-        "speed": more_speed * (delay + per_speed_after_delay),
+        "speed": more_speed * (delay + distance_per_speed_after_delay),
         "delay": more_delay * (speed - deficit),
-        "slowing": -more_deficit * delay - more_lost * per_speed_after_delay,
-        "deceleration": more_softness * np.mean(speeds_after_delay**2) / 2,
+        "slowing": -more_deficit * delay - more_lost * distance_per_speed_after_delay,
+        "deceleration": more_inverse * np.mean(speeds_after_delay**2) / 2,
         "remainder": original.remainder - changed.remainder,
     }
     return BrakingComparison(original, changed, {name: float(part) for name, part in parts.items()}, endings, point)

@@ -130,10 +130,10 @@ def compute_convergence(case: Case) -> pd.DataFrame:
 
 
 def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
-    """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
+    """Empirical attainment surfaces of the first two objectives, by algorithm and share [%] of its runs with solutions.
 
     A surface is K points, shape (K, 2), in the objectives' units, sorted by the first objective. For each point, that
-    percentage of the runs found a setting at least as good (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
+    percentage of these runs found a setting at least as good (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
 
     Raises
     ------
@@ -144,7 +144,7 @@ def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     surfaces: dict[str, dict[float, FloatArray]] = {}
     signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
     for algorithm in case.algorithms:
-        case.runs_of(algorithm)  # raises if there are none
+        case.runs_of(algorithm)  # raises if the solutions are imported
         solutions = case.solutions_of(algorithm)
         points = minimised_values(case, solutions)
         is_defined = np.isfinite(points).all(axis=1)

@@ -21,6 +21,7 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Interval, clo
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, escape_dollars, new_figure
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import join_phrases, number_of
+from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Study
@@ -201,15 +202,21 @@ def find_rules(source: Study | Case, options: RulesOptions, evaluator: Evaluator
     ------
     InputError
         If `unsafe` cannot be used.
+    SimulationError
+        If no setting can be simulated.
     """
     characteristics, unsafe = evaluator.characteristics, evaluator.choose_criterion(options.unsafe, source)
     evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
-    half = len(evaluations) // 2
+    rows = np.arange(len(evaluations))
+    if evaluator.region:  # where hardly any setting is feasible, the last ones are mixtures of corners
+        rows = np.random.default_rng(evaluator.study.search.seed).permutation(rows)
     training, validation = (
-        evaluations.take(rows[evaluations.valid[rows]]) for rows in np.split(np.arange(len(evaluations)), [half])
+        evaluations.take(half[evaluations.valid[half]]) for half in np.split(rows, [len(rows) // 2])
     )
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
     unsafe_count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
+    if not samples:
+        raise SimulationError(f"study {evaluator.study.name!r}: none of {len(rows)} vehicles could be simulated")
     remark, boxes = "", list[FloatArray]()
     if unsafe_count == len(training) > 0:
         boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]

@@ -269,7 +269,11 @@ def _across_fits_in_words(scans: Sequence[OneAtATimeScan]) -> Iterator[str]:
     if across_fits:
         sets = max(ends.sets for ends in across_fits.values())
         fits = f"With {sets} vehicle models that fit the published data about as well,"
-        yield f"{fits} {'; '.join(differences) or 'all safe intervals are the same'}."
+        lost = max(ends.unsafe_as_new for ends in across_fits.values())
+        differences = differences or ["all safe intervals are the same"]
+        if lost:
+            differences.append(f"with {lost} more even the original is unsafe")
+        yield f"{fits} {'; '.join(differences)}."
 
 
 def _losses_in_words(scan: OneAtATimeScan) -> str:

@@ -49,10 +49,13 @@ class EndsAcrossFits(NamedTuple):
         Number of sets in which the interval exists, the study's own among them.
     range
         The least and the greatest lower end, and the least and the greatest upper end.
+    unsafe_as_new
+        Number of further sets with which the original itself is unsafe, so that there is no interval.
     """
 
     sets: int
     range: tuple[Interval, Interval]
+    unsafe_as_new: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +179,11 @@ def scan_with_sets(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe,
         own_scan, intervals = of_characteristic[0], [each.safe for each in of_characteristic if each.safe is not None]
         if len(evaluators) > 1 and intervals:
             lows, highs = zip(*intervals, strict=True)
-            across_fits = EndsAcrossFits(len(intervals), ((min(lows), max(lows)), (min(highs), max(highs))))
+            across_fits = EndsAcrossFits(
+                sets=len(intervals),
+                range=((min(lows), max(lows)), (min(highs), max(highs))),
+                unsafe_as_new=len(evaluators) - len(intervals),
+            )
             own_scan = replace(own_scan, across_fits=across_fits)
         scans.append(own_scan)
     return scans
