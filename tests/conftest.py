@@ -12,7 +12,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from safevar_sumo.analysis.case import load_cases
+from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.answer import Explained
@@ -100,7 +100,12 @@ def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def explained(slippery: Path) -> Explained:
+def case(slippery: Path) -> Case:
+    """These results as a case."""
+    return load_cases([slippery])[0]
+
+
+@pytest.fixture(scope="session")
+def explained(case: Case) -> Explained:
     """Explanations of the failures in the results `slippery`."""
-    (case,) = load_cases([slippery])
     return explain_failures(case, ExplainOptions(top=3), Evaluator(case.study, InlinePool()))

@@ -7,7 +7,6 @@ import re
 from dataclasses import replace
 from io import StringIO
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,7 +15,7 @@ import scipy
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from safevar_sumo.analysis.case import Case, load_cases
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
@@ -53,11 +52,6 @@ from tests.conftest import FITS
 from tests.in_process import InlinePool
 
 CAUSE_KEYS = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
-
-
-@pytest.fixture(scope="module")
-def case(slippery: Path) -> Case:
-    return load_cases([slippery])[0]
 
 
 @pytest.mark.slow

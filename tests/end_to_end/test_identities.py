@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from fnmatch import fnmatch
 from pathlib import Path
@@ -13,7 +12,7 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import FILES
+from safevar_sumo.results import FILES, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import run
 
@@ -103,7 +102,7 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
     run("study", "../mine.toml", "--out", "../out", "--quiet")
-    assert {*files, "my_ads.py", "my_map.py"} == set(json.loads(Path("../out/manifest.json").read_text())["sources"])
+    assert {*files, "my_ads.py", "my_map.py"} == set(read_manifest(Path("../out"))["sources"])
     run("study", "../mine.toml", "--out", "../out", "--runs", "2", "--quiet")
     for name, text in files.items():
         Path("..", name).write_text(f"{text}\n# a comment\n")
@@ -138,9 +137,7 @@ def test_a_file_that_is_read_later_counts_from_then_on() -> None:
     assert [name for name in files if not any(fnmatch(name, row[0]) for row in FILES)] == [], (
         "a file that the manual does not list"
     )
-    assert "tile.txt" not in json.loads(Path("out/manifest.json").read_text())["sources"], (
-        "the original vehicle is never so fast"
-    )
+    assert "tile.txt" not in read_manifest(Path("out"))["sources"], "the original vehicle is never so fast"
     before = Path("out/solutions.csv").read_bytes()
     study()
     assert Path("out/solutions.csv").read_bytes() == before

@@ -19,6 +19,7 @@ from safevar_sumo.sumo.system import System, assemble
 from tests.fmu.exported import CART, changed, exported
 from tests.fmu.test_faults import Make, driven, edited, with_step
 
+FULL_THROTTLE = Command(np.ones(1), np.zeros(1))
 TABLE = """parameters = { where = 25.0 }
 inputs = { gap = "gap" }
 outputs = { brake = "pedal" }
@@ -160,7 +161,7 @@ def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Pat
         (cart / "cart.toml").write_text(text.format(more=f"[vehicle.characteristics]\n{row}"))
         vehicle = assemble(load_study("cart.toml")).vehicle
         prepared = vehicle.prepare({"power": np.array([power]), "grip": np.array([8.0])}, 1.0, 0.1)
-        state = vehicle.advance(prepared, vehicle.at_rest(prepared), Command(np.ones(1), np.zeros(1)))
+        state = vehicle.advance(prepared, vehicle.at_rest(prepared), FULL_THROTTLE)
         np.testing.assert_allclose(state.speed[0], 10.8 * 0.1)  # the FMU computes in its own unit
     wet = vehicle.prepare({"power": np.array([power]), "grip": np.array([8.0])}, 1.0, 0.1, wet=np.array([True]))
     assert (prepared.inputs["wet"], wet.inputs["wet"]) == (0, 1)
@@ -217,10 +218,10 @@ def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_g
     prepared = vehicle.prepare({"power": np.array([10.0]), "grip": np.array([8.0])}, 1.0, 0.1)
     states = [vehicle.at_rest(prepared)]
     for _ in range(6):
-        states.append(vehicle.advance(prepared, states[-1], Command(np.ones(1), np.zeros(1))))
+        states.append(vehicle.advance(prepared, states[-1], FULL_THROTTLE))
     np.testing.assert_allclose([one.speed[0] for one in states], np.arange(7.0))
     braked = vehicle.advance(prepared, states[4], Command(np.zeros(1), np.ones(1)))
-    again = vehicle.advance(prepared, states[4], Command(np.ones(1), np.zeros(1)))
+    again = vehicle.advance(prepared, states[4], FULL_THROTTLE)
     np.testing.assert_allclose([braked.speed[0], again.speed[0]], [4 - 0.8, 5])
 
 

@@ -17,7 +17,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from safevar_sumo.analysis.case import Case, load_cases
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene, find_ffmpeg
@@ -27,11 +27,6 @@ from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import refused
-
-
-@pytest.fixture
-def case(slippery: Path) -> Case:
-    return load_cases([slippery])[0]
 
 
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
@@ -45,8 +40,7 @@ def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Ca
 
 
 @pytest.fixture(scope="module")
-def comparison(slippery: Path) -> Comparison:
-    (case,) = load_cases([slippery])
+def comparison(case: Case) -> Comparison:
     return compare_setting(
         case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from safevar_sumo.analysis.case import load_cases
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.campaign import local
 from safevar_sumo.report import input as report_input, make_report, page as report_page
@@ -14,14 +14,13 @@ from tests.analysis.known_regions import Plant
 
 
 @pytest.fixture(scope="session")
-def page(slippery: Path, explained: Explained) -> str:
+def page(slippery: Path, case: Case, explained: Explained) -> str:
     """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1 to 3.9."""
-    study = load_cases([slippery])[0].study
-    friction = list(study.vehicle.characteristics).index("tireFric")
+    friction = list(case.study.vehicle.characteristics).index("tireFric")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report_page, "explain_failures", lambda *_, **__: explained)
         patch.setattr(report_input, "SAMPLED_VEHICLES", 400)
-        patch.setattr(local, "LocalPool", lambda *_: Plant(study, lambda rows: rows[:, friction] < 1.5))
+        patch.setattr(local, "LocalPool", lambda *_: Plant(case.study, lambda rows: rows[:, friction] < 1.5))
         shows: list[tuple[str, int, int]] = []
         page = make_report([slippery], paper=True, jobs=1, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0

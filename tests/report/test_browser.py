@@ -19,7 +19,7 @@ from selenium.webdriver import Chrome
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 
-from safevar_sumo.analysis.case import load_cases
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.replay.animation import animate
 from safevar_sumo.replay.comparison import compare_setting
 from safevar_sumo.sumo.system import assemble
@@ -88,8 +88,7 @@ def try_player(browser: Chrome, player: object) -> None:
 
 
 @pytest.mark.slow
-def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, slippery: Path, tmp_path: Path) -> None:
-    (case,) = load_cases([slippery])
+def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, case: Case, tmp_path: Path) -> None:
     setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]
     animate(compare_setting(case.study, assemble(case.study), setting), tmp_path / "it.html")
     opened(browser, tmp_path / "it.html")

@@ -21,7 +21,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.report.dossier import FIRST_SENTENCE, MEASURES, _Dossier, value_at
 from safevar_sumo.report.measurements import check_study, count_constants, measure_validation
 from safevar_sumo.report.pack import read_pack
-from safevar_sumo.results import handles_of
+from safevar_sumo.results import handles_of, read_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -148,7 +148,7 @@ def packed(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Packed:
     folder = tmp_path_factory.mktemp("dossier")
     shutil.copytree(slippery, folder / "results" / "slippery")
     frame = pd.read_csv(slippery / "solutions.csv").head(12)
-    manifest = json.loads((slippery / "manifest.json").read_text())
+    manifest = read_manifest(slippery)
     names = list(manifest["study"]["vehicle"]["characteristics"])
     rows = frame[names].assign(SaftyDegree=frame["safety_degree"] * 1.1, TET=0.5, TIT=0.1, Dece=3.0)
     rows.to_csv(folder / "rows.csv", index=False)

@@ -22,7 +22,7 @@ from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo.ads.reference_drivers import FullBraking
-from safevar_sumo.analysis.case import load_cases
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -30,7 +30,7 @@ from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, input as report_input, make_report, page as report_page
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
 from safevar_sumo.report.sections import make_verdict
-from safevar_sumo.results.manifest import write_manifest
+from safevar_sumo.results.manifest import read_manifest, write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import searched
@@ -85,11 +85,10 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
 
 @pytest.mark.slow
 def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(
-    page: str, slippery: Path, explained: Explained
+    page: str, case: Case, explained: Explained
 ) -> None:
     places = [page.index(f'<h2 id="{name}">') for name in SECTIONS if name not in ("compare", "repair")]
     assert places == sorted(places)
-    (case,) = load_cases([slippery])
     worst = case.solutions["f_safe"].min()
     words = words_of(page)
     assert "^2" not in words
@@ -190,7 +189,7 @@ def test_an_answer_without_rows_has_no_figure(slippery: Path, monkeypatch: pytes
 @pytest.mark.parametrize("bad", ["<script>alert(1)</script>", "</script><b>\"'&{{ 7 * 7 }}"])
 def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "copy")
-    manifest = json.loads((slippery / "manifest.json").read_text())
+    manifest = read_manifest(slippery)
     manifest["study"]["title"] = bad
     write_manifest(tmp_path / "copy", manifest)
     page = make_report([tmp_path / "copy"], only=["tested", "trust", "reproduce"])

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.analysis.case import load_cases
+from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
@@ -27,7 +27,7 @@ from safevar_sumo.results import (
     solutions_frame,
     status,
 )
-from safevar_sumo.results.manifest import differences, identity_digest
+from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
 from safevar_sumo.study import Study, load_study
 from tests.campaign.formulas import with_search
 from tests.in_process import refused, run
@@ -244,7 +244,7 @@ def copied(slippery: Path, tmp_path: Path) -> Path:
 def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     number: int, release: str, copied: Path
 ) -> None:
-    manifest = json.loads((copied / "manifest.json").read_text())
+    manifest = read_manifest(copied)
     manifest["format"] = number
     manifest["versions"]["safevar_sumo"] = release
     (copied / "manifest.json").write_text(json.dumps(manifest))
@@ -269,7 +269,7 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
 )
 def test_an_edited_manifest_is_refused_with_its_key(keys: str, value: object, told: str, copied: Path) -> None:
     """A value of None deletes the key."""
-    manifest = table = json.loads((copied / "manifest.json").read_text())
+    manifest = table = read_manifest(copied)
     *parents, key = keys.split(".")
     for parent in parents:
         table = table[parent]
@@ -287,10 +287,10 @@ def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
-def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path) -> None:
+def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path, case: Case) -> None:
     assert sv.status is status
     before = contents(slippery)
-    result, (case,) = status(slippery), load_cases([slippery])
+    result = status(slippery)
     assert contents(slippery) == before
     assert result.finished
     assert result.share == 1

@@ -4,7 +4,6 @@ the encounter, or no command gives a verdict on its driving system.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +16,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Observation, Outcome, differences
+from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
@@ -128,7 +128,7 @@ def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reac
         published={},
     )
     sv.run(study, out="results/it", jobs=1)
-    engine = json.loads(Path("results/it/manifest.json").read_text())["engine"]
+    engine = read_manifest(Path("results/it"))["engine"]
     assert engine["name"] == "sumo"
     assert "'reacting'" in engine["reason"]
 
