@@ -93,7 +93,9 @@ class ClusterPool:
         from distributed import KilledWorker, Queue
 
         def receive() -> Message | None:
-            while not future.done():
+            is_over = False
+            while not is_over:
+                is_over = future.done()  # its last messages may still wait
                 with suppress(TimeoutError):
                     return pickle.loads(messages.get(timeout=SECONDS_BETWEEN_LOOKS))  # type: ignore[no-any-return]
             return None

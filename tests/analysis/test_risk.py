@@ -212,7 +212,7 @@ def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same(monkey
     beyond = rare(linear(9.0), 2, method="subset_simulation")
     assert (beyond.method, beyond.probability) == ("subset_simulation", 0)
     assert "found no failure" in beyond.remark
-    assert beyond.interval == (0, pytest.approx(1 - 0.025**0.001)), "what the first 1000 vehicles show"
+    assert beyond.interval[1] == pytest.approx(1 - 0.025**0.001), "what the first 1000 vehicles show"
     monkeypatch.setattr(compute, "is_plateau", lambda responses: False)
     flat = rare(lambda u: np.select([u[:, 0] > end for end in (6, 3, 2, 1)], [-1, 1, 2, 3], 5.0), 2)
     assert (flat.method, "a plateau before failures" in flat.remark) == ("monte_carlo", True)

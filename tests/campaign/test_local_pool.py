@@ -1,20 +1,24 @@
-"""Worker processes of this machine."""
+"""Worker processes of this machine, and of a cluster."""
 
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from queue import SimpleQueue
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
 import psutil
 import pytest
 
+from safevar_sumo.campaign.cluster import ClusterPool
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.local import LocalPool, local_pool
 from safevar_sumo.campaign.pool import (
@@ -218,3 +222,13 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
         reproduced(study_at(study, point, "test"), mass=original + 200)
         == f" --point '{point}' --set mass={original + 200}"
     )
+
+
+def test_messages_of_a_task_that_has_ended_are_received(monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting = map(pickle.dumps, (b"late", None))
+    monkeypatch.setattr("distributed.Queue", lambda *_, **__: SimpleNamespace(get=lambda timeout: next(waiting)))
+    ended = SimpleNamespace(done=lambda: True, result=bool)
+    client: Any = SimpleNamespace(submit=lambda *_, **__: ended)
+    received: list[object] = []
+    ClusterPool(client, 9.0).carry(Batch(SMOKE, ORIGINAL), received.append).result()
+    assert received == [b"late"]
