@@ -242,7 +242,7 @@ class Guard(NamedTuple):
         scalars: Collection[str] = (),
     ) -> dict[str, Any]:
         """The attributes of a result that are named in `legal`, each checked; those in `scalars` are single numbers."""
-        columns = dict[str, Any]()
+        columns = dict[str, float | np.ndarray]()
         for name, legal_numbers in legal.items():
             is_scalar, attribute = name in scalars, self.field(method, value, name)
             column = self.numbers(method, name, attribute, () if is_scalar else shape, legal_numbers)

@@ -36,7 +36,7 @@ def file_schema() -> Parameters:
     vehicle["required"].remove("characteristics")
     vehicle["if"] = FMU
     vehicle["else"] = {"properties": vehicle.pop("properties"), "required": ["characteristics"]}
-    # Any file states these as a whole: elements of lists, and tables that no study refines.
+    # A file states these as a whole: elements of lists, and tables that no study refines.
     whole_parts = [
         part for name, part in study["properties"].items() if name in WHOLE_TABLES or part.get("type") == "array"
     ]

@@ -34,7 +34,7 @@ from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, 
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import check_network, network_remarks
-from safevar_sumo.sumo.traci_controller import TraciController, substitute_traci
+from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
 from safevar_sumo.vehicles import (
     CHANGES,
     VEHICLES,
@@ -266,7 +266,7 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
         step = getattr(controller, "step", None) if is_class else controller
         if not callable(step) or not (is_class or parameters or accepts(step, 2)):
             raise InputError(lookup.source, f"{name} cannot be called as step(traci, vehicle_id)", CONTROLLER_FORMS)
-        create: Callable[[], Any]
+        create: Callable[[], Controller]
         if is_class:
             create = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
         else:

@@ -301,7 +301,7 @@ class GuardedVehicle(Vehicle):
         wet: bool | BoolArray = False,
     ) -> _Prepared:
         n = len(next(iter(characteristics.values())))
-        road: tuple[Any, ...] = () if slope is LEVEL else (slope,)
+        road: tuple[Slope | bool | BoolArray, ...] = () if slope is LEVEL else (slope,)
         if np.any(wet):
             road = slope, wet
         arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)

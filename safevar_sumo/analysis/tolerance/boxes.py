@@ -70,8 +70,7 @@ def find_safe_box(
     """The largest safe box, in which `columns` vary, around an original vehicle that is safe itself.
 
     The box ends before all of `unsafe_settings`, shape (K, n): scans found them, so that there is no need to look for
-    nearer ones on the way to them. From `unsafe_solutions`, shape (L, n), of a search the box shrinks as from unsafe
-    settings that are found here.
+    nearer ones on the way. From `unsafe_solutions`, shape (L, n), of a search it shrinks as from those found here.
 
     Notes
     -----

@@ -289,11 +289,10 @@ def find_joint_limits(
 
     Notes
     -----
-    A random search seeks the largest box that is safe at known corners, within what is safe alone. At first only one
-    corner is known, at which every characteristic has gone towards its smaller margin. A search then attacks the box,
-    at Sobol points and at other corners. The causes of what is unsafe, as few changes as possible, are further corners,
-    and the largest box is sought anew, until no search finds anything. Sides that could go further are widened. At last
-    independent settings test the box (`sample_box`).
+    A random search seeks the largest box that is safe at known corners, within what is safe alone; at first at that
+    corner alone where every characteristic has gone towards its smaller margin. A search then attacks the box. Causes
+    of what is unsafe, as few changes as possible, are further corners, and the box is sought anew until no search finds
+    anything. Sides that could go further are widened. At last independent settings test the box (`sample_box`).
     """
     unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
     search = _BoxSearch(unverified, columns, unsafe, limits, np.concatenate([unsafe_settings, unsafe_solutions]))
@@ -303,18 +302,16 @@ def find_joint_limits(
         (low, high), (low_margin, high_margin) = scan.safe or (original, original), scan.margins
         safe_alone = np.minimum(start[:, column], (original - low, high - original))
         start[:, column] = np.where(search.is_free[:, column], safe_alone, start[:, column])
-        corner[column] = 1.0
-        if low_margin is not None and (high_margin is None or low_margin < high_margin):
-            corner[column] = -1.0
+        is_low_end = low_margin is not None and (high_margin is None or low_margin < high_margin)
+        corner[column] = -1.0 if is_low_end else 1.0
     search.corners.append(corner)
     for attempt in range(1, MAX_ATTEMPTS + 1):
         kept = not len(search.attack(search.fixed))
         # The last attempt gives up: it tests the limits alone, with all others as in the original.
         sides = search.best(start) if kept and attempt < MAX_ATTEMPTS else search.fixed
         ends, stream = search.ends(sides), (evaluator.study.search.seed, 1, attempt)
-        unsafe_samples, samples, failed, at_most = sample_box(
-            evaluator, columns, unsafe, ends, attempt, stream, "test of the limits together"
-        )
+        stage = "test of the limits together"
+        unsafe_samples, count, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
         if not kept or not len(unsafe_samples):
             break
         search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_samples])
@@ -329,7 +326,7 @@ def find_joint_limits(
     return JointLimits(
         fixed=limits,
         box=box,
-        samples=samples,
+        samples=count,
         unsafe=len(unsafe_samples),
         failed=failed,
         at_most=at_most,
