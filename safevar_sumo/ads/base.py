@@ -183,7 +183,8 @@ class DelayLine(NamedTuple):
         if self.fraction:
             with np.errstate(invalid="ignore"):  # the difference of two infinities
                 mixture = newer + (older - newer) * self.fraction
-            newer = np.where(np.isfinite(mixture), mixture, older)
+            is_defined = np.isfinite(mixture)
+            newer = mixture if is_defined.all() else np.where(is_defined, mixture, older)
         return newer, DelayLine(self.steps, self.fraction, past)
 
 

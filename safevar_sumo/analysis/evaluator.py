@@ -134,8 +134,8 @@ class Evaluator:
         )
 
     def random_settings(self, number: int) -> FloatArray:
-        """The first `number` random vehicles of the study, uniform over the feasible part of the domain; `risk` draws
-        the same ones.
+        """The first `number` random vehicles of the study, uniform over the feasible part of the domain (where hardly
+        any setting is feasible, mixtures of its corners fill up); `risk` draws the same ones.
         """
         bounds, seed = self.characteristics, self.study.search.seed
         rng = np.random.default_rng(seed)

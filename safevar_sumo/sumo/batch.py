@@ -216,7 +216,10 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
 
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
-    for copy in open_rows(~np.isfinite(speed))[:1]:  # the first one, if any
+    is_finite = np.isfinite(speed)
+    if is_finite.all():
+        return
+    for copy in open_rows(~is_finite)[:1]:
         changes = [
             f"{characteristic.name} = {value:g}"
             for characteristic, value in zip(characteristics, settings[copy], strict=True)

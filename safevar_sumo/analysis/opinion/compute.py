@@ -166,7 +166,6 @@ class Opinions(Answer):
 SIMULATION_LIMIT = 12_000
 """Approximate number of simulations of the search for minimal causes, the same as for a report."""
 STAGE = "second vehicle model"
-SHARE_STEP = 0.1
 CHANGE_SHARES = np.arange(1, 10) / 10
 """Shares of a cause's changes that the second model simulates, to locate the share from which they are unsafe."""
 
@@ -248,7 +247,7 @@ def judge_causes(
             safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])  # the largest that is still safe
             because = (
                 f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[0]}. "
-                f"{safe_share:.0%} to {safe_share + SHARE_STEP:.0%} of the changes are enough with the second "
+                f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
                 f"model, {cause.fraction:.1%} with ours"
             )
         reason = _why_borderline(second_system, settings[row], cause, fails_there[row], unsafe, study.search.seed)

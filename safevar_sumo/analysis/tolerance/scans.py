@@ -55,7 +55,7 @@ class EndsAcrossFits(NamedTuple):
 
     sets: int
     range: tuple[Interval, Interval]
-    unsafe_as_new: int = 0
+    unsafe_as_new: int
 
 
 @dataclass(frozen=True, kw_only=True)
