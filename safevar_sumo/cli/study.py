@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import time
 from collections import Counter
 from contextlib import nullcontext
@@ -20,19 +19,17 @@ from rich.live import Live
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.fronts import nondominated_points
-from safevar_sumo.analysis.words import change_texts, two_decimals
+from safevar_sumo.analysis.words import question_command, two_decimals
 from safevar_sumo.api.running import ENGINES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
 from safevar_sumo.cli.program import commands, print_note, print_remarks, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
-from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
-from safevar_sumo.terminal import WholeTable, open_progress, print_text
+from safevar_sumo.terminal import WholeTable, print_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -119,7 +116,7 @@ def study(
             )
             raise
         if not quiet:
-            print_summary(Console(), loaded_study, campaign, directory, pool)
+            print_summary(Console(), loaded_study, campaign, directory)
     if not quiet:
         print_text(Console(), f"Results: {directory}")
 
@@ -192,13 +189,12 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
     console.print(table)
 
 
-def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
-    """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1
-    and RQ2 in brief.
+def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path) -> None:
+    """Print the verdict, a table of the original and of each algorithm's solutions, RQ1 and RQ2 in brief, and the next
+    two commands.
     """
     from safevar_sumo.analysis.case import build_case
-    from safevar_sumo.analysis.evaluator import Evaluator
-    from safevar_sumo.analysis.explain.compute import summarise_failures
+    from safevar_sumo.analysis.explain.answer import study_verdict
 
     # Loads more slowly than all other modules.
     from safevar_sumo.analysis.research_questions.comparisons import summary_lines
@@ -213,11 +209,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         tuple(campaign.solutions),
         scoring=campaign.scoring,
     )
-    answer = [campaign.no_verdict] if campaign.no_verdict else []
-    if len(solutions):
-        with open_progress(True) as progress:
-            answer += summarise_failures(case, campaign.original, Evaluator(study, pool, progress), str(directory))
-    for line in answer:
+    for line in [campaign.no_verdict] if campaign.no_verdict else study_verdict(case, campaign.original):
         print_text(console, line)
     console.print(_summary_table(study, campaign, solutions))
     lines = SAFETY_NOTE.splitlines()
@@ -231,18 +223,8 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
             "they are neither failures nor successes, and no result contains them."
         )
-    if solutions.empty:
-        lines.append("No solution.")
-    else:
-        worst = solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").iloc[0]
-        lines.append(
-            f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
-            f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:"
-        )
-        changes = change_texts(case.characteristics, {name: worst[name] for name in names})
-        lines += [f"  {change}" for change in changes or ["no change"]]
-    command = f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}"
-    for line in (*lines, *summary_lines(case), command):
+    commands = (question_command(name, str(directory)) for name in ("explain", "tolerance"))
+    for line in (*lines, *summary_lines(case), f"Next: {', '.join(commands)}"):
         print_text(console, line)
 
 

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
-from safevar_sumo.analysis.explain.answer import Explained
+from safevar_sumo.analysis.explain.answer import Explained, study_verdict
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
@@ -30,7 +30,7 @@ from safevar_sumo.analysis.explain.causes import (
     necessity_frame,
     select_affordable_rows,
 )
-from safevar_sumo.analysis.explain.compute import explain_failures, summarise_failures
+from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -136,43 +136,24 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 
 
 @pytest.mark.slow
-def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
-    """It is the answer of `explain` without the other fitted models: the same failures, the same cause of each."""
-    evaluator = Evaluator(case.study, InlinePool())
-    alone = explain_failures(case, ExplainOptions(fits=0), evaluator)
-    paragraph, count, *others, more = summarise_failures(case, evaluator.evaluate_original(), evaluator, "my results")
-    assert_tells_a_manager(paragraph, explained)
-    assert [paragraph, count] == alone.sentences()[:2]
-    for failure in explained.choices:
-        start = f"{failure.title.capitalize()}: {failure.handle}, {failure.effect}. "
-        (line,) = [line for line in others if line.startswith(start)]
-        assert failure.cause is not None
-        assert re.findall(r"(\w+) [\d.]+ -> ", line.partition(" alone cause it: ")[2]) == list(failure.cause.changes)
-    assert more == "Causes and limits: python -m safevar_sumo explain 'my results'"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("least", "most"), [(0.6, 2.0), (0.3, 2.0), (0.6, 0.9)])
-def test_where_nothing_collides_the_verdict_says_so_first(case: Case, least: float, most: float) -> None:
-    """Half of the original's distance is a screening limit: what is below it is no failure, whatever its robustness."""
-    evaluator = Evaluator(case.study, InlinePool())
-    original = evaluator.evaluate_original()
+@pytest.mark.parametrize("collides", [True, False])
+def test_a_study_ends_with_how_many_of_its_solutions_are_unsafe_and_with_the_fewest_changes(
+    case: Case, collides: bool
+) -> None:
+    original = Evaluator(case.study, InlinePool()).evaluate_original()
     degree = float(original.f_safe[0])
-    few = case.solutions[case.solutions["f_safe"].between(least * degree, most * degree)].reset_index(drop=True)
-    first, count, *_, more = summarise_failures(replace(case, solutions=few), original, evaluator, "out")
-    distinct = few.drop_duplicates(list(case.characteristics.names))
+    solutions = case.solutions if collides else case.solutions[case.solutions["f_safe"] > 0.3 * degree]
+    first, *fewest = study_verdict(replace(case, solutions=solutions.reset_index(drop=True)), original)
+    distinct = solutions.drop_duplicates(list(case.characteristics.names))
+    unsafe = distinct[distinct["outcome"] == "collision" if collides else distinct["f_safe"] < degree / 2]
+    counts = f"{len(unsafe)} of {len(distinct)} different solutions of the search are unsafe: "
     assert first.startswith(
-        f"No collision in {len(distinct)} vehicles; the worst stops {few['f_safe'].min():.2f} m short of the "
-        f"pedestrian, the original {degree:.2f} m, with the weather 'wet leaves'. "
+        f"With the weather 'wet leaves', the original vehicle stops {degree:.2f} m short of the pedestrian. {counts}"
     )
-    below, collisions = int((distinct["f_safe"] < degree / 2).sum()), (case.evaluations["outcome"] == "collision").sum()
-    assert count == (
-        f"{below} of {len(distinct)} different vehicles are unsafe: safety degree below {degree / 2:.3g} m "
-        "(half of the original's, a screening limit). "
-        f"The search also simulated {collisions} collisions, which its objectives leave out."
-    )
-    assert ("Nothing unsafe was found." in first) is (below == 0)
-    assert more.endswith(f": python -m safevar_sumo {'explain' if below else 'tolerance'} out")
+    least = unsafe.sort_values(["f_num_diff", "f_safe"]).iloc[0]
+    (line,) = fewest
+    assert f"{abs(least['f_safe']):.2f} m" in line
+    assert len(re.findall(r" -> ", line)) == least["f_num_diff"]
 
 
 COLLISION = Unsafe()

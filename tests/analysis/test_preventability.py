@@ -4,7 +4,6 @@ what makes a changed vehicle brake worse than the original, in parts of the lost
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -26,7 +25,7 @@ from safevar_sumo.analysis.explain.causes import (
     estimate_robustness,
     find_smallest_robust_failure,
 )
-from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, summarise_failures
+from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points
 from safevar_sumo.analysis.preventability import (
     Preventability,
     PreventableBy,
@@ -40,7 +39,7 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from tests.analysis.known_regions import box, made_up_evaluator
 from tests.in_process import InlinePool
-from tests.made_up import case_of, made_up_runs, original_of
+from tests.made_up import made_up_runs, original_of
 
 COLLISION = Unsafe()
 
@@ -212,30 +211,6 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
     )
     least = failure[0]._replace(parts={"gap": MIN_PART, "remainder": 0.0})
     assert f" {MIN_PART:.2f} m because" in str(least)
-
-
-@pytest.mark.slow
-def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
-    system: System, weak: FloatArray, failure: PointComparison
-) -> None:
-    """The original vehicle has one safety degree, that at its worst point; that at another point stands with the
-    point's name.
-    """
-    study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
-    original = evaluate(system, original_of(system))
-    case = case_of(study, original, evaluate(system, weak))
-    first, count, there, *_, more = summarise_failures(case, original, Evaluator(case.study, InlinePool()), "out")
-    assert first == (
-        "At the worst of 5 test points, the original vehicle passes with a safety degree of "
-        f"{original.f_safe[0]:.2f} m."
-    )
-    assert count == "1 of 1 different vehicles are unsafe: collision."
-    degree = float(re.findall(r"safety degree (.*?) m;", str(failure[0]))[0])
-    assert degree > original.f_safe[0] + 0.01
-    assert there.startswith(
-        f"At {failure[0].point}, the original vehicle stops {degree:.2f} m short of the pedestrian. "
-    )
-    assert more.endswith(f": python -m safevar_sumo explain out --point '{failure[0].point}'")
 
 
 STEP, OBSTACLE = 0.002, 20.0

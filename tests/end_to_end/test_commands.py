@@ -62,7 +62,7 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
         "RQ2",
         "against the original vehicle: SD",
         "too few runs for a test (8 are needed)",
-        "python -m safevar_sumo tables results/smoke",
+        "Next: python -m safevar_sumo explain results/smoke, python -m safevar_sumo tolerance results/smoke",
     ):
         assert part in output
 

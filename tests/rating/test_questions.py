@@ -14,7 +14,8 @@ import pytest
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures, summarise_failures
+from safevar_sumo.analysis.explain.answer import study_verdict
+from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.plugins.check import check
@@ -74,7 +75,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_that_are_lost() -> None:
+def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_points_that_are_kept() -> None:
     evaluator = Evaluator(STUDY, TwoWorkers())
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
@@ -87,9 +88,10 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     assert failure.points
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
-    lines = summarise_failures(case, original, evaluator, "it")
-    assert f"the original vehicle earns {points:.2f} points" in lines[0]
-    assert f"Most points lost: nsga2:0:0 keeps {evaluations.column('rating_points')[0]:.2f} points" in "".join(lines)
+    situation, fewest = study_verdict(case, original)
+    assert f"the original vehicle earns {points:.2f} points" in situation
+    kept = evaluations.column("rating_points")[case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]]
+    assert fewest.startswith(f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> ")
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

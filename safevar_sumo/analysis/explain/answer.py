@@ -10,13 +10,22 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.explain.across_fits import AcrossFits
 from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation, speed_in_words
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.preventability import Preventability
-from safevar_sumo.analysis.words import OUTCOME_VERBS, list_of_changes, number_of, question_command, simulate_command
+from safevar_sumo.analysis.words import (
+    OUTCOME_VERBS,
+    ending_in_words,
+    list_of_changes,
+    number_of,
+    question_command,
+    simulate_command,
+)
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations, JsonObject, Outcome
+from safevar_sumo.results import CHOICES
 from safevar_sumo.scenarios import distance_in_words, equals_clear, weather_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
@@ -161,17 +170,6 @@ class Explained(Answer):
             ]
         return sentences
 
-    def choices_in_words(self) -> list[str]:
-        """A sentence for each failure that was chosen by its size or severity: its effect, and the cause that is
-        named.
-        """
-        return [
-            f"{failure.title.capitalize()}: {failure.name}, {failure.effect}. These changes alone cause it: "
-            f"{list_of_changes(failure.characteristics, failure.cause.changes)}."
-            for failure in self.choices
-            if failure.cause
-        ]
-
     def parts(self, subject: str, point: str = "", *, full: bool = False) -> Iterator[str | Table]:
         """The answer in about ten lines; `full` adds every chosen failure. Commands name `subject` and `point`."""
         yield from self.sentences()
@@ -298,6 +296,27 @@ def situation_in_words(
         f"No collision in {number_of(number, 'vehicle')}; the worst {_ending_in_words(system, nearest)}, "
         f"the original {ending}, {place[0].lower()}{place[1:]}."
     )
+
+
+def study_verdict(case: Case, original: Evaluations) -> list[str]:
+    """How a study ends, from its solutions: the situation, how many solutions are unsafe, and how little is enough."""
+    system, unsafe, names = assemble(case.study), case.unsafe, list(case.characteristics.names)
+    if original.collided[0] and not system.rater:
+        return ["The original vehicle itself collides: no change is needed."]
+    solutions = case.solutions.drop_duplicates(names)
+    if solutions.empty:
+        return ["No solution."]
+    failures = solutions[unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
+    counts = f"{len(failures)} of {number_of(len(solutions), 'different solution')} of the search are unsafe"
+    sentences = [f"{situation_in_words(system, original)} {counts}: {unsafe.description}."]
+    if len(failures):
+        fewest = failures.iloc[0]
+        ending = ending_in_words(fewest["outcome"], fewest["f_safe"])
+        if system.rater:
+            ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
+        changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})
+        sentences.append(f"With the fewest changes it {ending}: {changes}.")
+    return sentences
 
 
 def _place_in_words(system: System) -> str:

@@ -10,13 +10,12 @@ from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from safevar_sumo.analysis.case import Case, are_collisions
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
-from safevar_sumo.analysis.explain.answer import Explained, situation_in_words
+from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking
 from safevar_sumo.analysis.explain.causes import (
     STEP_FACTORS,
@@ -33,13 +32,11 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
-from safevar_sumo.analysis.subject import at_point
-from safevar_sumo.analysis.words import list_of_changes, question_command
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
-from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, choose_handle, handles_of, row_of_handle
+from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
@@ -48,8 +45,6 @@ Reasons = dict[int, tuple[str, ...]]
 """The rows of the chosen failures, with the reasons for their choice."""
 SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
 """Number of settings drawn from the whole domain if there are no results, in an unrated and in a rated study."""
-RATED_CHOICES = {"fewest": "Fewest changes", "smallest": "Smallest largest change", "most_points": "Most points lost"}
-"""Titles of the solutions of a rated study that its summary names, by the name of the choice in `CHOICES`."""
 
 
 def explain_failures(
@@ -303,62 +298,3 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
         worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
         comparisons.append((compare_braking(runs, 1, evaluations.f_safe, point.name), worse_cells))
     return comparisons
-
-
-def summarise_failures(case: Case, original: Evaluations, evaluator: Evaluator, directory: str) -> list[str]:
-    """Summarise results in lines: the verdict first, the command for the next step last.
-
-    In a study with a test matrix, the failures are those at one point: the worst point of the failure with the fewest
-    changes.
-
-    Parameters
-    ----------
-    original
-        The original vehicle's evaluation.
-    evaluator
-        Simulates subsets of the solutions' changes.
-    directory
-        The directory of the results, for the command.
-    """
-    study, solutions, names, unsafe = case.study, case.solutions, list(case.characteristics.names), case.unsafe
-    system, lines, point = assemble(study), list[str](), ""
-    if original.collided[0] and not is_rated(study):
-        return ["The original vehicle itself collides: no change is needed."]
-
-    def choose(choice: str) -> tuple[SolutionId, pd.DataFrame]:
-        """The handle of the solution that a choice selects, and the solution, a frame of one row."""
-        handle = choose_handle(solutions, unsafe, choice, study.name)
-        return handle, solutions.iloc[[row_of_handle(solutions, handle)]]
-
-    any_unsafe = bool(unsafe.rows(solutions).any())
-    if system.matrix:
-        distinct = solutions.drop_duplicates(names)
-        least_safe = None
-        if not is_rated(study):
-            _, solution = choose("most_severe")
-            least_safe = evaluator.evaluate(solution[names].to_numpy(float), "worst points")
-        lines = [
-            situation_in_words(system, original, least_safe, len(distinct)),
-            f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: "
-            f"{unsafe.description}.",
-        ]
-        if any_unsafe and is_rated(study):
-            for choice, title in RATED_CHOICES.items():
-                handle, solution = choose(choice)
-                ((points, *values),) = solution[[RATING_POINTS.name, *names]].to_numpy(float)
-                changes = list_of_changes(case.characteristics, dict(zip(names, values, strict=True)))
-                lines.append(f"{title}: {handle} keeps {points:.2f} points with {changes}.")
-        elif any_unsafe:
-            _, solution = choose("fewest")
-            worst = evaluator.evaluate(solution[names].to_numpy(float), "worst points").worst_points
-            assert worst is not None
-            point = system.points[worst[0]].name
-            case = at_point(case, point)
-    if point or not system.matrix:
-        explained = explain_failures(case, ExplainOptions(), evaluator.for_study(case.study), statistics=False)
-        lines += [" ".join(explained.verdict), f"{'There, ' if point else ''}{explained.counts}"]
-        lines += explained.choices_in_words()
-    if not any_unsafe:
-        return [*lines, f"How far each characteristic may go: {question_command('tolerance', directory)}"]
-    where = f", at that point (without --point: at all {len(system.points)}, which takes long)" if point else ""
-    return [*lines, f"Causes and limits{where}: {question_command('explain', directory, point)}"]
