@@ -34,7 +34,7 @@ def predict(forest: RandomForestRegressor, characteristics: CharacteristicSet, s
     """Evaluations with the forest's safety degrees of settings, shape (M, n); other metrics are undefined."""
     undefined = np.full(len(settings), np.nan)
     metrics = dict.fromkeys(METRICS, undefined) | {SAFETY_DEGREE: forest.predict(settings)}
-    return evaluations_of(ReferenceData(settings, metrics, skipped=0), characteristics)
+    return evaluations_of(ReferenceData(settings, metrics), characteristics)
 
 
 def search(evaluate: Evaluate, characteristics: CharacteristicSet, evaluations: int, runs: int) -> Evaluations:

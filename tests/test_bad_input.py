@@ -22,12 +22,6 @@ FILES = {
     "other/manifest.json": '{"study": {}, "versions": {}, "original": {}}',
     "results/smoke/manifest.json": "{}",
 }
-CALIBRATED = {
-    "original": "vehicle.characteristics.mass.original",
-    "name": "weather.name",
-    "friction": "weather.road_friction",
-}
-"""Keys that no calibration may change, or not so far; one study file each."""
 TYPED = [
     ("study sum", "'sum'; did you mean 'sun'?"),
     ("study sun --out /proc/nowhere", "--out: cannot write to /proc/nowhere"),
@@ -106,7 +100,6 @@ TYPED = [
     ("import sun --out out --nsga2 .", "Is a directory"),
     ("validate sun none.csv --jobs 1025", "see python -m safevar_sumo validate --help"),
     ("validate sun none.csv", "none.csv: cannot be read: No such file or directory"),
-    ("replicate folder --published nowhere", "folder: is not a results directory"),
     ("evidence folder --reference none.csv --out x.zip", "File 'none.csv' does not exist"),
     ("evidence folder --out x.zip", "folder: is not a results directory"),
     ("evidence folder --out it.tar", ".zip"),
@@ -115,10 +108,6 @@ TYPED = [
     ("verify none.zip", "none.zip: cannot be read: No such file or directory"),
     ("export file --solution nsga2:0:0 --to carla --out x", "file: is a study and has no solutions"),
     ("simulate euro_ncap_pedestrian --point CPNA", "72 points, such as CPNA, speed 10"),
-    ("calibrate original.toml --trials 1 --out x.toml", "vehicle.characteristics.mass.original"),
-    ("calibrate friction.toml --trials 1 --out x.toml", "lower = -3"),
-    ("calibrate sun mine.csv --trials 1 --out mine.csv", "mine.csv"),
-    ("calibrate name.toml --trials 1 --out name.toml", "--out: name.toml is an input of the command"),
 ]
 
 
@@ -126,11 +115,7 @@ TYPED = [
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with something wrong of every kind."""
     folder = tmp_path_factory.mktemp("bad")
-    rows = 'lower = -3, upper = 3, unit = "-", meaning = "none"'
-    tables = {
-        f"{name}.toml": f'extends = "sun"\n[calibration]\n"{key}" = {{ {rows} }}\n' for name, key in CALIBRATED.items()
-    }
-    for name, text in {**FILES, **tables}.items():
+    for name, text in FILES.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
     for name in ("folder", "folder.csv", "folder.png"):

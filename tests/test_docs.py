@@ -126,7 +126,10 @@ def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() 
 def test_every_file_of_code_that_is_named_exists() -> None:
     """In a page, a study or the package; a page may also make the file that it names."""
     code = [*(ROOT / "studies").rglob("*.toml"), *(ROOT / "safevar_sumo").rglob("*.py")]
-    there = [*code, *(path for folder in ("benchmarks", "docs", "tests") for path in (ROOT / folder).rglob("*.py"))]
+    there = [
+        *code,
+        *(path for folder in ("benchmarks", "calibration", "docs", "tests") for path in (ROOT / folder).rglob("*.py")),
+    ]
     for file in ["CONTRIBUTING.md", *PAGES, *(str(path.relative_to(ROOT)) for path in code)]:
         made = {block.title for block in blocks(file)}
         for name in re.findall(

@@ -133,13 +133,11 @@ def studies_of_sets(study: Study) -> list[Study]:
         If the study has no parameter sets, or lacks a parameter that they name.
     """
     if not study.spread:
-        raise InputError(
-            study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain"
-        )
+        raise InputError(study.source, "has no table [spread]", "a study that was fitted to data, such as sun or rain")
     outside_names = parameters_outside_sets(study)
     sets = {key: values[1:] for key, values in study.spread.items() if key not in outside_names}
     number = len(next(iter(study.spread.values()))) - 1
-    return [study, *(with_values(study, {key: sets[key][k] for key in sets}, "spread") for k in range(number))]
+    return [study, *(with_values(study, {key: sets[key][k] for key in sets}) for k in range(number))]
 
 
 def parameters_outside_sets(study: Study) -> list[str]:
@@ -150,7 +148,7 @@ def parameters_outside_sets(study: Study) -> list[str]:
     return [
         key
         for key, values in study.spread.items()
-        if not np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)
+        if not np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)
     ]
 
 
@@ -162,10 +160,8 @@ def remarks_on_sets(study: Study) -> list[str]:
     ]
 
 
-def with_values(study: Study, values: Mapping[str, float], stated_in: str = "calibration") -> Study:
+def with_values(study: Study, values: Mapping[str, float]) -> Study:
     """A study with other values of some parameters, which are named by their keys in the study file.
-
-    Errors name the table `stated_in`, which has the values.
 
     Raises
     ------
@@ -174,14 +170,14 @@ def with_values(study: Study, values: Mapping[str, float], stated_in: str = "cal
     """
     tables = _as_tables(study)
     for name, value in values.items():
-        table, key = _locate(study, tables, name, stated_in)
+        table, key = _locate(study, tables, name)
         table[key] = value
     return convert_table(study.source, tables, Study)
 
 
-def value_of(study: Study, name: str, stated_in: str = "calibration") -> float:
+def value_of(study: Study, name: str) -> float:
     """The value of a parameter in the study."""
-    table, key = _locate(study, _as_tables(study), name, stated_in)
+    table, key = _locate(study, _as_tables(study), name)
     return float(table[key])
 
 
@@ -190,9 +186,9 @@ def _as_tables(study: Study) -> Any:
     return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
 
 
-def _locate(study: Study, tables: Any, name: str, stated_in: str) -> tuple[Any, int | str]:
+def _locate(study: Study, tables: Any, name: str) -> tuple[Any, int | str]:
     """The table or list that holds a parameter, and the parameter's key or index in it."""
     place = locate_parameter(tables, name)
     if place is None:
-        raise missing_parameter(study.source, stated_in, name)
+        raise missing_parameter(study.source, name)
     return place

@@ -66,8 +66,6 @@ COMMANDS_BY_GROUP = {
     "Published data": {
         "import": ("reference", "Import published CSV solutions as a results directory."),
         "validate": ("reference", "Compare a study with reference data, row by row."),
-        "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
-        "calibrate": ("calibrate", "Fit a study's free parameters to reference data."),
     },
 }
 """Each command's module in this folder and its sentence in the help, by the title of its group, in the order of the

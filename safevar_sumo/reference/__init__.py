@@ -1,3 +1,1 @@
-"""Reference data: reading, comparison with a study, calibration, import as results."""
-
-from safevar_sumo.reference.agreement import Totals as Totals, shipped_totals_of as shipped_totals_of
+"""Published data: reading it, comparing a study with it, importing it as results."""

@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.analysis.subject import Results, load
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
-from safevar_sumo.results import UNKNOWN
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.results import MANIFEST, UNKNOWN, write_imported
+from safevar_sumo.study import SAFETY_DEGREE, StudyLike, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
@@ -49,15 +50,12 @@ class ReferenceData(NamedTuple):
         table.
     metrics
         Name -> values, shape (M,). TET and TIT of a collision are NaN, and so are metrics without a column.
-    skipped
-        Number of rows left out because a value lies outside its domain.
     fingerprint
         SHA-256 of the file's bytes.
     """
 
     settings: FloatArray
     metrics: dict[str, FloatArray]
-    skipped: int
     fingerprint: str = ""
 
     @property
@@ -72,7 +70,7 @@ class ReferenceData(NamedTuple):
 
 
 def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
-    """Read a file of the published package.
+    """Read a file of the published package; rows with values outside the domains are left out, with a warning.
 
     Raises
     ------
@@ -114,15 +112,12 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         raise InputError(
             path, "has no row whose values are all in the domains of the study", "a file of this study's vehicle"
         )
+    if skipped := np.count_nonzero(~is_in_domain):
+        warn(f"{path}: {skipped} rows with values outside the domains are left out")
     metrics = {name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS}
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
     metrics |= {name: np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name]) for name in ("tet", "tit")}
-    return ReferenceData(
-        package_filter(characteristics, settings[is_in_domain]),
-        metrics,
-        int(np.sum(~is_in_domain)),
-        sha256(content).hexdigest(),
-    )
+    return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics, sha256(content).hexdigest())
 
 
 def _plain_name(name: str) -> str:
@@ -149,13 +144,6 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
     return np.where(share >= characteristics.threshold / width - ROUNDING_ERROR, settings, characteristics.original)
 
 
-METRIC_NAMES = {
-    accepted_name: metric.name for metric in METRICS.values() for accepted_name in (metric.name, metric.title.lower())
-}
-"""Names of metrics by each name that a command accepts."""
-ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
-
-
 def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> Evaluations:
     """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method section 3)."""
     return Evaluations(
@@ -168,29 +156,51 @@ def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> E
     )
 
 
-def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[str, float | None]:
-    """Metrics of the original vehicle: those in `text` (sd=2.7,tet=1.2,...), else the published ones; None without a
-    value.
+def import_published(
+    study: StudyLike,
+    out: str | Path,
+    *,
+    nsga2: str | Path | None = None,
+    rs: str | Path | None = None,
+    safe_fuzzer: str | Path | None = None,
+    original: Mapping[str, float] | None = None,
+) -> Results:
+    """Import published CSV solutions of a study as a results directory, or add another algorithm's solutions to it.
+
+    Parameters
+    ----------
+    study
+        A study, or anything that `load_study` accepts.
+    out
+        Directory of the results.
+    nsga2, rs, safe_fuzzer
+        Files with the solutions of NSGA-II, random search and SafeFuzzer.
+    original
+        The original vehicle's metrics, such as {"safety_degree": 2.7}; by default those of earlier imports into the
+        directory, or else those published for the study.
 
     Raises
     ------
     InputError
-        If `text` has another form, or there is no safety degree.
+        If the study or a file cannot be used, no file is given, or the original vehicle's safety degree is unknown.
     """
-    original: dict[str, float | None] = {name: published.get(name) for name in METRICS}
-    given: dict[str, float] = {}
-    try:
-        for assignment in text.split(",") if text is not None else ():
-            word, _, number = assignment.partition("=")
-            name = METRIC_NAMES[word.strip()]
-            lowest, highest = RANGES[name]
-            if name in given or not lowest <= float(number) <= highest:
-                raise ValueError
-            given[name] = float(number)
-    except (KeyError, ValueError):
-        raise InputError(
-            "original", f"{assignment!r} in {text!r}", f"{ORIGINAL_FORM}: each metric once, in its range"
-        ) from None
-    if (original | given)[SAFETY_DEGREE] is None:
-        raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)
-    return original | given
+    loaded_study, directory = load_study(study), Path(out)
+    given = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
+    files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
+    if not files:
+        raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
+    metrics = None
+    if original is not None or not (directory / MANIFEST).exists():
+        metrics = {name: {**loaded_study.published, **(original or {})}.get(name) for name in METRICS}
+        if metrics[SAFETY_DEGREE] is None:
+            problem = "the study has no published values of the original vehicle"
+            raise InputError(study, problem, "them as `original`, at least the safety degree")
+    characteristics = CharacteristicSet.of(loaded_study)
+    solutions = {
+        algorithm: evaluations_of(read_reference(path, characteristics), characteristics)
+        for algorithm, path in files.items()
+    }
+    names = {algorithm: path.name for algorithm, path in files.items()}
+    for name, count in write_imported(directory, loaded_study, solutions, metrics, names).items():
+        warn(f"{directory}: {count} solutions of {name} of an earlier import are replaced")
+    return load(directory)

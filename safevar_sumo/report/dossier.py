@@ -162,7 +162,7 @@ class _Dossier:
 
     @property
     def level(self) -> str:
-        return OF_MODEL if self.study.calibration or self.study.spread else ASSUMED
+        return OF_MODEL if self.study.spread else ASSUMED
 
     def _say(self, source: str, text: str, level: str = "", at: str = "") -> Statement:
         """A statement whose text has fields, which are paths in a source's JSON below `at`."""

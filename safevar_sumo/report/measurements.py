@@ -21,7 +21,7 @@ from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.reference.agreement import rank_correlation
-from safevar_sumo.reference.effects import is_held_back, measure_coverage
+from safevar_sumo.reference.effects import HOLD_OUT, is_held_back, measure_coverage
 from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.results import record
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -62,15 +62,15 @@ def measure_validation(here: FloatArray, there: FloatArray) -> dict[str, float |
             "mean_absolute_error": np.mean(np.abs(error)),
         }
     numbers = {name: finite_or_none(float(value)) for name, value in measures.items()}
-    return {**numbers, "spearman": rank_correlation(here, there)}
+    return {**numbers, "spearman": finite_or_none(rank_correlation(here, there))}
 
 
 def validate_with(study: Study, reference: Path, pool: Pool, progress: Progress = show_no_progress) -> JsonObject:
     """The measures of the safety degree on the rows of a reference file that a fit uses, and on those held back."""
     data = read_reference(reference, CharacteristicSet.of(study))
     here = Evaluator(study, pool, progress).evaluate(data.settings, reference.name, ignore_constraints=True).f_safe
-    there, held_back = data.metrics[SAFETY_DEGREE], is_held_back(data, study.fit.hold_out)
-    result: JsonObject = {"file": reference.name, "sha256": data.fingerprint, "hold_out": study.fit.hold_out}
+    there, held_back = data.metrics[SAFETY_DEGREE], is_held_back(data)
+    result: JsonObject = {"file": reference.name, "sha256": data.fingerprint, "hold_out": HOLD_OUT}
     coverage = measure_coverage(data, study) if study.spread else None
     for name, rows in (("used", ~held_back), ("held_back", held_back)):
         defined = rows & np.isfinite(here) & np.isfinite(there)
@@ -142,7 +142,7 @@ def count_constants(study: Study) -> dict[str, int]:
     tables = [resolved["weather"], *(resolved[name]["parameters"] for name in ("vehicle", "ads", "scenario"))]
     ends = 3 * len(study.vehicle.characteristics)  # original, lower and upper
     published = ends + len(study.published) + len(study.repeatability)
-    fitted = len({*study.calibration, *study.spread})
+    fitted = len(study.spread)
     return {"published": published, "fitted": fitted, "assumed": max(_count_numbers(tables) - fitted, 0)}
 
 

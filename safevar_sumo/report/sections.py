@@ -23,7 +23,7 @@ from safevar_sumo.analysis.research_questions.tables import BoldText
 from safevar_sumo.analysis.words import number_of, points_in_words, question_command
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.reference import shipped_totals_of
+from safevar_sumo.reference.agreement import shipped_agreement
 from safevar_sumo.replay.comparison import format_number, list_differences
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import read_manifest
@@ -241,22 +241,14 @@ def _name_and_sentence(models: Mapping[str, type], name: str) -> str:
 
 def describe_agreement(study: Study) -> JsonObject | None:
     """How well a study agrees with each file of published data, as a table; None if there is no data."""
-    rows = {
-        f"{file}: {entry.rows} vehicles simulated again": {
-            "rank correlation": entry.spearman.get(SAFETY_DEGREE),
-            "mean error [m]": entry.mean_absolute_error.get(SAFETY_DEGREE),
-            "collisions there": entry.collisions["reference"],
-            "here": entry.collisions["here"],
-            "in both": entry.collisions["both"],
-            "recall": entry.recall,
-            "precision": entry.precision,
-        }
-        for file, entry in shipped_totals_of(study).items()
-    }
-    if not rows:
+    frame = shipped_agreement(study).drop(columns="study").set_index("file")
+    if frame.empty:
         return None
-    frame = pd.DataFrame.from_dict(rows, "index").sort_values("collisions there", ascending=False, kind="stable")
-    return table_data(frame.round(2).rename_axis("published data"), "Agreement with published data: safety degrees")
+    frame = frame.sort_values("collisions_reference", ascending=False, kind="stable").round(2)
+    return table_data(
+        frame.rename(columns=lambda name: name.replace("_", " ")).rename_axis("published data"),
+        "Agreement with published data: safety degrees [m]",
+    )
 
 
 def describe_limits(data: ReportInput, explained: Explained | None) -> JsonObject:

@@ -33,8 +33,6 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "title",
     "published",
     "repeatability",
-    "fit",
-    "calibration",
     "spread",
     "model_error",
     "variation",

@@ -19,7 +19,6 @@ from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,
     SAFETY_DEGREE as SAFETY_DEGREE,
-    FitTable as FitTable,
     FreeParameter as FreeParameter,
     MatrixTable as MatrixTable,
     MatrixTest as MatrixTest,
@@ -38,7 +37,6 @@ from safevar_sumo.study.schema import (
     tables_of as tables_of,
 )
 from safevar_sumo.study.validation import (
-    FITTED_TABLES as FITTED_TABLES,
     convert_table as convert_table,
     locate_parameter as locate_parameter,
     missing_parameter as missing_parameter,

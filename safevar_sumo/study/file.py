@@ -37,7 +37,7 @@ from safevar_sumo.study.validation import (
     raise_mistakes,
 )
 
-WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
+WHOLE_TABLES = ("published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
 SYSTEM_KEYS = ("title", "published", "repeatability")
 """Keys that describe one combination of vehicle, ADS, scenario, network, weather and matrix: a study does not inherit

@@ -23,7 +23,6 @@ from safevar_sumo.study.characteristics import (
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
-Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 Tables = Mapping[str, Any]
@@ -176,18 +175,16 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A parameter to calibrate: its bounds `lower` and `upper` in `unit`, and its `meaning`.
+    """A parameter that may change: its bounds `lower` and `upper` in `unit`, and its `meaning`.
 
-    Studies that are fitted together share one fitted value if their files state the same value; with `own`, a study has
-    its own. The search measures distances of values as differences, or with `log` as ratios, for positive quantities of
-    unknown magnitude.
+    The search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown
+    magnitude.
     """
 
     lower: float
     upper: float
     unit: str
     meaning: str
-    own: bool = False
     log: bool = False
 
 
@@ -220,48 +217,6 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     remarks: tuple[str, ...] = ()
 
 
-class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How free parameters are fitted: the weights in the loss, the rows used, and the starts of the search.
-
-    The loss adds two parts; for a metric m, w_m is the weight in `weights`:
-
-    - `original` * mean_m(w_m 2 max(miss_m / (`tolerance` * published_m) - 1, 0)), where miss_m is |value - published_m|
-      of the original vehicle;
-    - the mean, over the files of published data, of sum_m(w_m (`rank` (1 - rho_m) + mean |error_m| / unit_m)) +
-      `effects` * mean_c |difference of the safety degree's linear effects over the domain of characteristic c| / unit +
-      `collisions` * share of rows that collide on one side only. rho_m is the rank correlation; a unit is the study's
-      repeatability or, if unknown, the standard deviation of the data.
-
-    The loss of studies that are fitted together is the mean of their losses. One of every `hold_out` rows is only
-    reported, not fitted. Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well:
-    they become the study's `spread`.
-
-    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own
-    values and from `starts` random places in the bounds; the worse half gives up after every round. With an `ensemble`
-    of 2 or more, each random start is an ensemble Kalman inversion of so many places, and the search begins at its best
-    place and in its covariance; all inversions have half the trials at most. A search around known values has a third
-    of the `population`. `seed` is the seed of all random numbers; with `repeats`, all this is repeated with the next
-    seeds, the lowest loss counts, and the best set of every repetition that fits equally well is in the `spread`.
-    """
-
-    trials: PositiveInt = 1200
-    seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    repeats: Annotated[int, Meta(ge=1, le=100)] = 1
-    starts: Annotated[int, Meta(ge=0, le=1000)] = 0
-    ensemble: Annotated[int, Meta(ge=0, le=100_000)] = 0
-    population: Annotated[int, Meta(ge=4, le=1000)] = 14
-    hold_out: Annotated[int, Meta(ge=2, le=1000)] = 2
-    tolerance: Annotated[float, Meta(gt=0, le=1)] = 0.05
-    original: Weight = 1.0
-    rank: Weight = 5.0
-    collisions: Weight = 10.0
-    effects: Weight = 0.0
-    alike: Annotated[float, Meta(ge=0, le=1)] = 0.05
-    weights: dict[str, Weight] = msgspec.field(
-        default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5}
-    )
-
-
 class EvidenceTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """Thresholds that the user declares for measures of validation, before they are computed; no verdict of ours."""
 
@@ -292,14 +247,13 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `step_length` is the simulation's time step [s], by default the time step in the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as known;
     `repeatability` are standard deviations of repeats of one setting in the published study;
-    `calibration` are the free parameters by their keys in the file, such as `ads.parameters.corridor`, `fit` states how
-    they are fitted, `spread` are sets of their values that fit the published data equally well, a list for each
-    parameter, the study's own value first; `model_error` is the model's further error, by metric, for a vehicle that
-    differs from the original by the full width of a domain; `variation` and `correlations` state how characteristics
-    vary in the world, by name: uniformly by default; `constraints` are conditions that the characteristics of one
-    vehicle satisfy together; `limits` are the values, by name, up to which characteristics may wear in service;
-    `repair` states what a repair of the ADS may change; `evidence` holds thresholds
-    that the user declares for a dossier.
+    `spread` are sets of values of parameters, by their keys in the file, such as `ads.parameters.corridor`, that fit
+    the published data equally well, a list for each parameter, the study's own value first; `model_error` is the
+    model's further error, by metric, for a vehicle that differs from the original by the full width of a domain;
+    `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
+    `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits` are the values, by
+    name, up to which characteristics may wear in service; `repair` states what a repair of the ADS may change;
+    `evidence` holds thresholds that the user declares for a dossier.
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
@@ -318,8 +272,6 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: dict[str, float] = {}
     repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}
-    fit: FitTable = msgspec.field(default_factory=FitTable)
-    calibration: dict[str, FreeParameter] = {}
     spread: dict[str, list[float]] = {}
     model_error: dict[str, Annotated[float, Meta(ge=0, le=1e6)]] = {}
     variation: dict[str, Distribution] = {}

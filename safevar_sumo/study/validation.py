@@ -185,12 +185,6 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     yield from variation_mistakes(source, characteristics, study.variation, study.correlations)
     yield from constraint_mistakes(source, characteristics, study.constraints)
     yield from limit_mistakes(source, characteristics, study.limits, "limits.")
-    for name, bounds in study.calibration.items():
-        if bounds.lower >= bounds.upper:
-            problem = f"calibration.{name!r}: lower = {bounds.lower} and upper = {bounds.upper}"
-            yield InputError(source, problem, "lower < upper")
-    if study.fit.ensemble == 1:
-        yield InputError(source, "fit.ensemble = 1", "0 for starts without an ensemble, or at least 2 places")
     if study.matrix is not None and bool(study.matrix.tests) == bool(study.matrix.protocol):
         problem = f"matrix: {len(study.matrix.tests)} tests and protocol = {study.matrix.protocol!r}"
         yield InputError(source, problem, "tests, or a protocol")
@@ -239,24 +233,23 @@ def _key_or_index(table: Any, name: str) -> int | str:
     return int(name) if isinstance(table, list) and name == str(int(name)) else name
 
 
-def missing_parameter(source: object, table: str, name: str) -> InputError:
-    """The error for a parameter that a table such as `spread` names and the study does not have."""
+def missing_parameter(source: object, name: str) -> InputError:
+    """The error for a parameter that [spread] names and the study does not have."""
     return InputError(
         source,
-        f"{table}.{name!r} is no parameter of the study",
+        f"spread.{name!r} is no parameter of the study",
         f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED_TABLES)}",
     )
 
 
 def contradictions_of_file(source: object, stated: Tables, tables: Tables) -> Iterator[InputError]:
     """Errors for tables that a file states itself and that do not fit the study's `tables`, with the inherited ones."""
-    for table in ("calibration", "spread"):
-        values = stated.get(table)
-        for name in values if isinstance(values, Mapping) else ():
-            if name.startswith("weather.") and isinstance(tables.get("weather"), str):
-                continue  # a shipped weather: its values are looked up later
-            if locate_parameter(tables, name) is None:
-                yield missing_parameter(source, table, name)
+    spread = stated.get("spread")
+    for name in spread if isinstance(spread, Mapping) else ():
+        if name.startswith("weather.") and isinstance(tables.get("weather"), str):
+            continue  # a shipped weather: its values are looked up later
+        if locate_parameter(tables, name) is None:
+            yield missing_parameter(source, name)
     rating = stated.get("rating")
     matrix = tables.get("matrix")
     if (

@@ -219,7 +219,6 @@ def assemble(study: Study, source: str = "") -> System:
         "published": study.published,
         "repeatability": study.repeatability,
         "model_error": study.model_error,
-        "fit.weights": study.fit.weights,
     }
     for key, table in tables_of_metrics.items():
         for name in (name for name in table if name not in measuring.metrics):

@@ -39,7 +39,7 @@ def test_names_and_defaults_are_resolved_to_numbers() -> None:
     resolved = identity["resolved"]["ads"]["parameters"]
     assert set(resolved) >= set(given)
     assert "duration" in identity["resolved"]["scenario"]["parameters"], "a default"
-    assert not {"title", "published", "calibration"} & set(identity["resolved"])
+    assert not {"title", "published", "spread"} & set(identity["resolved"])
     assert not {"runs", "algorithms", "evaluations", "time_limit"} & set(identity["resolved"]["search"])
 
 

@@ -117,7 +117,7 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
 def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
     for other in (
-        msgspec.structs.replace(study, title="Another title", published={}, calibration={}),
+        msgspec.structs.replace(study, title="Another title", published={}),
         with_search(study, time_limit=7, runs=3, evaluations=900),
         with_search(study, algorithms=["rs"]),
     ):

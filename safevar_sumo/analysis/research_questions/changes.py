@@ -24,6 +24,8 @@ from safevar_sumo.study import SAFETY_DEGREE
 ANY = "any"
 WEATHER_VALUES = ["percent", "percent_other", "difference", "rank", "rank_other"]
 WEATHER_VALUES += ["increase", "increase_other", "decrease", "decrease_other"]
+WEATHER_PARAMETERS = (*REACTION_PARAMETERS, "brake_place")
+"""Parameters of an ADS by which it reacts to a weather: its delays, and where World On Rails sees the pedestrian."""
 COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
@@ -190,7 +192,7 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction,
     visibility, delays).
 
-    The reaction's parameters are the ADS's delays, and the calibrated parameters that either study declares its `own`.
+    The reaction's parameters are the `WEATHER_PARAMETERS`.
 
     Raises
     ------
@@ -252,9 +254,8 @@ def _differences(*pair: Case) -> list[str]:
     reaction to it.
     """
     studies = [msgspec.to_builtins(case.study) for case in pair]
-    own_keys = [key for case in pair for key, parameter in case.study.calibration.items() if parameter.own]
     for study in studies:
-        for name in (*REACTION_PARAMETERS, *(key.removeprefix("ads.parameters.") for key in own_keys)):
+        for name in WEATHER_PARAMETERS:
             study["ads"]["parameters"].pop(name, None)
     top_keys = [key for key in ("matrix", "constraints", "step_length") if studies[0][key] != studies[1][key]]
     return top_keys + [

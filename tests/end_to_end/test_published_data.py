@@ -1,26 +1,17 @@
-"""validate, calibrate, import, tables and figures as a user types them."""
+"""validate, import, tables and figures as a user types them."""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import tomllib
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
-from safevar_sumo.analysis.model_spread import with_values
-from safevar_sumo.cli import calibrate
-from safevar_sumo.cli.program import commands
-from safevar_sumo.reference.calibration import FitSubject
 from safevar_sumo.reference.rows import package_filter
-from safevar_sumo.shipped import STUDY_SCHEMA
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -48,48 +39,14 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
     output = json_of("validate", "sun", str(data))
-    assert output["rows"] == 40
-    assert output["spearman"] == pytest.approx(dict.fromkeys(COLUMNS, 1.0))
-    assert output["mean_absolute_error"] == pytest.approx(dict.fromkeys(COLUMNS, 0.0), abs=1e-12)
-
-
-@pytest.mark.slow
-def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None:
-    """A study that starts from another brake gap comes nearer to the one that the data was made with."""
-    Path("mine.toml").write_text(
-        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
-        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n'
-    )
-    truth = load_study("sun").ads.parameters["brake_gap"]
-    done = run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--out", "found.toml")
-    result = tomllib.loads(Path("found.toml").read_text())
-    assert abs(result["ads"]["parameters"]["brake_gap"] - truth) < 0.5 * abs(8.0 - truth)
-    assert "held back" in done.stdout
-    assert re.search("(?s)CMA-ES.*seed 3.*mine.csv, SHA-256", Path("found.toml").read_text())
-    assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
-    again = ("calibrate", "mine.toml", str(data), "--trials", "7", "--seed", "3", "--out", "again.toml")
-    assert len({run(*again) and Path("again.toml").read_bytes() for _ in range(2)}) == 1
-
-
-@pytest.mark.parametrize(
-    ("end", "told"), [(KeyboardInterrupt, "Best of 2 of 9 trials, then"), (SystemExit, "Best of 2 of 9 trials, while")]
-)
-def test_the_best_so_far_is_saved_now_and_then_and_if_a_calibration_is_interrupted(
-    end: type[BaseException], told: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def ended(
-        subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *, from_scratch: bool
-    ) -> None:
-        done(2.0, (subjects[0].study,))
-        done(1.0, (with_values(subjects[0].study, {"ads.parameters.brake_gap": 5.5}),))
-        raise end
-
-    monkeypatch.setattr(calibrate, "calibrate", ended)
-    monkeypatch.setattr(calibrate, "SECONDS_BETWEEN_SAVES", 60.0 if end is KeyboardInterrupt else 0.0)
-    CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--repeats", "1", "--out", "best.toml"])
-    assert Path("best.toml").read_text().startswith(f"#:schema {STUDY_SCHEMA}\n# ")
-    assert told in Path("best.toml").read_text()
-    assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
+    assert (output["question"], output["study"], output["numbers"]["rows"]) == ("validate", "sun", 40)
+    collisions = [output["numbers"][f"collisions_{side}"] for side in ("here", "reference", "both")]
+    assert collisions == collisions[:1] * 3
+    table = output["tables"]["agreement"]
+    assert all(list(row) == list(table["columns"]) for row in table["rows"])
+    assert {row["metric"]: row["spearman"] for row in table["rows"]} == pytest.approx(dict.fromkeys(COLUMNS, 1.0))
+    errors = [row[name] for row in table["rows"] for name in ("mean_absolute_error", "bias")]
+    assert errors == pytest.approx([0.0] * 8, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +73,10 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
     assert frame["algorithm"].value_counts().to_dict() == {"nsga2": 40, "rs": 40}
     assert "run" not in frame
     pd.read_csv(data).assign(mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)).to_csv("heavy.csv", index=False)
-    output = run("replicate", "imported", "--published", "imported", "--reference", "heavy.csv")
-    assert "### RQ1" in output.stdout
+    output = run("import", "sun", "--out", "imported", "--rs", "heavy.csv")
     assert "1 rows with values outside the domains are left out" in output.stderr
+    assert "40 solutions of rs of an earlier import are replaced" in output.stderr
+    assert "solutions: 40 of nsga2, 39 of rs" in output.stdout
     original = CharacteristicSet.of(load_study("sun")).original
     changed = frame.iloc[:, 1:13].to_numpy() != original
     assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, "changes below the threshold are put back"

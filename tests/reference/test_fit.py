@@ -1,0 +1,190 @@
+"""The script that fits studies to published rows: its loss, its space, and a search that improves a planted parameter;
+and the uncertainty that parameter sets make of a setting.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+
+from calibration import fit
+from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, value_of, with_values
+from safevar_sumo.analysis.tolerance import scans
+from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan_with_sets
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.reference.rows import COLUMNS, ReferenceData
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool
+from tests.made_up import made_up_evaluations
+
+GAP = "ads.parameters.brake_gap"
+OWN = float(load_study("sun").ads.parameters["brake_gap"])
+PLANS = sorted((Path(fit.__file__).parent).glob("*.toml"))
+
+
+@pytest.fixture(scope="module")
+def data() -> ReferenceData:
+    system = assemble(load_study("sun"))
+    characteristics = system.characteristics
+    settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (24, 12))
+    return ReferenceData(settings, dict(evaluate(system, settings).metrics))
+
+
+def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
+    data: ReferenceData, in_tmp: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From a gap of 8 m towards the 6.9 m that the rows were made with."""
+    Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n')
+    Path("plan.toml").write_text(
+        "population = 4\nhold_out = 4\ntolerance = 0.045\n[[parameters]]\n"
+        f'key = "{GAP}"\nlower = 6\nupper = 12\nunit = "m"\nmeaning = "gap"\n'
+        '[studies."mine.toml"]\nfiles = ["rows.csv"]\noriginal = 1.0\nrank = 5.0\ncollisions = 10.0\n'
+        "weights = { safety_degree = 1.0 }\n"
+    )
+    names = load_study("sun").vehicle.characteristics
+    columns = {column: np.nan_to_num(data.metrics[name]) for name, column in COLUMNS.items()}
+    pd.DataFrame(data.settings, columns=list(names)).assign(**columns).to_csv("rows.csv", index=False)
+    for seed in ("1", "2"):
+        fit.main(["plan.toml", ".", "--log", "log.csv", "--trials", "13", "--seed", seed, "--jobs", "1"])
+    trials = pd.read_csv("log.csv")
+    assert list(trials) == ["loss", GAP]
+    assert len(trials) == 2 * (1 + 12), "the study's own values, and three whole generations"
+    assert trials[GAP][0] == 8.0
+    best = trials.loc[trials["loss"].idxmin()]
+    assert best["loss"] < trials["loss"][0]
+    assert abs(best[GAP] - OWN) < abs(8.0 - OWN)
+    printed = capsys.readouterr().out
+    assert f'"{GAP}" = [{best[GAP]:g}' in printed
+    assert "rows.csv, held back: spearman" in printed
+
+
+@pytest.mark.parametrize("path", PLANS, ids=[path.stem for path in PLANS])
+def test_a_plan_has_the_values_of_its_studies_within_its_bounds(path: Path) -> None:
+    plan = msgspec.toml.decode(path.read_bytes(), type=fit.Plan)
+    values = fit.Fit(plan, {name: load_study(name) for name in plan.studies}, {}).own_values()
+    assert all(row.lower <= value <= row.upper for row, value in zip(plan.parameters, values, strict=True))
+
+
+def test_a_scale_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in_its_bounds() -> None:
+    rows = [fit.Parameter(GAP, 0.3, 30.0, "m", "gap", log=log) for log in (True, False)]
+    cube = fit.Cube.of(rows)
+    assert cube.values(np.array([0.5, 0.5])) == pytest.approx([3.0, 15.15])
+    assert max(cube.values(np.ones(2))) <= 30.0
+    assert cube.values(np.full(2, 1 / 7)) == [0.579209, 4.54286], "six digits, as in the study file"
+    assert cube.places(np.array([3.0, 15.15])) == pytest.approx([0.5, 0.5])
+
+
+def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(data: ReferenceData) -> None:
+    """All of the loss is sum(w error / repeatability): a repeatability of 2 halves what one of 1 makes of it."""
+    nearer = with_values(load_study("sun"), {GAP: 0.8 * OWN})
+    here = evaluate(assemble(nearer), data.settings)
+    error = np.abs(here.f_safe - data.metrics["safety_degree"]).mean()
+    only = fit.Target([], {"safety_degree": 1.0}, original=0.0, rank=0.0, collisions=0.0)
+    for unit in (1.0, 2.0):
+        study = msgspec.structs.replace(nearer, repeatability={"safety_degree": unit})
+        assert fit.loss_of_file(data, here, study, only) == pytest.approx(error / unit)
+    published = {"safety_degree": np.array([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0])}
+    there = data.take(np.arange(24) < 6)._replace(metrics=published)
+    here = made_up_evaluations([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0], settings=np.ones((6, 12)))
+    collisions = fit.Target([], {}, original=0.0, rank=0.0, collisions=6.0)
+    loss = fit.loss_of_file(there, here, nearer, collisions)
+    assert loss == pytest.approx(6 * 2 / 6), "four there and four here, three of them the same: two rows of six differ"
+
+
+def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
+    study = load_study("sun")
+    characteristics = assemble(study).characteristics
+    width, rng = characteristics.upper - characteristics.lower, np.random.default_rng(1)
+    settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
+    settings[:, 3] = characteristics.original[3]
+    slopes = np.where(np.arange(12) == 3, np.nan, np.arange(12) - 5.0)  # one does not vary
+    response = 1.0 + ((settings - characteristics.original) / width) @ np.nan_to_num(slopes)
+    assert fit.linear_effects(study, settings, response) == pytest.approx(slopes, nan_ok=True)
+    assert np.isnan(fit.linear_effects(study, settings[:20], np.ones(20))).all(), "too few rows"
+
+
+def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(data: ReferenceData) -> None:
+    """Rows of one file lie in the middle of the band, those of the other beyond it: 1 to 24 distances from the
+    original, at least 0.3.
+    """
+    sets = {GAP: [value_of(load_study("sun"), GAP)] * 2}
+    study = msgspec.structs.replace(load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9})
+    ch = assemble(study).characteristics
+    away = np.maximum(np.sqrt((((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1)), 0.3)
+    far = data._replace(metrics={"safety_degree": data.metrics["safety_degree"] + away * np.arange(1, 25)})
+    # Of 24 rows the 23rd: ceil(0.9 * 25); another file without a miss changes nothing.
+    assert fit.model_error(study, [far]) == pytest.approx(23, abs=1e-6)
+    assert fit.model_error(study, [data, far]) == pytest.approx(23, abs=1e-6)
+    assert fit.model_error(study, [data]) == 0
+
+
+def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
+    lower, upper = prediction_band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
+    assert (lower[0], upper[0]) == pytest.approx((0.05 - 0.1645, 0.95 + 0.1645))
+    assert np.isnan([lower[1], upper[1]]).all()
+
+
+def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_original_vehicle() -> None:
+    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras. The original counts as
+    0.3 away.
+    """
+    sets = {"spread": {GAP: [OWN, OWN]}, "repeatability": {"safety_degree": 1e-9}}
+    bare, study = (load_study("sun", **sets, model_error=error) for error in ({}, {"safety_degree": 0.4}))
+    ch = assemble(study).characteristics
+    settings = np.stack([ch.original, ch.original])
+    for name, share in (("tireFric", -0.75), ("dampRateZeroT_CE", -0.5)):
+        i = list(ch.names).index(name)
+        settings[1, i] += share * (ch.upper[i] - ch.lower[i])
+    for here, wide, more in zip(
+        compute_model_spreads(bare, settings),
+        compute_model_spreads(study, settings),
+        (0.4 * 0.3, 0.4 * 0.8125**0.5),
+        strict=True,
+    ):
+        assert here.lower is not None
+        assert here.upper is not None
+        assert (wide.lower, wide.upper) == pytest.approx((here.lower - more, here.upper + more), abs=1e-9)
+
+
+def test_the_sets_are_simulated_one_by_one() -> None:
+    study = load_study(
+        "sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={}
+    )
+    setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
+    alone = [
+        evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting)
+        for gap in (OWN, OWN - 1, OWN + 1)
+    ]
+    (band,) = compute_model_spreads(study, setting)
+    degrees = [float(one.f_safe[0]) for one in alone]
+    assert (band.lower, band.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
+    assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
+
+
+def test_another_vehicle_or_driver_has_no_spread() -> None:
+    other = load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"})
+    assert not other.spread
+    assert not other.model_error
+
+
+def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+    friction = list(load_study("sun").vehicle.characteristics).index("tireFric")
+    gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
+    study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
+
+    def ends(one: Study, fits: int) -> OneAtATimeScan:
+        return scan_with_sets(Evaluator(one, InlinePool()), [friction], Unsafe(below=1.5), fits)[0]
+
+    of_each = [ends(with_values(study, {gap: value}), 0).safe for value in gaps]
+    low, high = zip(*(interval for interval in of_each if interval), strict=True)
+    assert len({*low}) > 1, "the fits differ"
+    ranges = (min(low), max(low)), (min(high), max(high))
+    assert ends(study, 8).across_fits == (len(low), ranges, len(of_each) - len(low))
