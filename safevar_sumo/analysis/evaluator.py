@@ -13,12 +13,13 @@ import numpy as np
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Inputs, Selection, Task
-from safevar_sumo.campaign.identity import inputs_of
+from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, Task
+from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
+from safevar_sumo.plugins import Files
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
@@ -87,11 +88,11 @@ class Evaluator:
 
         The values stand beside the settings, shape (M, n + P).
         """
-        return self._evaluate_shown(rows, stage, 0, selection, self._inputs)
+        return self._evaluate_shown(rows, stage, 0, selection, self._files)
 
     @cached_property
-    def _inputs(self) -> Inputs:
-        return inputs_of(self.study, self._pool)
+    def _files(self) -> Files:
+        return files_of(self.study)
 
     def _evaluate_shown(
         self,
@@ -99,7 +100,7 @@ class Evaluator:
         stage: str,
         verified: int,
         selection: Selection = EVERYTHING,
-        inputs: Inputs | None = None,
+        files: Files | None = None,
     ) -> Evaluations:
         """Evaluate settings while progress is shown."""
         if not len(settings):
@@ -112,7 +113,7 @@ class Evaluator:
             done += increment
             self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection, inputs)
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection, files)
         self.simulated += total
         return evaluations
 
@@ -159,7 +160,7 @@ class Evaluator:
         cell_count = len(rater.protocol.cells)
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
-        tasks = (Task(study=self.study, inputs=self._inputs, cells=(part, parts)) for part in range(parts))
+        tasks = (Task(study=self.study, files=self._files, cells=(part, parts)) for part in range(parts))
         batches = [Batch(task.packed, settings) for task in tasks]
         results, done = list[CellResults](), 0
 

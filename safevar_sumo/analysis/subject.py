@@ -14,7 +14,7 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results import MANIFEST, input_differences, manifest_of, read_manifest
+from safevar_sumo.results import MANIFEST, differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import Progress, open_progress
 
@@ -227,16 +227,14 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
         If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
     from safevar_sumo.campaign.identity import identity_of
-    from safevar_sumo.campaign.local import local_pool
     from safevar_sumo.sumo.system import assemble
 
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:
         return []
     system = assemble(study, str(directory))
-    with local_pool(1, study.search.time_limit) as pool:
-        present = manifest_of(study, identity_of(study, system, pool))
-    changes = [text for _, text, matters in input_differences(directory, manifest, present, study) if matters]
+    present = manifest_of(study, identity_of(study, system))
+    changes = [text for _, text, matters in differences(manifest, present) if matters]
     if changes and not as_it_is_now:
         more = len(changes) - MAX_CHANGES_NAMED
         named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (f" (and {more} more)" if more > 0 else "")

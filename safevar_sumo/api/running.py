@@ -118,7 +118,7 @@ def carry_out_runs(
     SafevarError
         If another process works on one of the runs, or `run_campaign` raises it.
     """
-    results = ResultsDirectory(directory, study, identity_of(study, system, pool), system.measuring.scoring)
+    results = ResultsDirectory(directory, study, identity_of(study, system), system.measuring.scoring)
     engine_used, reason = choose_engine(system, engine)
     for remark in _extent_remarks(results, study):
         observer.warned(remark)

@@ -17,15 +17,14 @@ import platformdirs
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
-    Inputs,
     Selection,
     Task,
     refuse_unlike_sumo,
     tasks_for_sumo,
 )
-from safevar_sumo.campaign.identity import inputs_of
+from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches, evaluate_original
-from safevar_sumo.campaign.run import user_algorithm_packages
+from safevar_sumo.plugins import Files
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, tables_of, user_code_names
@@ -52,18 +51,18 @@ def evaluate_all(
     done: Callable[[int], None] = lambda size: None,
     verified: int = VERIFIED_SETTINGS,
     selection: Selection = EVERYTHING,
-    inputs: Inputs | None = None,
+    files: Files | None = None,
 ) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
 
     User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO,
     until `verified` ones of the study have been.
     `done` is called with the number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO;
-    a caller that evaluates many times may keep the `inputs` (`inputs_of`).
+    a caller that evaluates many times may keep the `files` (`files_of`).
     """
-    inputs = inputs_of(study, pool) if inputs is None else inputs
-    packed_task = Task(study=study, inputs=inputs, selection=selection).packed
-    check_code(study, inputs, pool)
+    files = files_of(study) if files is None else files
+    packed_task = Task(study=study, files=files, selection=selection).packed
+    check_code(study, files, pool)
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     if packed_task not in _batch_sizes:
         _batch_sizes[packed_task] = choose_batch_size(study, selection)
@@ -77,7 +76,7 @@ def evaluate_all(
     sample_size = max(min(verified - _verified_counts.get(packed_task, 0), len(distinct_settings)), 0)
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     must_verify = has_recorded_scene and sample_size > 0 and selection == EVERYTHING
-    verifying_tasks = filter(None, tasks_for_sumo(study, inputs)) if must_verify else ()
+    verifying_tasks = filter(None, tasks_for_sumo(study, files)) if must_verify else ()
     verifications = [Batch(verifying_task, distinct_settings[sample]) for verifying_task in verifying_tasks]
 
     def show_done(number: int, size: int) -> None:
@@ -103,12 +102,12 @@ def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
 
 def ask_why_no_verdict(study: Study, pool: Pool) -> str:
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
-    packed_task = Task(study=study, inputs=inputs_of(study, pool), purpose="empty road").packed
+    packed_task = Task(study=study, files=files_of(study), purpose="empty road").packed
     result = evaluate_original(study, packed_task, pool, must_succeed=False)
     return "" if len(result) else next(iter(result.reasons.values()), "")  # a failed simulation has a row
 
 
-def check_code(study: Study, inputs: Inputs, pool: Pool) -> None:
+def check_code(study: Study, files: Files, pool: Pool) -> None:
     """Check the user code of a study in a worker, unless it has passed before with the same files.
 
     Raises
@@ -116,14 +115,14 @@ def check_code(study: Study, inputs: Inputs, pool: Pool) -> None:
     UserCodeError
         With file, line and advice of the first finding that makes results wrong.
     """
-    if not (user_code_names(study) or user_algorithm_packages(study)):
+    if not user_code_names(study):
         return
-    identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
+    identity = json.dumps([tables_of(study), files, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
     digest = hashlib.sha256(identity.encode()).hexdigest()
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / digest
     if digest in _passed_checks or marker.exists():
         return
-    evaluate_original(study, Task(study=study, inputs=inputs, purpose="check").packed, pool)
+    evaluate_original(study, Task(study=study, files=files, purpose="check").packed, pool)
     _passed_checks.add(digest)
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)

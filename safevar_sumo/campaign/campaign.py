@@ -107,11 +107,11 @@ def run_campaign(
         If a journal cannot be written, or the study is at fault.
     """
     batch_size = batch_size or MAX_COPIES
-    packed_task = Task(study=study, inputs=results.inputs, engine=engine).packed
-    check_code(study, results.inputs, pool)
+    packed_task = Task(study=study, files=results.files, engine=engine).packed
+    check_code(study, results.files, pool)
     original = _evaluate_original(study, packed_task, results, pool, observer)
     results.begin(original)
-    sumo_tasks = tasks_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
+    sumo_tasks = tasks_for_sumo(study, results.files) if engine is Engine.RECORDED else (b"", b"")
     directory, identity = results.path.absolute(), results.digest
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / study.search.population), MAX_RUNS)
     shares = [
@@ -169,7 +169,7 @@ def _evaluate_original(
             original = journal.content.evaluations
             if not len(original):
                 original = evaluate_original(study, packed_task, pool)
-                journal.append([0], original, original.files)
+                journal.append([0], original)
     except JournalBusyError:  # another process, such as a job of an array, writes this journal
         original = evaluate_original(study, packed_task, pool)
     if not original.valid[0]:
@@ -239,7 +239,7 @@ def forecast(
     keys = all_runs(probe)[: max(runs_of_worker, 1) * pool.workers]
     stopwatch = _Stopwatch(len(keys))
     with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
-        results = ResultsDirectory(Path(folder), probe, identity_of(probe, system, pool), system.measuring.scoring)
+        results = ResultsDirectory(Path(folder), probe, identity_of(probe, system), system.measuring.scoring)
         with suppress(_Enough):
             run_campaign(probe, keys, results, pool, stopwatch, batch_size, engine=engine)
     evaluations = runs * search.evaluations

@@ -8,7 +8,6 @@ import faulthandler
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import IO, Literal
 
 import msgspec
@@ -17,18 +16,15 @@ import numpy as np
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import changed_files, digests, note_inputs, unload_user_modules
+from safevar_sumo.plugins import Files, changed_files
 from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
-from safevar_sumo.study import Study, user_code_packages
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, evaluate_cells, settings_per_batch
-from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System, assemble
 
-Inputs = dict[str, dict[str, str]]
-"""Digests of files, by layer and name."""
 VERIFIED_SETTINGS = 50
 """Number of settings to verify in SUMO: of a study in questions; of each run of a campaign, besides its solutions."""
 Evaluate = Callable[[bytes, FloatArray], Evaluations]
@@ -67,9 +63,8 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    inputs
-        Digests of files by layer and name: a worker refuses to compute with other files of a network, and reports files
-        that user code reads and `sources` lacks.
+    files
+        Digests of files by name: a worker refuses to compute with other files.
     engine
         What moves the vehicles.
     afresh
@@ -84,7 +79,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     study: Study
-    inputs: Inputs = {}
+    files: Files = {}
     engine: Engine = Engine.RECORDED
     afresh: bool = False
     purpose: Literal["evaluate", "check", "empty road"] = "evaluate"
@@ -117,26 +112,16 @@ def evaluate_batch(packed_task: bytes, settings: FloatArray) -> Evaluations:
 
         refuse_defects(task.study)
         return Evaluations.none(settings.shape[1], METRICS)
-    if task.afresh:
-        unload_user_modules()
-    with note_inputs() as reading:
-        system = assemble(task.study) if task.afresh else system_of(task)
-        if "network" in task.inputs:
-            refuse_changed_files(changed_files(task.inputs["network"], network_digests(system)))
-        if task.purpose == "empty road":
-            reason = why_no_verdict(system)
-            evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
-        elif task.cells is not None:
-            evaluations = evaluate_cells(system, settings, task.cells, task.engine)
-        elif task.selection != EVERYTHING:
-            evaluations = _evaluate_parameters(system, task, settings)
-        else:
-            evaluations = evaluate(system, settings, task.engine)
-    files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
-    known_files = task.inputs.get("sources", {})
-    refuse_changed_files([name for name, digest in files_read.items() if known_files.get(name, digest) != digest])
-    new_files = {name: digest for name, digest in files_read.items() if name not in known_files}
-    return replace(evaluations, files=new_files)
+    refuse_changed_files(changed_files(task.files, task.study.origin.places))
+    system = assemble(task.study) if task.afresh else system_of(task)
+    if task.purpose == "empty road":
+        reason = why_no_verdict(system)
+        return replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
+    if task.cells is not None:
+        return evaluate_cells(system, settings, task.cells, task.engine)
+    if task.selection != EVERYTHING:
+        return _evaluate_parameters(system, task, settings)
+    return evaluate(system, settings, task.engine)
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
@@ -178,7 +163,7 @@ def evaluate_in_time(packed_task: bytes, settings: FloatArray, time_limit: float
 
 def system_of(task: Task) -> System:
     """The system of a task's study; it is kept, and stays the same even if source files change."""
-    return _assemble_packed(Task(study=task.study, inputs=task.inputs).packed)
+    return _assemble_packed(Task(study=task.study, files=task.files).packed)
 
 
 @lru_cache(maxsize=4)
@@ -196,27 +181,16 @@ def refuse_changed_files(files: list[str]) -> None:
         )
 
 
-def network_digests(system: System) -> dict[str, str]:
-    """Digests of the files of all networks in the simulations."""
-    folders = list(dict.fromkeys(point.scenario.network for point in system.points))
-    if len(folders) == 1:
-        return dict(open_network(folders[0]).digests)
-    return {
-        f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in open_network(folder).digests
-    }
-
-
-def tasks_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
+def tasks_for_sumo(study: Study, files: Files) -> tuple[bytes, bytes]:
     """The packed task with which SUMO verifies results, and one with comparable results from recorded scenes.
 
     SUMO repeats only a few cells of a rating; the second task then has the same cells. Otherwise it is empty, and the
     results to verify are comparable themselves.
     """
     sumo_study = study_for_sumo_check(study, assemble(study).weather)
-    if sumo_study is study:
-        return Task(study=study, inputs=inputs, engine=Engine.LIBSUMO).packed, b""
-    recorded = Task(study=sumo_study, inputs={**inputs, "network": network_digests(assemble(sumo_study))})
-    return msgspec.structs.replace(recorded, engine=Engine.LIBSUMO).packed, recorded.packed
+    recorded = Task(study=sumo_study, files=files)
+    in_sumo = msgspec.structs.replace(recorded, engine=Engine.LIBSUMO)
+    return in_sumo.packed, b"" if sumo_study is study else recorded.packed
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:

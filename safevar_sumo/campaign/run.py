@@ -5,7 +5,7 @@ evaluations.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.campaign.evaluation import VERIFIED_SETTINGS
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.plugins import Files, Lookup, digests, instance_of, note_inputs
+from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import Failure, Journal, run_name
 from safevar_sumo.search import ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
@@ -94,7 +94,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         if table not in ALGORITHMS and table not in search.labels:
             legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
             raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
-    lookup = Lookup(source, study.origin.places)
+    lookup = Lookup.of(study)
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
     parameters = lookup.with_paths(member, search.parameters.get(label, {}), key)
     algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
@@ -105,28 +105,9 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 
-def make_search(key: RunKey, study: Study, problem: Problem, note_files: Callable[[Files], None]) -> Search:
-    """Make the search of a run; after each step, calls `note_files` with the files that a user's algorithm has read."""
-    packages, rng, has_ended = user_algorithm_packages(study), random_generator_of(study, key), False
-    search: Search | None = None
-    answer: Any = None  # None starts a generator
-    while True:
-        with note_inputs() as reading:
-            try:
-                search = search or algorithm_of(key.algorithm, study).search(problem, rng)
-                output: Any = search.send(answer)  # settings, or the result at the end
-            except StopIteration as end:
-                has_ended, output = True, end.value
-        if packages:
-            note_files(digests(reading.files(packages), study.origin.places))
-        if has_ended:
-            return output  # type: ignore[no-any-return]
-        answer = yield output
-
-
-def user_algorithm_packages(study: Study) -> list[str]:
-    """Top-level packages of a study's user algorithms."""
-    return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
+def make_search(key: RunKey, study: Study, problem: Problem) -> Search:
+    """Make the search of a run."""
+    return algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
 
 
 def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
@@ -211,14 +192,12 @@ class Run:
                 self._positions.setdefault(setting.tobytes(), position)
         return False
 
-    def receive(self, evaluations: Evaluations, files: Mapping[str, str]) -> None:
-        """Journal and remember new evaluations of requested settings, and files that user code has read for the first
-        time.
-        """
+    def receive(self, evaluations: Evaluations) -> None:
+        """Journal and remember new evaluations of requested settings."""
         positions = [self._positions[setting.tobytes()] for setting in evaluations.settings]
         if not self._known_positions.isdisjoint(positions):
             raise InputError(self.journal.path, "holds other settings than this search requests", "another `out`")
-        self.journal.append(positions, evaluations, files)
+        self.journal.append(positions, evaluations)
         self._remember(positions, evaluations)
         self._has_simulated = True
 

@@ -10,18 +10,12 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
+import msgspec
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import (
-    Evaluate,
-    Task,
-    refuse_changed_files,
-    refuse_unlike_sumo,
-    system_of,
-    task_of,
-)
+from safevar_sumo.campaign.evaluation import Evaluate, refuse_unlike_sumo, system_of, task_of
 from safevar_sumo.campaign.pool import Job, Report, Share, WorkerLostError
 from safevar_sumo.campaign.run import Run, RunKey, make_search, random_generator_of
 from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
@@ -178,10 +172,6 @@ class _ShareCarrier:
     def __init__(self, share: Share, report: Report, attempts: Attempts) -> None:
         self._share, self._report, self._attempts, self._task = share, report, attempts, task_of(share.packed_task)
         self._study = self._task.study
-        self._files = dict(self._task.inputs.get("sources", {}))
-        """Digests of the files that user code has read so far."""
-        self._new_files: dict[str, str] = {}
-        """Files that user code has read and that no journal holds yet."""
 
     def carry_out(self) -> None:
         """Advance all runs in rounds, until their searches have ended: each round simulates what they wait for."""
@@ -228,14 +218,7 @@ class _ShareCarrier:
                 self._report(journal.remark_on_tail)
             if share.retry_failed and journal.content.evaluations.failed.any():
                 journal.retry()
-            yield Run(key, make_search(key, self._study, problem, self._note_files), journal, search.evaluations)
-
-    def _note_files(self, files: Mapping[str, str]) -> None:
-        """Note files that user code has read, so that the next line of a journal names them; refuses changed files."""
-        refuse_changed_files([name for name, digest in files.items() if self._files.get(name, digest) != digest])
-        new_files = {name: digest for name, digest in files.items() if name not in self._files}
-        self._files |= new_files
-        self._new_files |= new_files
+            yield Run(key, make_search(key, self._study, problem), journal, search.evaluations)
 
     def _simulate(self, runs: Sequence[Run]) -> None:
         """Simulate and journal the settings that the runs wait for, in equal batches."""
@@ -244,12 +227,10 @@ class _ShareCarrier:
             return
         settings = np.concatenate([run.missing_settings for run in runs])
         for evaluations in self._evaluate(self._share.packed_task, settings, self._share.batch_size):
-            self._note_files(evaluations.files)
             owners_of_rows, owners = owners[: len(evaluations)], owners[len(evaluations) :]
             for run in dict.fromkeys(owners_of_rows):
                 rows = [row for row, owner in enumerate(owners_of_rows) if owner is run]
-                run.receive(evaluations.take(rows), self._new_files)
-                self._new_files = {}
+                run.receive(evaluations.take(rows))
 
     def _evaluate(self, packed_task: bytes, settings: FloatArray, size: int) -> Iterator[Evaluations]:
         """Evaluate settings in equal batches of at most `size` settings."""
@@ -269,7 +250,7 @@ class _ShareCarrier:
     def _verify_isolation(self, run: Run) -> None:
         """Refuse a run with a setting whose evaluation is another one alone, with user code loaded afresh."""
         task = self._task
-        packed_task = Task(study=task.study, inputs=task.inputs, engine=task.engine, afresh=True).packed
+        packed_task = msgspec.structs.replace(task, afresh=True).packed
         for expected in run.sample_evaluations(self._generator("recheck", run.key)):
             (isolated,) = self._attempts.evaluate(packed_task, expected.settings)
             if expected.failed[0] or isolated.failed[0]:

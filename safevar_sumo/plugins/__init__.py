@@ -5,15 +5,14 @@ use it.
 """
 
 from safevar_sumo.plugins.files import (
-    DIGEST_LENGTH as DIGEST_LENGTH,
     Files as Files,
     changed_files as changed_files,
+    code_files as code_files,
     digest_of as digest_of,
     digests as digests,
     file_by_name as file_by_name,
-    files_named_in as files_named_in,
-    note_inputs as note_inputs,
-    unload_user_modules as unload_user_modules,
+    files_in as files_in,
+    is_shipped as is_shipped,
 )
 from safevar_sumo.plugins.guard import (
     FINITE as FINITE,
@@ -36,4 +35,5 @@ from safevar_sumo.plugins.lookup import (
     check_parameters as check_parameters,
     inherit_import_folders as inherit_import_folders,
     instance_of as instance_of,
+    unload_user_modules as unload_user_modules,
 )

@@ -1,154 +1,92 @@
-"""Finds the files that user code reads, on which results depend, and names them alike on every machine.
-
-The interpreter raises an audit event for every file that Python code opens and for every module that it loads. Compiled
-code raises no event, so all files that a study's parameters name count as read.
+"""The user's files on which results depend, by names that are the same on every machine: code, and the data files that
+a study names.
 """
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from hashlib import file_digest
 from pathlib import Path
-from typing import Any
 
 from safevar_sumo.output import file_beside
-from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
+from safevar_sumo.shipped import NETWORKS, PACKAGE
 
 DIGEST_LENGTH = 16
 """Length of a file's digest."""
 Files = dict[str, str]
 """Digests of files by the names that `digests` gives them."""
+CACHE = "__pycache__"
+"""Name of Python's cache folders."""
 LIBRARY_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders of installed libraries; such folders may be anywhere."""
-KNOWN_FOLDERS = tuple(
-    f"{folder}{os.sep}"
-    for folder in sorted(
-        {
-            str(PACKAGE),
-            str(STUDIES),
-            str(NETWORKS),
-            *(os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
-            *(
-                os.path.realpath(os.path.join(prefix, name))
-                for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
-                for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")
-            ),
-            "/dev",
-            "/proc",
-            "/sys",
-            "/System",
-            "/Library",
-            os.environ.get("SYSTEMROOT", "/dev"),
-        }
-    )
-)
-"""Folders without user code: of this package, the interpreter, installed libraries and the operating system."""
-CACHE_FOLDERS = ("__pycache__", ".cache", ".config")
-"""Names of folders in which programs keep caches and settings."""
-WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
-"""Flags of a file that is opened for writing only; a file opened for reading and writing counts as read."""
-
-
-class InputFiles:
-    """The absolute `paths` of files that user code opens."""
-
-    def __init__(self) -> None:
-        self.paths: set[str] = set()
-
-    def files(self, packages: Sequence[str]) -> set[str]:
-        """Every input file: sources in place of Python's caches, and of installed packages only the files of
-        `packages`.
-        """
-        modules = {file_of_module(name) for name in list(sys.modules) if name.partition(".")[0] in packages}
-        return {path for path in map(_source_of, self.paths | modules) if _is_input(path, packages)}
-
-
-class _AuditHook:
-    """The process's only audit hook, which cannot be removed.
-
-    `call_depth` is the number of calls of user code under way, `modules` the names of all modules that it has loaded,
-    `written` the files that it wrote, which are no inputs; `recordings` are those of `note_inputs` that are not over.
-    """
-
-    def __init__(self) -> None:
-        self.call_depth, self.modules, self.written, self.recordings = 0, set[str](), set[str](), list[InputFiles]()
-        sys.addaudithook(self._note)
-
-    def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if not self.call_depth or event not in ("open", "import"):
-            return
-        if event == "import":
-            self.modules.add(arguments[0])
-        path = arguments[1] if event == "import" else arguments[0]
-        if not isinstance(path, str | bytes | os.PathLike):
-            return
-        path = os.path.abspath(os.fsdecode(path))
-        if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS:
-            self.written.add(path)
-            return
-        for recording in self.recordings:
-            recording.paths.add(path)
-
-
-audit_hook = _AuditHook()
-
-
-@contextmanager
-def note_inputs() -> Iterator[InputFiles]:
-    """Record the files that user code opens while a guard calls it."""
-    recording = InputFiles()
-    audit_hook.recordings.append(recording)
-    try:
-        yield recording
-    finally:
-        audit_hook.recordings.remove(recording)
-
-
-def unload_user_modules() -> None:
-    """Unload all modules that user code is made of, so that the next lookup loads them again."""
-    for name in sorted(audit_hook.modules):
-        if (
-            (file := file_of_module(name))
-            and is_user_file(file)
-            and name.partition(".")[0] not in ("safevar_sumo", "__main__")
-        ):
-            sys.modules.pop(name)
-    audit_hook.modules.clear()
-
-
-def file_of_module(name: str) -> str:
-    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the
-    interpreter.
-    """
-    module = sys.modules.get(name)
-    return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
+KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in (PACKAGE, *map(sysconfig.get_path, ("stdlib", "platstdlib"))))
+"""The folders of this package and of the interpreter."""
 
 
 def is_user_file(path: str) -> bool:
-    """Whether a file belongs neither to the interpreter or an installed library nor to this package or the operating
-    system.
+    """Whether a file belongs neither to the interpreter, nor to an installed library, nor to this package."""
+    is_in_library = any(name in Path(path).parts for name in LIBRARY_FOLDERS)
+    return os.path.isabs(path) and not path.startswith(KNOWN_FOLDERS) and not is_in_library
+
+
+def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
+    """The files of user code: of the `modules`, wherever they are, and of all that they import in the study's folders.
+
+    A module is a file; of a package every file counts.
     """
-    return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
+    own_folders = (*folders, os.getcwd())
+    paths, known = set[Path](), {PACKAGE.name, *sys.stdlib_module_names}
+    waiting = [(module, (*own_folders, *sys.path)) for module in modules]
+    while waiting:
+        module, search_path = waiting.pop()
+        name = module.partition(".")[0]
+        if name in known:
+            continue
+        known.add(name)
+        found = next(filter(None, (_files_of_module(Path(folder, name)) for folder in search_path)), set())
+        paths |= found
+        imported = (other for path in found if path.suffix == ".py" for other in _imported_modules(path))
+        waiting += [(other, own_folders) for other in imported]
+    return paths
 
 
-def _source_of(path: str) -> str:
-    """The source of a cached module; any other path unchanged."""
-    folder, name = os.path.split(path)
-    if os.path.basename(folder) == "__pycache__" and name.endswith(".pyc"):
-        return os.path.join(os.path.dirname(folder), f"{name.partition('.')[0]}.py")
-    return path
+def _files_of_module(path: Path) -> set[Path]:
+    """The file of a module, or every file of a package, whose path has no ending; empty if there is none."""
+    if path.with_suffix(".py").is_file():
+        return {path.with_suffix(".py")}
+    return set(files_in(path)) if any(path.rglob("*.py")) else set()
 
 
-def _is_input(path: str, packages: Sequence[str]) -> bool:
-    parts = Path(path).parts
-    if path in audit_hook.written or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
-        return False
-    library_members = [parts[parts.index(folder) + 1] for folder in LIBRARY_FOLDERS if folder in parts]
-    return is_user_file(path) or any(member.partition(".")[0] in packages for member in library_members)
+def _imported_modules(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module
+
+
+def files_in(path: Path) -> list[Path]:
+    """A file itself, or every file in a folder, without Python's cache and hidden files."""
+    if path.is_file():
+        return [path]
+    files = (file for file in path.rglob("*") if file.is_file())
+    return [file for file in files if not any(part[0] == "." or part == CACHE for part in file.relative_to(path).parts)]
+
+
+def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
+    """Digests of files by name.
+
+    Parameters
+    ----------
+    folders
+        The folders of the study's file and of the files that it extends.
+    """
+    named = {_name_of(Path(os.path.abspath(path)), folders): path for path in paths}
+    return {name: digest_of(path) for name, path in sorted(named.items())}
 
 
 def digest_of(path: Path | str) -> str:
@@ -160,52 +98,26 @@ def digest_of(path: Path | str) -> str:
         return ""
 
 
-def digests(paths: Iterable[str], folders: Sequence[str]) -> Files:
-    """Digests of files by name.
-
-    Parameters
-    ----------
-    folders
-        The folders of the study's file and of the files that it extends.
-    """
-    named: dict[str, str] = {}
-    for path in sorted(paths):
-        extra_parts = 0
-        while named.setdefault(_name_of(path, folders, extra_parts), path) != path:
-            extra_parts += 1
-    return {name: digest_of(path) for name, path in sorted(named.items())}
-
-
-def _name_of(path: str, folders: Sequence[str], extra_parts: int) -> str:
-    """A file's path relative to the first of `folders` that contains the file; if none does, or with `extra_parts`, the
-    path's last 2 + `extra_parts` parts.
-    """
-    for folder in (*folders, *_import_folders()):
-        if not extra_parts and Path(path).is_relative_to(folder):
-            return Path(path).relative_to(folder).as_posix()
-    return Path(*Path(path).parts[-2 - extra_parts :]).as_posix()
+def _name_of(path: Path, folders: Sequence[str]) -> str:
+    """A file's path relative to the first folder that contains it; its whole path if none does."""
+    folder = next((folder for folder in _naming_folders(folders) if path.is_relative_to(folder)), path.anchor)
+    return path.relative_to(folder).as_posix() if folder != path.anchor else path.as_posix()
 
 
 def file_by_name(name: str, folders: Sequence[str]) -> str:
     """The path of the file that `digests` calls `name`; "" if there is no such file."""
-    return file_beside(name, (*folders, *_import_folders()))
+    return file_beside(name, _naming_folders(folders))
 
 
-def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Names of files with different digests."""
-    return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+def is_shipped(name: str) -> bool:
+    """Whether `digests` calls a file of a shipped network by this name."""
+    return (NETWORKS / name).is_file()
 
 
-def files_named_in(value: Any, folders: Sequence[str]) -> Iterator[str]:
-    """Files in `folders` whose names occur as texts anywhere in a value."""
-    if isinstance(value, dict | list | tuple):
-        items = value.values() if isinstance(value, dict) else value
-        for item in items:
-            yield from files_named_in(item, folders)
-    elif isinstance(value, str) and (path := file_beside(value, folders or (os.getcwd(),))):
-        yield path
+def _naming_folders(folders: Sequence[str]) -> list[str]:
+    return [str(NETWORKS), *folders, os.getcwd(), *filter(os.path.isabs, sys.path)]
 
 
-def _import_folders() -> list[str]:
-    """Folders in which Python looks for modules."""
-    return [os.getcwd(), *(folder for folder in sys.path if folder)]
+def changed_files(before: Mapping[str, str], folders: Sequence[str]) -> list[str]:
+    """Names of files that no longer have the digests `before`."""
+    return [name for name, digest in before.items() if digest_of(file_by_name(name, folders)) != digest]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 import traceback
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, describe_error
-from safevar_sumo.plugins.files import audit_hook, is_user_file
+from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 Parameters = ParamSpec("Parameters")
@@ -184,15 +183,12 @@ class Guard(NamedTuple):
         UserCodeError
             If the function raises anything but Ctrl-C.
         """
-        audit_hook.call_depth += 1
         try:
             return function(*arguments, **keywords)
         except (UserCodeError, KeyboardInterrupt):
             raise
         except BaseException as error:
             raise self.failure(method, error) from error
-        finally:
-            audit_hook.call_depth -= 1
 
     def failure(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that user code raised."""
@@ -279,7 +275,7 @@ class Guard(NamedTuple):
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
         for file, line in reversed(frames):
-            if os.path.isabs(file) and (is_user_file(file) or (self.folder and file.startswith(self.folder))):
+            if is_user_file(file) or (self.folder and file.startswith(self.folder)):
                 return f"{file}:{line}"
         return ""
 

@@ -11,16 +11,16 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
 import msgspec
 
 from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins.files import audit_hook, file_of_module
+from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.guard import Guard, completed, contract_of, violation
-from safevar_sumo.study import convert_table
+from safevar_sumo.study import Study, convert_table, data_files
 from safevar_sumo.study.schema import Parameters
 
 
@@ -36,17 +36,27 @@ class Member(NamedTuple):
 
 _NO_ATTRIBUTE = object()
 _added_folders: list[str] = []
+_user_modules: set[str] = set()
+"""Names of all modules that the import of user code has loaded."""
 
 
 class Lookup(NamedTuple):
     """Looks up the names of a study.
 
     `source` is the study, as errors name it; `folders`, searched first, are those of the study's file and of the files
-    that it extends.
+    that it extends; `files` are the paths of its data files by the names that it gives them.
     """
 
     source: str
     folders: Sequence[str] = ()
+    files: Mapping[str, str] = MappingProxyType({})
+
+    @classmethod
+    def of(cls, study: Study, source: str = "") -> Lookup:
+        """The lookup for a study, which errors name by `source`; raises an InputError if one of its data files is
+        missing.
+        """
+        return cls(source or study.source, study.origin.places, data_files(study))
 
     def find(self, shipped: Mapping[str, Any], name: str, key: str) -> Member:
         """The object called `name` among the `shipped` ones, or the object that `package.module:Name` names.
@@ -94,36 +104,26 @@ class Lookup(NamedTuple):
         return member._replace(target=completed(member.target, base))
 
     def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
-        """Parameters for a member that is user code, in which names of files beside the study's file are absolute
-        paths.
+        """Parameters of a member; for user code, the names of the study's data files become absolute paths.
 
         Raises
         ------
         InputError
-            If a text names a file that is only in the working directory: elsewhere the study would read another file.
+            If a text names a file that is none of the data files: results would depend on it unnoticed.
         """
-        if member.guard is None or not self.folders:
-            return dict(parameters)
-        return {
-            name: value if name == "network" else self._with_paths(value, f"{key}.{name}")
-            for name, value in parameters.items()
-        }
+        return dict(parameters) if member.guard is None else self._with_paths(parameters, key)
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):
             return {name: self._with_paths(item, f"{key}.{name}") for name, item in value.items()}
         if isinstance(value, list):
             return [self._with_paths(item, key) for item in value]
-        if not isinstance(value, str):
-            return value
-        path = file_beside(value, self.folders)
-        if not path and file_beside(value, [os.getcwd()]):
-            raise InputError(
-                self.source,
-                f"{key} = {value!r}: that file lies in the working directory, not beside the study's file",
-                f"a path relative to {self.folders[0]}",
-            )
-        return path or value
+        is_name = isinstance(value, str) and not key.endswith(".network")  # a network counts anyway
+        if is_name and value not in self.files and file_beside(value, [*self.folders, os.getcwd()]):
+            problem = f"{key} = {value!r}: the study does not name this file"
+            table = key.partition(".")[0]
+            raise InputError(self.source, problem, f"files = [{value!r}] in its table [{table}]")
+        return self.files.get(value, value) if is_name else value
 
     def _import(self, name: str, guard: Guard) -> ModuleType:
         if name.partition(".")[0] == "__main__":
@@ -145,7 +145,23 @@ class Lookup(NamedTuple):
             raise UserCodeError(self.source, problem, expected, error.place) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
-            audit_hook.modules |= sys.modules.keys() - modules_before  # `import_module` raises no audit event
+            _user_modules.update(sys.modules.keys() - modules_before)
+
+
+def unload_user_modules() -> None:
+    """Unload all modules that user code is made of, so that the next lookup loads them again."""
+    for name in _user_modules:
+        if is_user_file(file_of_module(name)):
+            del sys.modules[name]
+    _user_modules.clear()
+
+
+def file_of_module(name: str) -> str:
+    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the
+    interpreter.
+    """
+    module = sys.modules.get(name)
+    return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
@@ -186,12 +202,7 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str, sou
     """
     cls = member.target
     if issubclass(cls, msgspec.Struct):
-        is_user_code = member.guard is not None
-        audit_hook.call_depth += is_user_code  # without its guard, which would hide the errors of `convert_table`
-        try:
-            return convert_table(source, parameters, cls, key)
-        finally:
-            audit_hook.call_depth -= is_user_code
+        return convert_table(source, parameters, cls, key)
     check_parameters(cls, (), parameters, name, key, source)
     return (member.guard or Guard(source, name)).call("__init__", cls, **parameters)
 

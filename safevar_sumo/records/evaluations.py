@@ -42,10 +42,9 @@ class Evaluations:
     `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
     `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
-    setting, why the setting could not be simulated. `files` are digests, by name, of files that user code
-    read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None
-    without a rating. `worst_points` are the numbers of the points at which the settings were worst, None without a
-    matrix.
+    setting, why the setting could not be simulated. `cells` are a rating's results,
+    None without a rating. `worst_points` are the numbers of the points at which the settings were worst, None without
+    a matrix.
     """
 
     settings: FloatArray
@@ -55,7 +54,6 @@ class Evaluations:
     f_diff: FloatArray
     f_num_diff: FloatArray
     reasons: Mapping[bytes, str] = field(default_factory=dict)
-    files: Mapping[str, str] = field(default_factory=dict)
     cells: CellResults | None = None
     worst_points: npt.NDArray[np.intp] | None = None
 
@@ -147,7 +145,6 @@ class Evaluations:
                 for name in dict.fromkeys(name for batch in batches for name in batch.metrics)
             },
             reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
-            files={name: digest for batch in batches for name, digest in batch.files.items()},
             worst_points=None if all(batch.worst_points is None for batch in batches) else np.concatenate(points),
             cells=None
             if len(cells) < len(batches)

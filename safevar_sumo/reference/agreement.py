@@ -17,7 +17,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.results import evaluation_keys
-from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study, study_names
+from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study, study_names, tables_of
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -182,7 +182,9 @@ def shipped_agreement(study: Study) -> pd.DataFrame:
     `SIMULATION_KEYS`.
     """
     frame = pd.read_csv(SHIPPED_AGREEMENT)
-    keys = {name: evaluation_keys(load_study(name)) for name in frame["study"].unique() if name in study_names()}
-    own_keys = evaluation_keys(study)
+    keys = {
+        name: evaluation_keys(tables_of(load_study(name))) for name in frame["study"].unique() if name in study_names()
+    }
+    own_keys = evaluation_keys(tables_of(study))
     same = [name for name, keys in keys.items() if all(keys[key] == own_keys[key] for key in SIMULATION_KEYS)]
     return frame[frame["study"].isin(same)]

@@ -204,9 +204,8 @@ class _Dossier:
         manifest = self._answer("manifest", {})
         for name in manifest["versions"]:
             yield self._say("manifest", f"{name} {{versions.{name}}}")
-        for layer in ("network", "sources"):
-            for name, digest in manifest[layer].items():
-                yield Statement(f"{layer}: {name}, sha256 {digest}...", command=self.sources["manifest"][0])
+        for name, digest in manifest["files"].items():
+            yield Statement(f"file: {name}, sha256 {digest}...", command=self.sources["manifest"][0])
         yield self._say(
             "checks",
             "Numbers that go in: {constants.published} published, {constants.fitted} fitted, {constants.assumed} "

@@ -9,7 +9,6 @@ import io
 import json
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -35,17 +34,15 @@ from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
-from safevar_sumo.plugins import file_by_name
+from safevar_sumo.plugins import file_by_name, is_shipped
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.report.dossier import dossier_page, make_dossier
 from safevar_sumo.report.measurements import check_study, settings_of, validate_with
 from safevar_sumo.report.pack import Description, PackedAnswer, PackedStudy, describe
 from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, read_manifest
-from safevar_sumo.results.journal import files_read_later
 from safevar_sumo.study import Origin, Study, convert_table, write_study
-from safevar_sumo.sumo.network import OPTIONS_FILE, open_network, options_of
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.network import OPTIONS_FILE, options_of
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -294,16 +291,13 @@ def study_text(study: Study) -> bytes:
 
 
 def _files_of_user(study: Study, directory: Path) -> dict[str, bytes]:
-    """The user's files that count in the identity of results, by the names that a pack gives them: code, files that
-    code reads, and networks in the folders of the study.
+    """The user's files that count in the identity of results, by the names that a pack gives them, and the views of
+    sumo-gui beside networks, without which SUMO does not start.
     """
-    sources = {**read_manifest(directory)["sources"], **files_read_later(directory)}
-    paths = {name: Path(path) for name in sources if (path := file_by_name(name, study.origin.places))}
-    networks = {point.scenario.network for point in assemble(study, study.source).points}
-    for network, root in product(networks, study.origin.places):
-        if Path(network).is_relative_to(root) and ".." not in Path(network).relative_to(root).parts:
-            opened = open_network(network)
-            view = options_of(opened.path(OPTIONS_FILE)).get("gui-settings-file", "")  # SUMO does not start without it
-            names = [*(name for name, _ in opened.digests), *([view] if view else [])]
-            paths |= {str((opened.folder / name).relative_to(root)): opened.folder / name for name in names}
-    return {name: path.read_bytes() for name, path in sorted(paths.items())}
+    places = study.origin.places
+    names = [name for name in read_manifest(directory)["files"] if not (Path(name).is_absolute() or is_shipped(name))]
+    for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
+        view = options_of(Path(file_by_name(name, places))).get("gui-settings-file", "")
+        names += [str(Path(name).with_name(view))] if view else []
+    paths = {name: file_by_name(name, places) for name in names}
+    return {name: Path(path).read_bytes() for name, path in sorted(paths.items()) if path}

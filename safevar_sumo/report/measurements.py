@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import scipy
 
@@ -15,7 +16,6 @@ from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.model_spread import HALF_WIDTH, compute_model_spreads
 from safevar_sumo.analysis.subject import load
-from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import SafevarError
@@ -138,8 +138,10 @@ def count_constants(study: Study) -> dict[str, int]:
     """Numbers of a study by origin: the characteristics' originals and domains and what [published] and [repeatability]
     hold; parameters that a fit has found; all others of vehicle, ADS, scenario and weather, with their defaults.
     """
-    resolved = identity_of(study, assemble(study, study.source))["resolved"]
-    tables = [resolved["weather"], *(resolved[name]["parameters"] for name in ("vehicle", "ads", "scenario"))]
+    system = assemble(study, study.source)
+    models = ((system.vehicle, study.vehicle), (system.ads, study.ads), (system.scenario, study.scenario))
+    tables = [model if isinstance(model, msgspec.Struct) else table.parameters for model, table in models]
+    tables = msgspec.to_builtins([system.weather, *tables])
     ends = 3 * len(study.vehicle.characteristics)  # original, lower and upper
     published = ends + len(study.published) + len(study.repeatability)
     fitted = len(study.spread)

@@ -22,7 +22,7 @@ from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, describe_error
-from safevar_sumo.plugins import digest_of
+from safevar_sumo.plugins import digest_of, file_by_name
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.report.evidence import (
     ANSWERS,
@@ -196,7 +196,7 @@ class _Part:
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(files[f"{CODE}/{name}"])
-            if manifest["sources"].get(name, digest_of(target)) != digest_of(target):
+            if manifest["files"].get(name, digest_of(target)) != digest_of(target):
                 raise InputError(path, f"{CODE}/{name} is not the file of the study's identity", PACK)
         self.subject = subject_of(packed, files, [str(folder)] if packed.code else [])
 
@@ -219,7 +219,8 @@ class _Part:
     def claims(self, names: Sequence[str], pool: Pool) -> Iterator[Claim]:
         """The claims with these names, made again: rows first."""
         packed, _, manifest, _ = self.subject
-        if missing := [name for name in manifest["sources"] if name not in packed.code]:
+        places = self.subject.study.origin.places
+        if missing := [name for name in manifest["files"] if not file_by_name(name, places)]:
             reason = f"the pack has only the digest of {', '.join(missing)}"
             yield from (Claim(packed.name, name, CANNOT, here=reason) for name in names)
             return
@@ -266,7 +267,7 @@ class _Part:
             yield files[file], self.subject.make(file, pool, self._progress)
         if name == "inputs":
             system = assemble(case.study, packed.name)
-            now = manifest_of(case.study, identity_of(case.study, system, pool))
+            now = manifest_of(case.study, identity_of(case.study, system))
             changes = [text for _, text, changes_simulations in differences(manifest, now) if changes_simulations]
             yield b"", "; ".join(changes).encode()
         elif name == "original vehicle":

@@ -22,11 +22,11 @@ from safevar_sumo.results.load import (
 )
 from safevar_sumo.results.manifest import (
     FILES as FILES,
-    LAYERS_OF_FILES as LAYERS_OF_FILES,
     MANIFEST as MANIFEST,
     ORIGINAL as ORIGINAL,
     RESULTS as RESULTS,
     SOLUTIONS as SOLUTIONS,
+    differences as differences,
     evaluation_keys as evaluation_keys,
     folders_of as folders_of,
     journal_file as journal_file,
@@ -41,7 +41,6 @@ from safevar_sumo.results.store import (
     UNKNOWN as UNKNOWN,
     ResultsDirectory as ResultsDirectory,
     evaluations_frame as evaluations_frame,
-    input_differences as input_differences,
     record as record,
     solutions_frame as solutions_frame,
     write_imported as write_imported,

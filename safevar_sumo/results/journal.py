@@ -23,13 +23,13 @@ import portalocker
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.results.manifest import FORMAT, RUNS, disk_errors
+from safevar_sumo.results.manifest import FORMAT, disk_errors
 
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
-POSITION, OUTCOME, REASON, FILES_READ = "evaluation", "outcome", "reason", "files"
+POSITION, OUTCOME, REASON = "evaluation", "outcome", "reason"
 FIRST_BYTES = b'{"format"'
 """What every journal begins with."""
 UNDAMAGED = "the file as it was, or no file: the run is then simulated again"
@@ -114,12 +114,8 @@ class Journal:
             self._file.close()
             raise
 
-    def append(
-        self, positions: Sequence[int], evaluations: Evaluations, files: Mapping[str, str] | None = None
-    ) -> None:
-        """Add a batch; `files` are digests of files that user code has read for the first time."""
-        if files:
-            self._write({FILES_READ: dict(files)})
+    def append(self, positions: Sequence[int], evaluations: Evaluations) -> None:
+        """Add a batch."""
         self._write(_batch_line(positions, evaluations, self._head["characteristics"]))
 
     def finish(self, positions: Sequence[int], asked: int, budget: int) -> None:
@@ -194,20 +190,6 @@ def read_journal(path: Path, head: JsonObject) -> JournalContent:
     if lines and lines[0] != head:
         raise InputError(path, ANOTHER_OWNER, "the manifest.json and journals of one study, as it was run")
     return _content_of(lines, path, head)._replace(tail_size=len(data) - end)
-
-
-def files_read_later(directory: Path) -> dict[str, str]:
-    """Digests, by name, of the files that user code read for the first time after the study began, from all journals of
-    a directory.
-    """
-    files = dict[str, str]()
-    start = msgspec.json.encode({FILES_READ: {}}).removesuffix(b"}}")  # most lines are long and need not be decoded
-    for path in sorted((directory / RUNS).glob("*.jsonl")):
-        with path.open("rb") as file:
-            for line in file:
-                if line.startswith(start) and line.endswith(b"\n"):
-                    files |= msgspec.json.decode(line)[FILES_READ]
-    return files
 
 
 def _open_and_lock(path: Path, deadline: float) -> IO[bytes]:

@@ -22,7 +22,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import DESCRIPTION_KEYS, Study, convert_table, tables_of
 from safevar_sumo.study.schema import Tables
 
-FORMAT = 4
+FORMAT = 5
 """Version number of the files' format."""
 RESULTS = 7
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
@@ -45,9 +45,8 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of a study's search table that change no evaluation, but decide which evaluations there are."""
 IDENTITY = {
-    "resolved": "the same study and options",
-    "network": "the network's file as it was",
-    "sources": "the file as it was",
+    "study": "the same study and options",
+    "files": "the file as it was",
     "results": "that version",
     "versions": "those versions",
     "platform": "such a machine",
@@ -55,8 +54,6 @@ IDENTITY = {
 """Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or
 REMEDY".
 """
-LAYERS_OF_FILES = ("network", "sources")
-"""Inputs that are a digest for each file; all workers must have the same files."""
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 ORIGINAL = "original"
 """Name of the original vehicle's journal."""
@@ -147,40 +144,45 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     return {
         "format": FORMAT,
         "study": tables_of(study),
-        "seed": study.search.seed,
-        "resolved": evaluation_keys(study),
         **identity,
         "versions": {name: version(name) for name in PACKAGES},
     }
 
 
-def evaluation_keys(study: Study) -> JsonObject:
-    """Study keys that affect evaluations."""
-    tables: JsonObject = tables_of(study)
-    for characteristic in tables["vehicle"]["characteristics"].values():
-        for key in DESCRIPTION_KEYS:
-            del characteristic[key]
-    search = {key: value for key, value in tables["search"].items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS}
+def evaluation_keys(tables: Tables) -> JsonObject:
+    """Those of a study's tables that affect evaluations."""
+    vehicle, search = tables["vehicle"], tables["search"]
+    characteristics = {
+        name: {key: value for key, value in row.items() if key not in DESCRIPTION_KEYS}
+        for name, row in vehicle["characteristics"].items()
+    }
     return {
         **{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS},
-        "search": search,
+        "vehicle": {**vehicle, "characteristics": characteristics},
+        "search": {key: value for key, value in search.items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS},
     }
+
+
+def identity_in(manifest: JsonObject) -> JsonObject:
+    """The inputs of a manifest, by `IDENTITY`."""
+    layers = {layer: manifest.get(layer, {}) for layer in IDENTITY}
+    return {**layers, "study": evaluation_keys(manifest["study"])}
 
 
 def identity_digest(manifest: JsonObject) -> str:
     """The digest that identifies a manifest's study in its journals."""
-    return sha256(json.dumps({layer: manifest.get(layer) for layer in IDENTITY}, sort_keys=True).encode()).hexdigest()
+    return sha256(json.dumps(identity_in(manifest), sort_keys=True).encode()).hexdigest()
 
 
 def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
-    """The differences between the inputs of stored results and other inputs.
+    """The differences between the inputs of two manifests: of stored results, and of now.
 
     Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other search libraries,
     other machines, other versions of this package with the same `RESULTS`, and new keys of a study do not.
     """
-    for layer in IDENTITY:
-        for key, before, after in _changed_values(stored.get(layer, {}), now.get(layer, {})):
-            if layer in LAYERS_OF_FILES:
+    for layer, inputs in identity_in(now).items():
+        for key, before, after in _changed_values(identity_in(stored)[layer], inputs):
+            if layer == "files":
                 change = "is new" if before is None else "has changed since"
                 text = f"{key} no longer exists" if after is None else f"{key} {change}"
             else:
@@ -189,7 +191,7 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
             is_harmless = (
                 layer == "platform"
                 or (layer == "versions" and key not in SIMULATORS)
-                or (layer == "resolved" and before is None)
+                or (layer == "study" and before is None)
             )
             yield layer, text, not is_harmless
 
@@ -206,12 +208,12 @@ def write_manifest(directory: Path, manifest: JsonObject) -> None:
 
 
 class _Manifest(Struct):
-    """What a reader of a manifest relies on; imported results have neither `sources` nor `folders`."""
+    """What a reader of a manifest relies on; imported results have neither `files` nor `folders`."""
 
     study: Study
     versions: dict[str, str]
     original: dict[str, bool | float | str | None]
-    sources: dict[str, str] = {}
+    files: dict[str, str] = {}
     folders: list[str] = []
 
 

@@ -16,13 +16,11 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
-from safevar_sumo.plugins import digest_of, file_by_name
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
-from safevar_sumo.results.journal import Journal, JournalBusyError, files_read_later, journal_head, read_journal
+from safevar_sumo.results.journal import Journal, JournalBusyError, journal_head, read_journal
 from safevar_sumo.results.manifest import (
     FORMAT,
     IDENTITY,
-    LAYERS_OF_FILES,
     MANIFEST,
     RUNS,
     SOLUTIONS,
@@ -37,7 +35,7 @@ from safevar_sumo.results.manifest import (
     write_manifest,
     write_whole,
 )
-from safevar_sumo.study import Study, tables_of, user_code_names
+from safevar_sumo.study import Study, tables_of
 from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
@@ -77,9 +75,8 @@ class ResultsDirectory:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
         self._refuse_another_study()
-        self.inputs: JsonObject = {layer: self.manifest.get(layer, {}) for layer in LAYERS_OF_FILES}
-        """Digests, by layer, of the files that all workers must share."""
-        self.inputs["sources"] = self.inputs["sources"] | _later_files(path, study)
+        self.files: dict[str, str] = self.manifest.get("files", {})
+        """Digests of the files that all workers must share."""
 
     @property
     def digest(self) -> str:
@@ -120,29 +117,8 @@ class ResultsDirectory:
         problem = "holds results of another study"
         if "imported" in stored:
             raise InputError(self.path, f"{problem}: they are imported", "another `out`")
-        for layer, text, _ in input_differences(self.path, stored, self.manifest, self._study):
+        for layer, text, _ in differences(stored, self.manifest):
             raise InputError(self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}")
-
-
-def input_differences(
-    directory: Path, stored: JsonObject, now: JsonObject, study: Study
-) -> list[tuple[str, str, bool]]:
-    """The `differences` between the stored inputs of a directory's results and present inputs; with the files that user
-    code read for the first time after the study began.
-    """
-    later = _later_files(directory, study)
-    later_now = {name: digest for name in later if (digest := digest_of(file_by_name(name, study.origin.places)))}
-    return list(
-        differences(
-            {**stored, "sources": later | stored.get("sources", {})},
-            {**now, "sources": later_now | now.get("sources", {})},
-        )
-    )
-
-
-def _later_files(directory: Path, study: Study) -> dict[str, str]:
-    has_user_code = user_code_names(study) or any(":" in name for name in study.search.algorithms)
-    return files_read_later(directory) if has_user_code else {}
 
 
 def solutions_frame(

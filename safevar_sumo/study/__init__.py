@@ -9,10 +9,11 @@ from safevar_sumo.study.characteristics import (
 )
 from safevar_sumo.study.file import (
     SCHEMA_LINE as SCHEMA_LINE,
+    data_files as data_files,
     fmus_of as fmus_of,
     load_study as load_study,
     user_code_names as user_code_names,
-    user_code_packages as user_code_packages,
+    user_modules as user_modules,
     write_study as write_study,
 )
 from safevar_sumo.study.schema import (

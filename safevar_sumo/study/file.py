@@ -279,9 +279,9 @@ def fmus_of(study: Study) -> list[tuple[str, str]]:
     ]
 
 
-def user_code_packages(study: Study) -> list[str]:
-    """The top-level packages of a study's user code."""
-    return sorted({name.partition(":")[0].partition(".")[0] for _, name in _keys_of_user_code(study)})
+def user_modules(study: Study) -> list[str]:
+    """The modules of a study's user code."""
+    return sorted({name.partition(":")[0] for _, name in _keys_of_user_code(study)})
 
 
 def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
@@ -293,6 +293,7 @@ def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
         "scenario.model": [study.scenario.model, *tests],
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
+        "search.algorithms": study.search.algorithms,
         "constraints.function": [constraint.function for constraint in study.constraints],
     }
     fmus = fmus_of(study)
@@ -302,3 +303,23 @@ def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
         for name in dict.fromkeys(names)
         if ":" in name and (key, name) not in fmus
     ]
+
+
+def data_files(study: Study) -> dict[str, str]:
+    """The paths of the data files and folders that a study names, by their names.
+
+    Raises
+    ------
+    InputError
+        If one of them does not exist.
+    """
+    places = study.origin.places or (os.getcwd(),)
+    paths = {}
+    for key, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
+        for name in table.files:
+            found = [os.path.abspath(path) for place in places if (path := Path(place, name)).exists()]
+            if not found:
+                problem = f"{key}.files: there is no file {name!r}"
+                raise InputError(study.source, problem, f"the path of a file or folder, relative to {places[0]}")
+            paths[name] = found[0]
+    return paths

@@ -46,7 +46,8 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
     its path: `inputs` and `outputs` are the FMU's variables by the quantity they receive or return; `step` [s] is the
-    FMU's time step, by default the declared step.
+    FMU's time step, by default the declared step. `files` are data files, or folders of them, that a model of your
+    own reads, relative to the study's file.
     """
 
     model: str
@@ -55,6 +56,7 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     inputs: dict[str, str] = {}
     outputs: dict[str, str] = {}
     step: FmuStep | None = None
+    files: list[str] = []
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,7 +65,8 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     A vehicle of the `kind` `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its
     parameters are the characteristics, whose rows state only what the FMU does not declare. `sensors` and `sumo_type`
     map properties of the sensors and of SUMO's vehicle type to a characteristic or a number; `sumo_type` may also name
-    variables of the FMU.
+    variables of the FMU. `files` are data files, or folders of them, that a model of your
+    own reads, relative to the study's file.
     """
 
     model: str
@@ -75,6 +78,7 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     sensors: dict[str, str | float] = {}
     sumo_type: dict[str, str | float] = {}
     step: FmuStep | None = None
+    files: list[str] = []
 
 
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

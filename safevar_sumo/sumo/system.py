@@ -214,7 +214,7 @@ def assemble(study: Study, source: str = "") -> System:
     _check_units(study, vehicle, is_shipped_vehicle, source)
     if isinstance(ads, TraciController) and isinstance(vehicle, GuardedVehicle):
         vehicle.require_sensors()
-    measuring = measuring_of(study, Lookup(source, study.origin.places))
+    measuring = measuring_of(study, Lookup.of(study, source))
     tables_of_metrics = {
         "published": study.published,
         "repeatability": study.repeatability,
@@ -250,7 +250,7 @@ def assemble(study: Study, source: str = "") -> System:
 
 def models_of(study: Study, source: str) -> tuple[Vehicle, Ads, Scenario, Weather]:
     """The study's models with their parameters; raises the errors of `assemble`."""
-    lookup = Lookup(source, study.origin.places)
+    lookup = Lookup.of(study, source)
     vehicle, ads = _create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup)
     return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather, source)
 
@@ -279,7 +279,7 @@ def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
     points = []
     for test in () if study.matrix is None else study.matrix.tests:
-        lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
+        lookup = Lookup.of(study, f"{source}: test {test.name!r}")
         model, shared = test.model or study.scenario.model, dict(test.parameters)
         if model == study.scenario.model:
             shared = {**study.scenario.parameters, **shared}

@@ -164,7 +164,7 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     characteristics = CharacteristicSet.of(study)
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
-    lookup = Lookup(source, study.origin.places)
+    lookup = Lookup.of(study, source)
     bounds = tuple(
         _bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]")
         for number, constraint in enumerate(study.constraints)

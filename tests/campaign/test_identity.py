@@ -5,7 +5,6 @@ once, and the campaign goes on to the same bytes.
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -16,37 +15,21 @@ import pytest
 
 from safevar_sumo import output
 from safevar_sumo.campaign import all_runs, run_campaign
-from safevar_sumo.campaign.evaluation import Task, evaluate_batch, network_digests
-from safevar_sumo.campaign.identity import identity_of, source_digests
+from safevar_sumo.campaign.evaluation import Task, evaluate_batch
+from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.results import ResultsDirectory, journal, load_runs, manifest
-from safevar_sumo.results.manifest import IDENTITY
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import EventLog, FormulaPool
-from tests.in_process import InlinePool
-
-
-def test_names_and_defaults_are_resolved_to_numbers() -> None:
-    study = load_study("rain")
-    identity = identity_of(study, assemble(study))
-    assert set(identity) <= set(IDENTITY)
-    assert json.dumps(identity, allow_nan=False)
-    assert identity["resolved"]["weather"]["road_friction"] == 1
-    given = load_study("rain", ads={"parameters": {}}).ads.parameters
-    resolved = identity["resolved"]["ads"]["parameters"]
-    assert set(resolved) >= set(given)
-    assert "duration" in identity["resolved"]["scenario"]["parameters"], "a default"
-    assert not {"title", "published", "spread"} & set(identity["resolved"])
-    assert not {"runs", "algorithms", "evaluations", "time_limit"} & set(identity["resolved"]["search"])
 
 
 def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
     study = load_study("native", scenario={"parameters": {"network": str(tmp_path / "mine")}})
-    packed_task = Task(study=study, inputs={"network": network_digests(assemble(study))}).packed
+    packed_task = Task(study=study, files=files_of(study)).packed
     original = CharacteristicSet.of(study).original[None]
     evaluate_batch(packed_task, original)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
@@ -63,78 +46,78 @@ import my_maps.rules
 from my_space import roads
 from safevar_sumo.ads import ScalarAds
 
-HERE = Path(__file__).parent
-
 
 class Mine(ScalarAds):
-    def __init__(self, weights, table="", outside=""):
+    def __init__(self, weights):
         self.gap = json.loads(Path(weights).read_text())["gap"]
-        self.seen = not outside or Path(outside).read_text()
 
     def drive(self, seen):
         import my_lazy
-        (HERE / "tiles" / "1.txt").read_bytes()
-        (HERE / "both.txt").open("r+").close()
-        (HERE / "log.txt").write_text("written, then read")
-        (HERE / "log.txt").read_text()
         return (0.0, 1.0) if seen.gap < self.gap else (0.5, 0.0)
 """
 FILES = {
     "my_ads.py": ADS,
     "my_maps/__init__.py": "",
-    "my_maps/rules.py": "import numpy\n",
-    "my_maps/unused.py": "",
+    "my_maps/rules.py": "import numpy\nimport my_helper\n",
+    "my_maps/table.txt": "",
     "my_space/roads.py": "",
     "my_lazy.py": "X = 1\n",
+    "my_helper.py": "",
     "weights.json": '{"gap": 9.0}',
     "tiles/1.txt": "tile",
     "tiles/2.txt": "another tile",
-    "unused.py": "",
-    "table.bin": "read by compiled code",
-    "both.txt": "opened to be read and written",
 }
+UNUSED = {"unused.py": "", "json/mine.py": "", "log.txt": "", "tiles/.hidden": ""}
 STUDY = """
 extends = "smoke"
 [ads]
 model = "my_ads:Mine"
-parameters = { weights = "weights.json", table = "table.bin" }
+parameters = { weights = "weights.json" }
+files = ["weights.json", "tiles"]
 """
-READ = {
-    "my_ads.py",
-    "my_maps/__init__.py",
-    "my_maps/rules.py",
-    "my_space/roads.py",
-    "my_lazy.py",
-    "weights.json",
-    "tiles/1.txt",
-    "table.bin",
-    "both.txt",
-}
 
 
 @pytest.fixture
 def place(in_tmp: Path) -> Path:
     """A study with its files, in a folder that is not the working directory."""
-    for name, text in FILES.items():
+    for name, text in {**FILES, **UNUSED}.items():
         (in_tmp / "there" / name).parent.mkdir(exist_ok=True, parents=True)
         (in_tmp / "there" / name).write_text(text)
     (in_tmp / "there" / "mine.toml").write_text(STUDY)
     return in_tmp / "there"
 
 
-def read(place: Path) -> dict[str, str]:
-    return source_digests(load_study(place / "mine.toml"), InlinePool())
-
-
-def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(
+def test_imported_modules_whole_packages_and_named_files_count_wherever_the_command_is_started(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = read(place)
-    assert set(result) == READ
+    def files(place: Path) -> dict[str, str]:
+        return files_of(load_study(place / "mine.toml"))
+
+    result = files(place)
+    network = {name for name in result if name.startswith("pedestrian_crossing/")}
+    assert {"pedestrian_crossing/traffic.rou.xml", "pedestrian_crossing/scenario.sumocfg"} <= network
+    assert set(result) - network == set(FILES)
     monkeypatch.chdir(place / "tiles")
-    assert read(place) == result
+    assert files(place) == result
     shutil.copytree(place, place.parent / "copy")
-    assert read(place.parent / "copy") == result, "no name holds where the study lies"
+    assert files(place.parent / "copy") == result, "no name holds where the study lies"
+
+
+@pytest.mark.parametrize(
+    ("files", "problem", "legal"),
+    [
+        ("[]", "ads.parameters.weights = 'weights.json': the study does not name this file", "[ads]"),
+        ('["weight.json"]', "ads.files: there is no file 'weight.json'", "relative to"),
+    ],
+)
+def test_a_file_that_a_study_does_not_name_or_that_is_missing_is_refused(
+    files: str, problem: str, legal: str, place: Path
+) -> None:
+    (place / "mine.toml").write_text(STUDY.replace('["weights.json", "tiles"]', files))
+    with pytest.raises(InputError) as refused:
+        assemble(load_study(place / "mine.toml"))
+    assert problem in refused.value.problem
+    assert legal in refused.value.legal
 
 
 KINDS = (errno.EIO, errno.ENOSPC, errno.EINTR, 0)

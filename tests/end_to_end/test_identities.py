@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, read_manifest
@@ -59,6 +58,8 @@ def edited(path: str, old: str, new: str) -> None:
 
 
 MATRIX = """
+[scenario]
+files = ["table.txt", "near.txt", "far.txt"]
 [matrix]
 [[matrix.tests]]
 name = "as it is"
@@ -92,7 +93,7 @@ def refused(*words: str) -> str:
 
 
 @pytest.mark.slow
-def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results_refuses_by_name(
+def test_code_and_named_files_count_and_every_command_that_simulates_results_refuses_by_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX)
@@ -102,8 +103,13 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
     run("study", "../mine.toml", "--out", "../out", "--quiet")
-    assert {*files, "my_ads.py", "my_map.py"} == set(read_manifest(Path("../out"))["sources"])
+    assert {*files, "my_ads.py", "my_map.py"} <= set(read_manifest(Path("../out"))["files"])
     run("study", "../mine.toml", "--out", "../out", "--runs", "2", "--quiet")
+    listed = [path.relative_to("../out").as_posix() for path in Path("../out").rglob("*") if path.is_file()]
+    assert {row for row in FILES if any(fnmatch(name, row[0]) for name in listed)} == {*FILES}
+    assert [name for name in listed if not any(fnmatch(name, row[0]) for row in FILES)] == [], (
+        "a file that the manual does not list"
+    )
     for name, text in files.items():
         Path("..", name).write_text(f"{text}\n# a comment\n")
         assert f"{name} has changed since" in refused("study", "../mine.toml", "--out", "../out", "--runs", "3")
@@ -116,31 +122,3 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
     done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"])
     assert done.exit_code == 0, done.exception
     assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
-
-
-@pytest.mark.slow
-def test_a_file_that_is_read_later_counts_from_then_on() -> None:
-    top = sv.simulate("mine.toml").runs.trace.speed.max()
-    Path("my_ads.py").write_text(
-        ADS.replace(
-            "def drive(self, seen):",
-            f"""def drive(self, seen):
-        if seen.speed > {float(top)!r}:
-            open("tile.txt").read()""",
-        )
-    )
-    Path("tile.txt").write_text("a tile")
-    edited("mine.toml", "evaluations = 30", "evaluations = 60")
-    study()
-    files = [path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file()]
-    assert {row for row in FILES if any(fnmatch(name, row[0]) for name in files)} == {*FILES}
-    assert [name for name in files if not any(fnmatch(name, row[0]) for row in FILES)] == [], (
-        "a file that the manual does not list"
-    )
-    assert "tile.txt" not in read_manifest(Path("out"))["sources"], "the original vehicle is never so fast"
-    before = Path("out/solutions.csv").read_bytes()
-    study()
-    assert Path("out/solutions.csv").read_bytes() == before
-    Path("tile.txt").write_text("another tile")
-    assert "tile.txt has changed since" in refused("study", "mine.toml", "--out", "out", "--runs", "2")
-    assert "tile.txt has changed since" in refused("rules", "out")

@@ -28,7 +28,7 @@ from safevar_sumo.results import (
     status,
 )
 from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study, load_study, tables_of
 from tests.campaign.formulas import with_search
 from tests.in_process import refused, run
 from tests.made_up import made_up_evaluations
@@ -132,29 +132,26 @@ def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, tex
         ResultsDirectory(tmp_path, study)
 
 
-def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys() -> None:
-    stored = {
-        "resolved": {"a": 1},
-        "network": {},
-        "sources": {"x.py": "0"},
-        "results": 1,
-        "versions": {"numpy": "1", "libsumo": "1"},
-    }
+def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys(study: Study) -> None:
+    tables = tables_of(study)
+    stored = {"study": tables, "files": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1", "libsumo": "1"}}
 
     def changed(**layers: object) -> list[tuple[str, bool]]:
         return [
             (text, changes_simulations) for _, text, changes_simulations in differences(stored, {**stored, **layers})
         ]
 
-    assert changed(resolved={"a": 1, "b": False}, versions={"numpy": "2", "libsumo": "1"}) == [
-        ("b was None and is False now", False),
+    assert changed(study={**tables, "new": False}, versions={"numpy": "2", "libsumo": "1"}) == [
+        ("new was None and is False now", False),
         ("version of numpy was '1' and is '2' now", False),
     ]
-    assert changed(resolved={"a": 2}, sources={}, results=2, versions={"numpy": "1", "libsumo": "2"}) == [
-        ("a was 1 and is 2 now", True),
+    assert not changed(study={**tables, "title": "new"})
+    assert changed(study={**tables, "weather": "fog"}, files={}, results=2, versions={"libsumo": "2"}) == [
+        (f"weather was {tables['weather']!r} and is 'fog' now", True),
         ("x.py no longer exists", True),
         ("the version of the package's results was 1 and is 2 now", True),
         ("version of libsumo was '1' and is '2' now", True),
+        ("version of numpy was '1' and is None now", False),
     ]
 
 
@@ -240,7 +237,7 @@ def copied(slippery: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(slippery, tmp_path / "it"))
 
 
-@pytest.mark.parametrize(("number", "release"), [(3, "0.2.0"), (5, "9.0.0")])
+@pytest.mark.parametrize(("number", "release"), [(4, "0.3.0"), (6, "9.0.0")])
 def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     number: int, release: str, copied: Path
 ) -> None:

@@ -338,6 +338,6 @@ def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:
 
 def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> None:
     study = load_study("native", limits={"decel": {"at_least": 6, "source": "workshop manual"}})
-    assert evaluation_keys(study) == evaluation_keys(load_study("native"))
+    assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(load_study("native")))
     assert "limits" not in tables_of(load_study("native"))
     assert load_study(tables_of(study)).limits == study.limits

@@ -131,7 +131,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns;
     shape (k, n).
     """
-    system, lookup, label = assemble(study), Lookup(study.source, study.origin.places), name.rpartition(":")[2]
+    system, lookup, label = assemble(study), Lookup.of(study), name.rpartition(":")[2]
     member = lookup.find(ALGORITHMS, name, "search.algorithms")
     parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
     original = _smooth_evaluations(system, system.characteristics.original[np.newaxis])
