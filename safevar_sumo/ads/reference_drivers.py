@@ -24,12 +24,25 @@ from safevar_sumo.ads.base import (
     time_to_reach,
 )
 from safevar_sumo.ads.car_following import KEEPING_GAINS
-from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import (
+    GRAVITY,
+    KMH_PER_MS,
+    TIME_ROUNDING,
+    BoolArray,
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+)
 
 HARDEST_BRAKING = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
 JERK = 12.65
 """Jerk limit while that deceleration builds up [m/s^3] (UN R157, annex 4, appendix 3)."""
+ANY_BRAKING = 0.5
+"""Deceleration above which a leader counts as braking [m/s^2]."""
+DECELERATION_ROUNDING = 1e-6
+"""Difference below which two decelerations over a time step count as equal [m/s^2]."""
 UNLIMITED_BRAKING = 1e6
 """Deceleration beyond every brake [m/s^2]; it presses the pedal fully."""
 CRUISE_GAIN = 1.0
@@ -38,6 +51,24 @@ LEAST_DIVISOR = 1e-9
 """Lower bound of an acceleration [m/s^2] or of a ramp's width [m] that is a divisor."""
 StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 """Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
+
+
+class Leader(NamedTuple):
+    """What a reference driver remembers of who is in the way of N vehicles; arrays have shape (N,).
+
+    Attributes
+    ----------
+    speed
+        Its speed at the last call [m/s]; 0 if nobody was in the way.
+    has_braked
+        Whether it has braked while it was in the way.
+    time_gap
+        The time gap to it at the last call before it braked [s].
+    """
+
+    speed: FloatArray
+    has_braked: BoolArray
+    time_gap: FloatArray
 
 
 class Reaction(NamedTuple):
@@ -55,6 +86,8 @@ class Reaction(NamedTuple):
         Time since the driver first saw the danger [s]; negative without a danger.
     felt_deceleration, intended_deceleration
         The vehicle's deceleration while the driver did not brake yet, and the one that the driver aims at [m/s^2].
+    leader
+        Who is in the way.
     """
 
     nominal: Nominal
@@ -64,6 +97,7 @@ class Reaction(NamedTuple):
     danger_time: FloatArray
     felt_deceleration: FloatArray
     intended_deceleration: FloatArray
+    leader: Leader
 
     def acceleration(self, seen: Observation) -> FloatArray:
         """Mean acceleration since the last call [m/s^2]; 0 at the first call."""
@@ -81,7 +115,24 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     corridor: PositiveParameter = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n))
+        leader = Leader(np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n))
+        return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n), leader)
+
+    def watch_leader(self, seen: Observation, memory: Reaction, is_in_way: BoolArray) -> tuple[FloatArray, Reaction]:
+        """The mean deceleration of a leader since the last call [m/s^2], 0 without one; and the memory with the
+        leader as it is now.
+        """
+        last = memory.leader
+        is_led = is_in_way & (last.speed > 0)
+        deceleration = np.where(is_led, (last.speed - np.where(is_led, seen.obstacle_speed, 0.0)) / memory.step, 0.0)
+        has_braked = is_in_way & (last.has_braked | (deceleration > ANY_BRAKING + DECELERATION_ROUNDING))
+        time_gap = np.where(is_in_way, seen.gap, 0.0) / np.maximum(seen.speed, LEAST_DIVISOR)
+        leader = Leader(
+            speed=np.where(is_in_way, seen.obstacle_speed, 0.0),
+            has_braked=has_braked,
+            time_gap=np.where(has_braked, last.time_gap, time_gap),
+        )
+        return deceleration, memory._replace(leader=leader)
 
     def react(
         self,
@@ -132,12 +183,12 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             acceleration = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
             calm = pedals_for(nominal, seen.speed, acceleration, initial_trim)
         command = Command(np.where(is_reacting, 0.0, calm.throttle), np.where(is_reacting, brake, calm.brake))
-        return command, Reaction(nominal, step, cruise, seen.speed, danger_time, felt, intended)
+        return command, Reaction(nominal, step, cruise, seen.speed, danger_time, felt, intended, memory.leader)
 
 
 class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
-    """Brakes fully as soon as an obstacle is in its way or will be there when the vehicle arrives: the best that a
-    driver can do.
+    """Brakes fully as soon as it approaches an obstacle that is in its way or will be there when the vehicle arrives:
+    the best that a driver can do.
 
     Parameters
     ----------
@@ -152,17 +203,20 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
     start_throttle: StartThrottle = ()
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        danger = is_in_the_way(seen, self.corridor)
+        danger = is_in_the_way(seen, self.corridor) & (seen.closing_speed > 0)
         return self.react(
             seen, memory, danger, UNLIMITED_BRAKING, reaction_time=0.0, jerk=np.inf, start=self.start_throttle
         )
 
 
 class R157(ReferenceDriver, frozen=True, kw_only=True):
-    """Reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
+    """An automated lane keeping system that does what UN R157, 5.2.5, demands, and no more.
 
-    v and u are the speeds of the vehicle and the obstacle. UN R157, 5.2.5.2, requires this braking of an automated lane
-    keeping system.
+    To who enters its way, and to who stands or drives steadily in it, it reacts at a TTC below
+    (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, with the speeds v and u of the vehicle and the obstacle, and brakes with
+    6 m/s^2 at once (5.2.5.2, which means it for cars that cut in). Behind a leader that brakes, 5.2.5.1 counts: no
+    collision if the time gap was at least 1 s + v / (100 km/h) s. Then it brakes in the same way as soon as the leader
+    does, which is enough; nearer the regulation demands nothing, and it does not react to the leader's braking.
 
     Parameters
     ----------
@@ -179,8 +233,12 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     margin: NonNegativeParameter = 0.1
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        is_in_way = is_in_the_way(seen, self.corridor)
+        _, memory = self.watch_leader(seen, memory, is_in_way)
+        leader, least_time_gap = memory.leader, 1 + seen.speed * KMH_PER_MS / 100
         critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
-        danger = is_in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
+        keeps_distance = leader.time_gap >= least_time_gap - TIME_ROUNDING
+        danger = is_in_way & np.where(leader.has_braked, keeps_distance, time_to_reach(seen) < critical_ttc)
         jerk = self.deceleration / memory.step  # reaches the deceleration within a step
         return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk)
 
@@ -188,7 +246,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
 
-    A gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
+    A gap below the safe distance is a danger, to which it reacts and brakes.
     safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and
     leader.
 
@@ -199,7 +257,10 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time
         rt [s].
     acceleration, deceleration, leader_deceleration
-        Acceleration a while it reacts, deceleration b of its own braking and b_u of the leader's braking [m/s^2].
+        Acceleration a while it reacts, decelerations b and b_u of its own and of the leader's braking, with which it
+        plans [m/s^2].
+    braking
+        Deceleration with which it brakes, by default 0.774 g [m/s^2].
     corridor
         Half the width of the corridor that it watches [m].
     """
@@ -207,12 +268,13 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time: NonNegativeParameter = 0.75
     acceleration: NonNegativeParameter = 0.0
     deceleration: PositiveParameter = HARDEST_BRAKING
+    braking: PositiveParameter = HARDEST_BRAKING
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         is_too_near = seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed)
         danger = is_in_the_way(seen, self.corridor) & is_too_near
-        return self.react(seen, memory, danger, self.deceleration, self.reaction_time)
+        return self.react(seen, memory, danger, self.braking, self.reaction_time)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
@@ -299,19 +361,26 @@ class _Perceiving(NamedTuple):
         the way.
     stray_time
         Time since the obstacle strayed from this position [s], negative before.
+    braking_time
+        Time since a leader began to brake harder than `leader_braking` [s], negative before.
     """
 
     reaction: Reaction
     first_lateral: FloatArray
     appeared_in_way: BoolArray
     stray_time: FloatArray
+    braking_time: FloatArray
 
 
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
 
-    Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with
-    up to 0.774 g.
+    Holds its speed or a headway, perceives a danger, reacts, and brakes with up to 0.774 g. The danger is
+
+    - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a standing car this is a
+      time headway of 2 s;
+    - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
+      by the letter the driver does not react.
 
     While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
     Behind a moving leader it keeps its headway by the accelerator only:
@@ -327,6 +396,9 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     stray, perception_time
         An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
         position [m, s].
+    leader_braking
+        Deceleration of a leader above which its braking is a danger [m/s^2], perceived `perception_time` after it
+        begins; 5 by the letter of the regulation, 0.5 for any braking.
     lets_go
         Largest deceleration by which it lets its gap to a leader grow to the headway [m/s^2].
     headway
@@ -341,23 +413,30 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time: NonNegativeParameter = 0.75
     stray: NonNegativeParameter = 0.375
     perception_time: NonNegativeParameter = 0.4
+    leader_braking: NonNegativeParameter = 5.0
     lets_go: NonNegativeParameter = 0.4
     headway: PositiveParameter = 2.0
     start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
         reaction: Reaction = ReferenceDriver.start(self, n, nominal, step)
-        return _Perceiving(reaction, np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
+        return _Perceiving(reaction, np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0), np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         is_perceived, memory = self._perceive(seen, memory)
         is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
-        danger = is_in_way & (time_to_reach(seen) < self.critical_ttc)
+        deceleration, reaction = self.watch_leader(seen, memory.reaction, is_in_way)
+        brakes_now = deceleration > self.leader_braking + DECELERATION_ROUNDING
+        begun = np.where(brakes_now, 0.0, -1.0)
+        braking_time = np.where(memory.braking_time >= 0, memory.braking_time + reaction.step, begun)
+        brakes = braking_time >= self.perception_time - TIME_ROUNDING
+        is_near = time_to_reach(seen) < self.critical_ttc
+        danger = is_in_way & np.where(reaction.leader.has_braked, brakes, is_near)
         following = self._following(seen, is_in_way)
         command, reaction = self.react(
-            seen, memory.reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following
+            seen, reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following
         )
-        return command, memory._replace(reaction=reaction)
+        return command, memory._replace(reaction=reaction, braking_time=np.where(is_in_way, braking_time, -1.0))
 
     def _following(self, seen: Observation, is_in_way: BoolArray) -> FloatArray:
         """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite if no leader is in the way."""
@@ -380,4 +459,6 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         new_stray_time = np.where(strays_now, 0.0, -1.0)
         stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
         is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
-        return is_perceived, _Perceiving(memory.reaction, first_lateral, appeared_in_way, stray_time)
+        return is_perceived, memory._replace(
+            first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
+        )

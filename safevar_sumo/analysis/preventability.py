@@ -1,25 +1,28 @@
 """Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
 
 If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible
-moment avoids it, the vehicle is the cause. UN R157 means its driver for cars that cut in, cut out or brake on
+moment avoids it, the vehicle is the cause. A driver who collides at a point in the original vehicle, too, says nothing
+about a changed vehicle there: no verdict. UN R157 means its driver for cars that cut in, cut out or brake on
 motorways; its use for pedestrians is ours. How fast a driver reacts to a pedestrian is therefore uncertain: the share
-of collisions that the driver avoids is computed for a later reaction, too.
+of collisions that the driver avoids is computed for a later reaction, too. The regulation names no danger if a leader
+brakes with 5 m/s^2 or less: there are two conventions, and both are computed.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from msgspec.structs import replace
 
-from safevar_sumo.ads.reference_drivers import CompetentDriver
+from safevar_sumo.ads.reference_drivers import ANY_BRAKING, CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.words import number_of, share_in_words
+from safevar_sumo.analysis.words import number_of, points_named, share_in_words
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import System, assemble
@@ -27,155 +30,169 @@ from safevar_sumo.sumo.system import System, assemble
 MAX_SIMULATIONS = 20_000
 """Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated.
 """
-
 DELAY = 0.4
-"""Time by which the competent driver reacts later in the second of the two computations [s]."""
-LATER_REACTION = CompetentDriver().reaction_time + DELAY
-"""Reaction time in the second computation [s]."""
-SIMULATIONS = 3
-"""Simulations of each collision: a competent driver, the same with the later reaction, and full braking."""
-
-
-class PreventableBy(StrEnum):
-    """The weakest reference driver that avoids a collision in the same vehicle; NOBODY if none avoids it."""
-
-    COMPETENT_DRIVER = "preventable by a competent driver"
-    FULL_BRAKING = "preventable by full braking at the first possible moment"
-    NOBODY = "physically unavoidable"
-
-
-Avoidance = tuple[PreventableBy, bool]
-"""The weakest driver who avoids a collision, and whether the competent driver does with `LATER_REACTION`."""
+"""Time by which a competent driver reacts later in the second of two computations [s]."""
+LATER = {"reaction_time": CompetentDriver().reaction_time + DELAY}
+ANY = {"leader_braking": ANY_BRAKING}
+LETTER, ANY_LEADER, FULL = "competent_driver", "competent_driver_any_braking", "full_braking"
+DRIVERS: dict[str, tuple[str, JsonObject]] = {
+    LETTER: ("competent_driver", {}),
+    ANY_LEADER: ("competent_driver", ANY),
+    FULL: ("full_braking", {}),
+    f"{LETTER}_later": ("competent_driver", LATER),
+    f"{ANY_LEADER}_later": ("competent_driver", ANY | LATER),
+}
+"""Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
+TITLES = {
+    LETTER: "a competent driver",
+    ANY_LEADER: "one who reacts to any braking of a leader, not only above 5 m/s^2,",
+    FULL: "full braking at the first possible moment",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Counts of collisions, or of a random sample of them, by category: the weakest driver that avoids a collision.
+    """What the reference drivers do in collisions, or in a random sample of them.
 
     The collisions are the distinct solutions that collide; without results, the settings drawn from the study's domain
     that collide.
 
     Attributes
     ----------
-    counts
-        Number of simulated collisions in each category; the categories are disjoint.
+    verdicts
+        The result of `judge_collisions` for the simulated collisions.
     collisions
         Number of all these collisions, simulated with the reference drivers or not.
-    later
-        Number of simulated collisions that the competent driver avoids with `LATER_REACTION`.
     """
 
-    counts: Mapping[PreventableBy, int]
+    verdicts: pd.DataFrame
     collisions: int
-    later: int
-
-    @property
-    def looked_at(self) -> int:
-        """Number of collisions simulated with the reference drivers."""
-        return sum(self.counts.values())
-
-    def share(self, category: PreventableBy) -> float:
-        """The share of a category among the simulated collisions; 0 if no collision was simulated."""
-        return self.counts.get(category, 0) / max(self.looked_at, 1)
 
     @property
     def shares(self) -> dict[str, float]:
-        """The shares of all categories, and `later`, by name; empty if no collision was simulated."""
-        if not self.looked_at:
-            return {}
-        return {by.name.lower(): self.share(by) for by in PreventableBy} | {"later": self.later / self.looked_at}
-
-    def to_dict(self) -> JsonObject:
-        """The shares, None without a simulated collision, and the competent driver's 95 % interval, for JSON.
-
-        If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a
-        sample the interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite
-        population.
-        """
-        number, shares, interval = self.looked_at, self.shares, None
-        if number:
-            driver, count = PreventableBy.COMPETENT_DRIVER, self.counts.get(PreventableBy.COMPETENT_DRIVER, 0)
-            interval = [self.share(driver)] * 2 if number == self.collisions else [*clopper_pearson(count, number)]
-        return {
-            **{by.name.lower(): shares.get(by.name.lower()) for by in PreventableBy},
-            "looked_at": number,
-            "interval_competent_driver": interval,
-            "later": {"reaction": LATER_REACTION, "competent_driver": shares.get("later")},
-        }
+        """The share that each driver avoids of the collisions on which he has a verdict; without a verdict no share."""
+        shares = ((driver, float(self.verdicts[driver].mean())) for driver in DRIVERS)
+        return {driver: share for driver, share in shares if not np.isnan(share)}
 
     @property
-    def range_in_words(self) -> str:
-        """The share of collisions that the competent driver avoids: `71 % (39 % if he needs 0.4 s longer)`."""
-        later = share_in_words(self.later / max(self.looked_at, 1))
-        return f"{share_in_words(self.share(PreventableBy.COMPETENT_DRIVER))} ({later} if he needs {DELAY:g} s longer)"
+    def drivers(self) -> list[JsonObject]:
+        """A row for each driver, if a collision was simulated.
+
+        The numbers of collisions that he has `avoided`, avoids with a `later` reaction, and has `no_verdict` on; the
+        `share` that he avoids of those with a verdict, with the ends `share_low` and `share_high` of its 95 % interval:
+        Clopper and Pearson's for a sample (slightly too wide, without a correction for the finite population), the
+        share itself if all collisions were simulated; the share with the later reaction; and the names of the points
+        without a verdict.
+        """
+        rows, verdicts, shares = list[JsonObject](), self.verdicts, self.shares
+        for driver in TITLES if len(verdicts) else ():
+            later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
+            low = high = shares.get(driver)
+            if number and len(verdicts) < self.collisions:
+                low, high = clopper_pearson(avoided, number)
+            rows.append(
+                {
+                    "driver": driver,
+                    "avoided": avoided,
+                    "later": int(verdicts[later].sum()) if later in verdicts else None,
+                    "no_verdict": len(verdicts) - number,
+                    "share": shares.get(driver),
+                    "share_low": low,
+                    "share_high": high,
+                    "later_share": shares.get(later),
+                    "no_verdict_points": [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())],
+                }
+            )
+        return rows
+
+    def to_dict(self) -> JsonObject:
+        """The simulated collisions and `drivers`, for JSON."""
+        return {"looked_at": len(self.verdicts), "later_reaction": LATER["reaction_time"], "drivers": self.drivers}
+
+    def _avoided(self, driver: str) -> str:
+        """What a driver avoids, such as `a competent driver avoids 71 % (39 % if he needs 0.4 s longer)`."""
+        shares, later, number = self.shares, f"{driver}_later", int(self.verdicts[driver].count())
+        if not number:
+            return f"{TITLES[driver]} has no verdict"
+        of_number = f" of the {number} with a verdict" if number < len(self.verdicts) else ""
+        delayed = f" ({share_in_words(shares[later])} if he needs {DELAY:g} s longer)" if later in shares else ""
+        return f"{TITLES[driver]} avoids {share_in_words(shares[driver])}{of_number}{delayed}"
 
     def __str__(self) -> str:
-        """A sentence; empty if no collision was simulated."""
-        if not self.looked_at:
+        """What each driver avoids, and where he has no verdict; empty if no collision was simulated."""
+        verdicts = self.verdicts
+        if not len(verdicts):
             return ""
-        sample = "" if self.looked_at == self.collisions else f", drawn at random from {self.collisions}"
-        return (
-            f"In the same vehicle, of {number_of(self.looked_at, 'collision')}{sample}, a competent driver avoids "
-            f"{self.range_in_words}; only full braking at the first possible moment: "
-            f"{share_in_words(self.share(PreventableBy.FULL_BRAKING))}; nobody: "
-            f"{share_in_words(self.share(PreventableBy.NOBODY))}."
-        )
+        drivers = [name for name in TITLES if name != ANY_LEADER or not verdicts[name].equals(verdicts[LETTER])]
+        sample = "" if len(verdicts) == self.collisions else f", drawn at random from {self.collisions}"
+        collisions = f"{number_of(len(verdicts), 'collision')}{sample}"
+        sentences = [f"In the same vehicle, of {collisions}, {'; '.join(map(self._avoided, drivers))}."]
+        for row in self.drivers:
+            if row["no_verdict"] and row["driver"] in drivers:
+                points = points_named(row["no_verdict_points"])
+                sentences.append(
+                    f"No verdict of {TITLES[row['driver']]} on {row['no_verdict']}{points and f', at {points}'}: "
+                    "there the original vehicle collides with that driver, too."
+                )
+        return " ".join(sentences)
+
+
+def avoided_by(verdicts: Mapping[Any, Any]) -> str:
+    """The weakest driver who avoids a collision, in words; `verdicts` is a row of `judge_collisions`."""
+    by = next((title for driver, title in TITLES.items() if verdicts[driver] == 1), "")
+    if not by:
+        return "no verdict" if np.isnan(verdicts[FULL]) else "physically unavoidable"
+    silent = f" (no verdict of {TITLES[LETTER]})" if np.isnan(verdicts[LETTER]) else ""
+    return f"preventable by {by}{silent}"
 
 
 def assess_preventability(
     evaluator: Evaluator, collisions: Evaluations, max_simulations: int = MAX_SIMULATIONS
 ) -> Preventability:
-    """Classify M evaluated collisions by the weakest driver that avoids them; equal settings count once.
+    """Which of M evaluated collisions the drivers avoid; equal settings count once.
 
     If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the
-    study's seed. A setting that cannot be simulated with a reference driver is not counted.
+    study's seed.
     """
     _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
-    sample = shuffled[: max(max_simulations // SIMULATIONS, 1)]
-    avoidances = list(filter(None, classify_collisions(evaluator, collisions.take(sample))))
-    return Preventability(
-        counts=Counter(by for by, _ in avoidances),
-        collisions=len(distinct),
-        later=sum(avoids_later for _, avoids_later in avoidances),
-    )
+    sample = shuffled[: max(max_simulations // len(TITLES), 1)]
+    return Preventability(verdicts=judge_collisions(evaluator, collisions.take(sample)), collisions=len(distinct))
 
 
-def classify_collisions(evaluator: Evaluator, collisions: Evaluations) -> list[Avoidance | None]:
-    """Who avoids each of M evaluated collisions at its worst point; None if a reference driver cannot be simulated."""
-    avoidances: list[Avoidance | None] = [None] * len(collisions)
+def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:
+    """Whether each driver avoids each of M evaluated collisions at its worst point: 1, 0, or NaN for no verdict.
+
+    A driver has no verdict on a collision at a point where he collides with the original vehicle, too, or if he cannot
+    be simulated. The columns are the drivers' names and `point`, the name of the point.
+    """
     system = assemble(evaluator.study)
     worst = np.zeros(len(collisions), dtype=np.intp) if collisions.worst_points is None else collisions.worst_points
-    for point_index in np.unique(worst).tolist():
-        rows, point = np.flatnonzero(worst == point_index).tolist(), system.points[point_index]
+    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(DRIVERS)).assign(point="")
+    for index in np.unique(worst).tolist():
+        rows, point = np.flatnonzero(worst == index), system.points[index]
         study = study_at(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
-        at_point = _classify_at_point(evaluator.for_study(study), system.at(point), collisions.settings[rows])
-        for row, avoidance in zip(rows, at_point, strict=True):
-            avoidances[row] = avoidance
-    return avoidances
+        settings, at_point = collisions.settings[rows], system.at(point)
+        verdicts.loc[rows, list(DRIVERS)] = _judge_at_point(evaluator.for_study(study), at_point, settings)
+        verdicts.loc[rows, "point"] = point.name
+    return verdicts
 
 
-def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[Avoidance | None]:
-    """Who avoids collisions at one point; full braking is tried only if the competent driver collides."""
-    approach = approach_parameters(system)
-
-    def drive(driver: str, settings: FloatArray, **parameters: float) -> Evaluations:
-        ads = ModelTable(model=driver, parameters={**approach, **parameters})
+def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> FloatArray:
+    """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
+    approach, verdicts = approach_parameters(system), dict[str, FloatArray]()
+    with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
+    is_led = system.points[0].scenario.pre_crash == PreCrash.LEAD_DECELERATING
+    for driver, (model, parameters) in DRIVERS.items():
+        if ANY.items() <= parameters.items() and not is_led:  # nobody brakes: both conventions are one
+            verdicts[driver] = verdicts[driver.replace(ANY_LEADER, LETTER)]
+            continue
+        ads = ModelTable(model=model, parameters={**approach, **parameters})
         with_driver = evaluator.for_study(replace(evaluator.study, ads=ads))
-        return with_driver.evaluate(settings, "reference drivers in the same vehicle")
-
-    competent = drive("competent_driver", settings)
-    later = drive("competent_driver", settings, reaction_time=LATER_REACTION)
-    full_braking = drive("full_braking", settings[competent.collided])
-    categories = np.full(len(settings), PreventableBy.COMPETENT_DRIVER, dtype=object)
-    categories[competent.collided] = np.where(full_braking.collided, PreventableBy.NOBODY, PreventableBy.FULL_BRAKING)
-    is_valid = competent.valid.copy()
-    is_valid[competent.collided] = full_braking.valid
-    avoids_later = (later.valid & ~later.collided).tolist()
-    return [
-        (PreventableBy(category), avoids) if valid else None
-        for category, avoids, valid in zip(categories, avoids_later, is_valid, strict=True)
-    ]
+        runs = with_driver.evaluate(with_original, "reference drivers in the same vehicle")
+        avoided = np.where(runs.valid, ~runs.collided, np.nan)
+        verdicts[driver] = avoided[1:] if avoided[0] == 1 else np.full(len(settings), np.nan)
+    return np.column_stack(list(verdicts.values()))
 
 
 def approach_parameters(system: System) -> JsonObject:

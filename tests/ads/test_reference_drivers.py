@@ -5,6 +5,7 @@ regulations.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -179,3 +180,77 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     assert model.critical_metric(0.4 * one, 12 * one, 10 * one, -8 * one)[0] == 1
     assert model.critical_metric(0.6 * one, 12 * one, 10 * one, -8 * one)[0] == 0
     assert model.critical_metric(1.0 * one, 10 * one, 10 * one, 0 * one)[0] == 0
+
+
+def least_gap(speed: float, headway: float, let_go: float = 0.0, leader_braking: float = 7.0) -> float:
+    """The rule of UN R157 for a point mass in steps of a millisecond: least gap [m], or minus the collision's speed.
+
+    From 0.4 s + 0.75 s after the leader begins to brake, the deceleration rises at 12.65 m/s^3 up to 0.774 g; it is at
+    least `let_go`.
+    """
+    step, v, u = 1e-3, speed, speed
+    gap = least = speed * headway
+    for k in range(20_000):
+        deceleration = max(let_go, min(12.65 * (k * step - 0.4 - 0.75), 0.774 * 9.81))
+        gap += (u - v) * step
+        if gap < 0:
+            return -(v - u)
+        u, v, least = max(u - leader_braking * step, 0.0), max(v - deceleration * step, 0.0), min(least, gap)
+    return least
+
+
+def behind_a_braking_leader(driver: Any, speed: float, headway: float, leader_braking: float = 7.0) -> float:
+    """As `least_gap`, with a driver in a vehicle without delays, and a leader that brakes after a second."""
+    one, memory, v, gap = np.ones(1), driver.start(1, KNOWN, STEP), speed, speed * headway
+    least, leader = gap, [max(speed - leader_braking * max(k * STEP - 1, 0.0), 0.0) for k in range(500)]
+    for k, (u, next_u) in enumerate(pairwise(leader)):
+        seen = Observation(k * STEP, v * one, gap * one, (v - u) * one, 0 * one, 0 * one, 1.0, u * one)
+        command, memory = driver.drive(seen, memory)
+        next_v = max(v + (3 * float(command.throttle[0]) - 10 * float(command.brake[0])) * STEP, 0.0)
+        gap += (u + next_u - v - next_v) / 2 * STEP
+        v, least = next_v, min(least, gap)
+        if gap < 0:
+            return -(v - next_u)
+    return least
+
+
+@pytest.mark.parametrize(
+    ("speed", "low", "high", "lets_go"), [(50, 8.4, 9.9, 10.0), (80, 14.0, 16.3, 16.8), (100, 18.1, 21.0, 21.8)]
+)
+def test_the_competent_driver_sees_a_leader_brake(speed: float, low: float, high: float, lets_go: float) -> None:
+    """A time step is the difference to the rule, which sees at once; with a headway of 2 s."""
+    found = behind_a_braking_leader(CompetentDriver(lets_go=0.0), speed / 3.6, 2.0)
+    assert low < found < high
+    assert found == pytest.approx(least_gap(speed / 3.6, 2.0), abs=speed / 3.6 * STEP)
+    assert least_gap(speed / 3.6, 2.0, let_go=0.4) == pytest.approx(lets_go, abs=0.1)
+
+
+def test_from_a_headway_of_a_second_the_competent_driver_hits() -> None:
+    found = behind_a_braking_leader(CompetentDriver(lets_go=0.0), 50 / 3.6, 1.0)
+    assert found == pytest.approx(-8.8, abs=0.1)
+    assert found == pytest.approx(least_gap(50 / 3.6, 1.0), abs=0.1)
+
+
+@pytest.mark.parametrize("speed", range(30, 80))
+def test_below_5_two_conventions_differ(speed: int) -> None:
+    """CCRb: 4 m/s^2 from a headway of 1 s. By the letter nothing is a danger; any braking is one for the other."""
+    letter, anyone = CompetentDriver(lets_go=0.0), CompetentDriver(lets_go=0.0, leader_braking=0.5)
+    assert behind_a_braking_leader(letter, speed / 3.6, 1.0, 4.0) < 0
+    assert behind_a_braking_leader(letter, speed / 3.6, 1.0, 5.0) < 0, "which does not exceed 5"
+    assert behind_a_braking_leader(anyone, speed / 3.6, 1.0, 4.0) > 0
+
+
+@pytest.mark.parametrize("leader_braking", [1.0, 4.0, 9.81])
+def test_r157_avoids_a_braking_leader_from_its_least_time_gap_and_nearer_nothing_is_demanded(
+    leader_braking: float,
+) -> None:
+    for speed in (20.0, 50.0, 60.0):
+        least = 1 + speed / 100
+        assert behind_a_braking_leader(R157(), speed / 3.6, least, leader_braking) > 0
+        assert behind_a_braking_leader(R157(), speed / 3.6, least - 0.01, leader_braking) < 0
+
+
+def test_rss_brakes_with_another_number_than_it_plans_with() -> None:
+    onset_gap, decelerations = braking(Rss(deceleration=4.0, braking=6.0), 12.0, 60.0)
+    assert onset_gap == pytest.approx(12**2 / (2 * 4), abs=2 * 12 * STEP), "rt later than 12 * rt + 12^2 / (2 * 4)"
+    assert decelerations.max() == pytest.approx(6.0)

@@ -4,11 +4,13 @@ what makes a changed vehicle brake worse than the original, in parts of the lost
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 
@@ -27,10 +29,11 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points
 from safevar_sumo.analysis.preventability import (
+    DRIVERS,
     Preventability,
-    PreventableBy,
     assess_preventability,
-    classify_collisions,
+    avoided_by,
+    judge_collisions,
 )
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
@@ -111,41 +114,86 @@ def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
     return evaluations
 
 
-def categories(here: Evaluator, *settings: FloatArray) -> list[PreventableBy | None]:
+def avoiders(here: Evaluator, *settings: FloatArray) -> list[str]:
     """The weakest driver who avoids each collision."""
-    return [avoidance and avoidance[0] for avoidance in classify_collisions(here, collisions(here, *settings))]
+    return list(map(avoided_by, judge_collisions(here, collisions(here, *settings)).to_dict("records")))
+
+
+def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> pd.DataFrame:
+    """Made-up verdicts of all drivers, in their order."""
+    return pd.DataFrame(dict(zip(DRIVERS, drivers, strict=True))).assign(point=points or "")
 
 
 def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> None:
-    by = PreventableBy
-    for counts, later, number, collisions, shares, others in (
-        ({by.COMPETENT_DRIVER: 5, by.FULL_BRAKING: 1, by.NOBODY: 1}, 3, 7, "7", "71 % (43 %", "14 %; nobody: 14 %"),
+    seven = verdicts([1.0] * 5 + [0.0] * 2, [1.0] * 5 + [0.0] * 2, [1.0] * 6 + [0.0], *[[1.0] * 3 + [0.0] * 4] * 2)
+    many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
+    for found, number, told in (
         (
-            {by.COMPETENT_DRIVER: 999, by.FULL_BRAKING: 1},
-            390,
-            3000,
-            "1000",
-            "nearly all (39 %",
-            "hardly any; nobody: none",
+            seven,
+            7,
+            "7 collisions, a competent driver avoids 71 % (43 % if he needs 0.4 s longer); full braking at the "
+            "first possible moment avoids 86 %.",
         ),
-        ({by.FULL_BRAKING: 17}, 0, 17, "17", "none (none", "all; nobody: none"),
+        (
+            many,
+            3000,
+            "1000 collisions, drawn at random from 3000, a competent driver avoids nearly all (39 % if he needs "
+            "0.4 s longer); full braking at the first possible moment avoids all.",
+        ),
     ):
-        sample = ", drawn at random from 3000" if number == 3000 else ""
-        assert str(Preventability(counts=counts, collisions=number, later=later)) == (
-            f"In the same vehicle, of {collisions} collisions{sample}, a competent driver avoids {shares} if he needs "
-            f"0.4 s longer); only full braking at the first possible moment: {others}."
-        )
+        assert str(Preventability(verdicts=found, collisions=number)) == f"In the same vehicle, of {told}"
+
+
+def test_who_has_no_verdict_is_counted_with_the_points() -> None:
+    """By the letter he collides in the original vehicle at the point b, where any braking is a danger to the other."""
+    nan = np.nan
+    two = verdicts([1.0, nan], [1.0, 1.0], [1.0, nan], [0.0, nan], [0.0, 0.0], points=["a", "b"])
+    found = Preventability(verdicts=two, collisions=2)
+    both, letter, full = str(found).split(". ")
+    assert both == (
+        "In the same vehicle, of 2 collisions, a competent driver avoids all of the 1 with a verdict (none if he needs "
+        "0.4 s longer); one who reacts to any braking of a leader, not only above 5 m/s^2, avoids all (none if he "
+        "needs 0.4 s longer); full braking at the first possible moment avoids all of the 1 with a verdict"
+    )
+    there = "on 1, at b: there the original vehicle collides with that driver, too"
+    assert letter == f"No verdict of a competent driver {there}"
+    assert full == f"No verdict of full braking at the first possible moment {there}."
+    rows = found.drivers
+    assert [(row["avoided"], row["later"], row["no_verdict"], row["no_verdict_points"]) for row in rows] == [
+        (1, 0, 1, ["b"]),
+        (2, 0, 0, []),
+        (1, None, 1, ["b"]),
+    ]
+    only_any, nobody = verdicts([nan], [1.0], [1.0], [nan], [nan]), verdicts(*[[nan]] * 5)
+    assert avoided_by(only_any.iloc[0].to_dict()).endswith("(no verdict of a competent driver)")
+    assert avoided_by(nobody.iloc[0].to_dict()) == "no verdict"
+    json.dumps(Preventability(verdicts=nobody, collisions=1).to_dict(), allow_nan=False)
 
 
 @pytest.mark.slow
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
-    found = categories(evaluator(test="CPFA", speed=30), vehicle(), vehicle(brakes=0.1))
-    assert found == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
+    found = avoiders(evaluator(test="CPFA", speed=30), vehicle(), vehicle(brakes=0.1))
+    assert found == ["preventable by a competent driver", "physically unavoidable"]
 
 
 @pytest.mark.slow
-def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
-    assert categories(evaluator(test="CPNCO", speed=40), vehicle()) == [PreventableBy.FULL_BRAKING]
+def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
+    """He hits it in the original vehicle."""
+    found = avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99))
+    assert found == ["preventable by full braking at the first possible moment (no verdict of a competent driver)"]
+
+
+@pytest.mark.slow
+def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_verdict() -> None:
+    tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
+    study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
+    here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
+    found = assess_preventability(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
+    letter, any_braking, _ = found.drivers
+    assert (letter["no_verdict"], letter["share"], any_braking["share"]) == (2, None, 1.0)
+    (point,) = letter["no_verdict_points"]
+    assert point.startswith("CCRb, speed 50")
+    assert f"No verdict of a competent driver on 2, at {point}: " in str(found)
 
 
 @pytest.mark.slow
@@ -156,22 +204,19 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     here = evaluator(test="CPFA", speed=30)
     brakeless = (vehicle(0.1, 1 - (30 - k) / 1e6) for k in range(20))
     every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10)))
-    whole = assess_preventability(here, Evaluations.concatenate([every, every])).to_dict()
-    assert whole == {
-        "competent_driver": pytest.approx(1 / 3),
-        "full_braking": 0,
-        "nobody": pytest.approx(2 / 3),
-        "looked_at": 30,
-        "interval_competent_driver": [pytest.approx(1 / 3)] * 2,
-        "later": pytest.approx({"reaction": 1.15, "competent_driver": 1 / 3}),
-    }
-    sample = assess_preventability(here, every, max_simulations=45).to_dict()
-    assert sample["looked_at"] == 15
+    whole = assess_preventability(here, Evaluations.concatenate([every, every]))
+    assert (len(whole.verdicts), whole.collisions) == (30, 30)
+    letter = whole.drivers[0]
+    assert (letter["avoided"], letter["later"], letter["no_verdict"]) == (10, 10, 0)
+    assert [letter[name] for name in ("share", "share_low", "share_high", "later_share")] == [pytest.approx(1 / 3)] * 4
+    sample = assess_preventability(here, every, max_simulations=45)
+    assert len(sample.verdicts) == 15
     reverse = every.take(np.arange(30)[::-1])
-    assert sample == assess_preventability(here, reverse, max_simulations=45).to_dict()
-    hits = round(sample["competent_driver"] * 15)
+    assert sample.to_dict() == assess_preventability(here, reverse, max_simulations=45).to_dict()
+    letter = sample.drivers[0]
+    hits = letter["avoided"]
     expected = scipy.stats.beta.ppf(0.025, hits, 16 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 15 - hits)
-    assert sample["interval_competent_driver"] == pytest.approx(expected)
+    assert (letter["share_low"], letter["share_high"]) == pytest.approx(expected)
     assert expected[0] < 1 / 3 < expected[1]
 
 

@@ -41,8 +41,8 @@ class AcrossFits(NamedTuple):
         Number of parameter sets with which the shares were computed, the study's own among them.
     ranges
         The ends of each range by kind and name of the share: (`unsafe`, ""), the settings that are unsafe;
-        (`necessary`, a characteristic), the failures that need it; (`preventable`, a name in
-        `Preventability.shares`), the collisions in that category, if there is a collision.
+        (`necessary`, a characteristic), the failures that need it; (`preventable`, a driver),
+        the collisions that he avoids of those with a verdict, if there is one.
     """
 
     sets: int

@@ -31,7 +31,7 @@ from safevar_sumo.analysis.explain.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation
-from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
+from safevar_sumo.analysis.preventability import assess_preventability, avoided_by, judge_collisions
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
@@ -228,10 +228,9 @@ def _explain_rows(
         for cause, robustness, holds in zip(described, robustness_of_causes, holding, strict=True)
     )
     is_assessed = _is_assessed(study, failures)
-    avoidances = iter(classify_collisions(evaluator, failures.take(is_assessed)))
+    verdicts = iter(judge_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
     explanations = []
     for index, (row, (comparison, points)) in enumerate(zip(reasons, comparisons, strict=True)):
-        avoidance = next(avoidances) if is_assessed[index] else None
         explanations.append(
             Explanation(
                 characteristics=characteristics,
@@ -244,7 +243,7 @@ def _explain_rows(
                 robustness=robustnesses[index],
                 because=comparison,
                 points=points,
-                preventable=str(avoidance[0]) if avoidance else "",
+                preventable=avoided_by(next(verdicts)) if is_assessed[index] else "",
             )
         )
     return tuple(explanations)

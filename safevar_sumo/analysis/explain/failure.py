@@ -53,7 +53,7 @@ class Explanation:
     because
         Why the setting is less safe than the original: the comparison of how both vehicles brake.
     preventable
-        The `PreventableBy` of a collision, as text; empty without a collision and in a rated study.
+        The weakest reference driver who avoids a collision, in words; empty without a collision and in a rated study.
     points
         Names of the test points at which the setting is unsafe; in a rated study, of the cells whose colour is worse
         than the original's.
