@@ -5,19 +5,24 @@ from __future__ import annotations
 import base64
 import io
 import re
+import sys
 import tempfile
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
 from PIL import Image
 
 import safevar_sumo as sv
+from safevar_sumo.reference.rows import COLUMNS
+from safevar_sumo.vehicles import CharacteristicSet
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SHOWN = {"quickstart": (1, 2), "rq1": (2, 0), "rq2": (1, 2), "rq3": (4, 3)}
 """Number of cells that show a table and of those that show a picture, by notebook."""
+OTHERS = ("answers", "paper", "rating")
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +32,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_no_others() -> None:
-    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, "answers", "rating"}
+    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, *OTHERS}
 
 
-@pytest.mark.parametrize("name", [*SHOWN, "answers", "rating"])
+@pytest.mark.parametrize("name", [*SHOWN, *OTHERS])
 def test_a_notebook_needs_only_the_public_names(name: str) -> None:
     cells = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4).cells
     code = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
@@ -47,7 +52,7 @@ def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
 
 
 def test_stored_outputs_are_of_todays_vehicle() -> None:
-    """`python -m tests.test_notebooks` stores them anew."""
+    """`python -m tests.test_notebooks [NAME]...` stores them anew."""
     texts = {name: _texts(nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)) for name in (*SHOWN, "answers")}
     assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(texts["quickstart"])
     results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
@@ -64,6 +69,27 @@ def test_a_notebook_shows_its_tables_and_pictures(name: str, place: Path, monkey
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
     notebook = _executed(name, place, timeout=240)
     assert _shown(notebook) == SHOWN[name]
+
+
+@pytest.mark.slow
+def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With made-up rows in the published format, and a smaller study."""
+    characteristics = CharacteristicSet.of(sv.load_study("sun"))
+    settings = np.random.default_rng(5).uniform(
+        characteristics.lower, characteristics.upper, (60, len(characteristics))
+    )
+    rows = sv.evaluate("sun", settings).rename(columns=COLUMNS)
+    for name in ("nsga2", "rs", "fuzzer"):
+        rows[[*characteristics.names, *COLUMNS.values()]].fillna(0).to_csv(tmp_path / f"sun_{name}.csv", index=False)
+    monkeypatch.setenv("SAFEVAR_PUBLISHED", str(tmp_path))
+    monkeypatch.setenv("SAFEVAR_RUNS", "2")
+    monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
+    for notebook in (nbformat.read(NOTEBOOKS / "paper.ipynb", as_version=4), _executed("paper", place, timeout=240)):
+        assert _shown(notebook) == (0, 0)
+        tables = [text for text in _texts(notebook) if "results/small" in text and "results/published" in text]
+        assert len(tables) == 6
 
 
 def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
@@ -120,9 +146,11 @@ def test_the_notebook_of_the_rating_tells_where_points_are_lost(tmp_path: Path) 
 
 
 def main() -> None:
-    """Execute the notebooks and store them with their outputs, pictures in 128 colours: a third of the size."""
+    """Execute notebooks, by default all, and store them with their outputs, pictures in 128 colours: a third of the
+    size. `paper` needs the published files.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        for name in (*SHOWN, "answers", "rating"):
+        for name in sys.argv[1:] or (*SHOWN, *OTHERS):
             notebook = _executed(name, Path(folder), timeout=1800)
             for data in [
                 output["data"] for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -59,6 +59,8 @@ class Case:
         False for imported solutions, whose runs are unknown.
     failures
         Settings that could not be simulated.
+    titles
+        Names of algorithms for readers, by label, as far as their classes have them.
     """
 
     name: str
@@ -70,6 +72,11 @@ class Case:
     has_runs: bool
     failures: tuple[Failure, ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
+    titles: Mapping[str, str] = field(default_factory=dict)
+
+    def title_of(self, algorithm: str) -> str:
+        """The name of an algorithm for readers."""
+        return self.titles.get(algorithm) or ALGORITHM_TITLES.get(algorithm, algorithm)
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -181,9 +188,10 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
             study = msgspec.structs.replace(study, origin=Origin(places=folders_of(path, manifest)))
             scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
             has_runs = "imported" not in manifest
-            cases.append(
-                build_case(study, manifest["original"], solutions, evaluations, finished, has_runs, failures, scoring)
+            case = build_case(
+                study, manifest["original"], solutions, evaluations, finished, has_runs, failures, scoring
             )
+            cases.append(replace(case, titles=manifest.get("titles", {})))
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
             raise InputError(
                 path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`"

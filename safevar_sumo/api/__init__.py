@@ -43,7 +43,7 @@ class Figures(dict[str, "Figure"]):
     lacking: tuple[str, ...] = ()
 
 
-def tables(*results: Results | str | Path, question: str | None = None) -> Tables:
+def tables(*results: Results | str | Path, question: str | None = None, algorithm: str = "") -> Tables:
     """Answer the research questions.
 
     Parameters
@@ -52,6 +52,8 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
         Results, or their directories, one for each case in the tables.
     question
         Answer only this question, such as "rq1".
+    algorithm
+        The algorithm that RQ2 compares with all others; by default NSGA-II or, without it, the study's first.
 
     Returns
     -------
@@ -65,7 +67,7 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     """
     from safevar_sumo.analysis.research_questions.answer import answer_questions
 
-    return Tables(answer_questions(_load_cases(results), question))
+    return Tables(answer_questions(_load_cases(results), question, algorithm))
 
 
 def figures(*results: Results | str | Path) -> Figures:

@@ -123,6 +123,8 @@ def carry_out_runs(
     for remark in _extent_remarks(results, study):
         observer.warned(remark)
     results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
+    algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
+    results.manifest["titles"] = {name: one.title for name, one in algorithms.items() if one.title}
     no_verdict = ask_why_no_verdict(study, pool)
     if no_verdict:
         observer.warned(f"study {study.name!r}: {no_verdict}")

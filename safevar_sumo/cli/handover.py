@@ -55,11 +55,19 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
     show_default=True,
     help="Format of the tables.",
 )
+@click.option(
+    "--algorithm",
+    default="",
+    metavar="NAME",
+    help="The algorithm that RQ2 compares with all others.  [default: nsga2, else the study's first]",
+)
 @file_option("--out", "Write each table to a file in this directory.", metavar="DIR")
-def tables(directories: tuple[str, ...], question: str | None, format_name: str, out: Path | None) -> None:
+def tables(
+    directories: tuple[str, ...], question: str | None, format_name: str, algorithm: str, out: Path | None
+) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
     write = FORMATS[format_name]
-    answers = answer_questions(load_cases(directories), question)
+    answers = answer_questions(load_cases(directories), question, algorithm)
     if format_name in FORMATS_WITHOUT_NOTES:
         for note in dict.fromkeys(note for answer in answers for note in answer.notes):
             print_note(note)

@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause
 from safevar_sumo.analysis.explain.failure import Explanation
@@ -224,7 +223,7 @@ def _describe_search(data: ReportInput) -> str:
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
-    names = [f"{ALGORITHM_TITLES.get(name, name)} ({number_of(count, 'run')})" for name, count in runs.items()]
+    names = [f"{case.title_of(name)} ({number_of(count, 'run')})" for name, count in runs.items()]
     return (
         f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations} simulations each, "
         f"{len(case.evaluations)} different vehicles in all, from seed {search.seed}, with {versions}."

@@ -57,9 +57,13 @@ class Problem:
 
 
 class Algorithm:
-    """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2]."""
+    """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2].
+
+    `title` is its name in tables and legends, by default its name in the study.
+    """
 
     __slots__ = ()
+    title: str = ""
 
     @abstractmethod
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
@@ -75,7 +79,7 @@ class GuardedAlgorithm(Algorithm):
     """A user's algorithm: it gets read-only copies, and this class checks its settings and its result."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
-        self._algorithm, self._guard = algorithm, guard
+        self._algorithm, self._guard, self.title = algorithm, guard, getattr(algorithm, "title", "")
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)

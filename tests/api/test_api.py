@@ -174,3 +174,16 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     assert worst != points[-1].point.name  # the last one that is driven
     alone = sv.simulate(study_at(study, worst, "the test")).trace
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
+
+
+def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
+    Path("mine.py").write_text(
+        "class Mine:\n    title = 'My own search'\n\n    def search(self, problem, rng):\n"
+        "        settings = problem.uniform(4, rng)\n"
+        "        return (yield problem.characteristics.filter(settings))\n"
+    )
+    Path("mine.toml").write_text(
+        'extends = "smoke"\n[search]\nalgorithms = ["mine:Mine"]\nruns = 1\nevaluations = 4\npopulation = 4\n'
+    )
+    results = sv.run("mine.toml", jobs=1)
+    assert "My own search" in sv.tables(results, question="rq1")._repr_markdown_()

@@ -61,7 +61,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_figures_are_files_of_the_kind_asked_for(results: Path, in_tmp: Path) -> None:
     done = run("figures", str(results), "--out", "pictures", "--format", "svg")
     files = sorted(Path("pictures").iterdir())
-    assert len(files) == 6
+    assert len(files) == 5
     assert sorted(done.stdout.split()) == [str(path) for path in files]
     assert all(path.read_bytes().startswith(b"<?xml") for path in files)
 

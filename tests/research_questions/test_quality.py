@@ -21,9 +21,9 @@ from hypothesis import given, strategies as st
 
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.figures import draw_convergence, draw_pareto_fronts
 from safevar_sumo.analysis.research_questions.formats import as_json, as_latex, as_markdown, as_text
 from safevar_sumo.analysis.research_questions.fronts import (
-    compute_attainment,
     compute_convergence,
     compute_indicators,
     hypervolume,
@@ -33,11 +33,9 @@ from safevar_sumo.analysis.research_questions.fronts import (
     reference_front,
 )
 from safevar_sumo.analysis.research_questions.statistics import (
-    ALPHA,
     EXACT_TEST,
     compare_samples,
     correct_by_holm,
-    critical_difference,
     magnitude_of,
     signed_rank_test,
 )
@@ -86,21 +84,30 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
     grown = compute_convergence(case)
     assert set(grown["evaluations"]) >= {10, 100}
+    assert grown.groupby("run")["evaluations"].max().tolist() == [100, 100], "a run that ended early keeps what it had"
     for run, group in grown.groupby("run"):
         assert (np.diff(group["hypervolume"]) >= 0).all()
         points = points_of(case, case.evaluations[case.evaluations["run"] == run])
         volume = moocore.hypervolume(normalised(points, reference_front(case)), ref=[1.1] * 3)
         assert group["hypervolume"].iloc[-1] == pytest.approx(volume)
     early = grown[(grown["run"] == 0) & (grown["evaluations"] >= 40)]
-    assert early["hypervolume"].nunique() == 1, "a run that ended early keeps what it had"
+    assert early["hypervolume"].nunique() == 1
 
 
-def test_attainment_is_what_so_many_runs_reach() -> None:
-    """Two runs by hand: one has (1, 0.4), the other (2, 0.2): both reach (2, 0.4)."""
-    case = made_up(row(run=0, sd=1.0, f_diff=0.4), row(run=1, sd=2.0, f_diff=0.2))
-    surface = compute_attainment(case)["nsga2"]
-    assert surface[50.0].tolist() == [[1.0, 0.4], [2.0, 0.2]]
-    assert surface[100.0].tolist() == [[2.0, 0.4]]
+def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:
+    seen = [
+        {**row(name, run, sd=2 - i / 100), "evaluation": i}
+        for name, ends in (("nsga2", (100, 100)), ("mine", (20, 33)))
+        for run, end in enumerate(ends)
+        for i in range(end)
+    ]
+    case = made_up(*(row(name, run) for name in ("nsga2", "mine") for run in (0, 1)), evaluations=seen)
+    case = dataclasses.replace(case, titles={"mine": "My search"})
+    ends = compute_convergence(case).groupby(["algorithm", "run"])["evaluations"].max()
+    assert ends.to_dict() == {("nsga2", 0): 100, ("nsga2", 1): 100, ("mine", 0): 33, ("mine", 1): 33}
+    figures = (draw_convergence(case), draw_pareto_fronts(case))
+    labels = ["".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures]
+    assert all("My search" in label and "mine" not in label for label in labels)
 
 
 SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)
@@ -162,12 +169,6 @@ def test_magnitudes_are_kitchenhams(effect: float, name: str) -> None:
 def test_holms_correction_of_a_worked_example() -> None:
     corrected = correct_by_holm([0.01, math.nan, 0.04, 0.03, 0.005])
     assert corrected == pytest.approx([0.03, math.nan, 0.06, 0.06, 0.02], nan_ok=True)
-
-
-@pytest.mark.parametrize(("algorithms", "runs", "published"), [(4, 14, 1.25), (5, 30, 1.11)])
-def test_critical_differences_are_published_ones(algorithms: int, runs: int, published: float) -> None:
-    """Demsar 2006: 2.569 sqrt(20 / 84) = 1.25; his q of five algorithms at 0.05 is 2.728."""
-    assert critical_difference(algorithms, runs, 0.05) == pytest.approx(published, abs=0.006)
 
 
 def rich_case(**changes: Any) -> Case:
@@ -236,7 +237,11 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
     ("question", "keys"),
     [
         ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original"),
-        ("rq2", "setting baseline metric p_value effect_size magnitude n1 n2 method"),
+        (
+            "rq2",
+            "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm evaluations "
+            "baseline_evaluations",
+        ),
         ("rq3.2", "setting characteristic j percent"),
         ("rq3.3", "setting characteristic direction j pc delta n"),
         ("rq3.3-safety", "setting quantity j value percent n"),
@@ -272,10 +277,3 @@ def test_every_rendering_has_every_effect() -> None:
     answers = answer_questions([three_algorithms()])
     for output in (render(answers) for render in (as_text, as_markdown, as_latex)):
         assert all(f"{effect:.3f}" in output for answer in answers for effect in answer.frame.get("effect_size", ()))
-
-
-def test_significant_ranks_stand_out() -> None:
-    (answer,) = answer_questions([three_algorithms()], "rq2-ranks")
-    number = answer.frame.groupby("metric")["p_holm"].first().lt(ALPHA).sum()
-    assert number
-    assert (as_text([answer]).count("* "), as_latex([answer]).count(r"\textbf")) == (number, number)

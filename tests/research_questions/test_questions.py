@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import re
@@ -22,16 +23,10 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33,
     rq33_safety,
 )
-from safevar_sumo.analysis.research_questions.comparisons import (
-    compare_pairs,
-    rank_algorithms,
-    rq1,
-    rq1_runs,
-    rq2,
-    rq2_runs,
-    summary_lines,
-)
-from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples, correct_by_holm
+from safevar_sumo.analysis.research_questions.comparisons import rq1, rq1_runs, rq2, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.formats import as_text
+from safevar_sumo.analysis.research_questions.fronts import count_evaluations
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import MetricsTable
 from tests.research_questions.made_up import ORIGINAL, made_up, made_up_study, only, row
@@ -86,31 +81,46 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
 
 
-def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
+def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> None:
     case = three_algorithms()
-    frame = compare_pairs(case)
-    pairs = {("nsga2", "spea2"), ("nsga2", "mocell"), ("spea2", "mocell")}
-    assert set(zip(frame["algorithm"], frame["other"], strict=True)) == pairs
-    assert len(frame) == 3 * 7
     means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
-    expected = compare_samples(means["mocell"], means["spea2"])
-    chosen = only(frame, metric="safety_degree", algorithm="spea2")
-    assert (chosen["p_value"], chosen["effect_size"], expected.effect_size) == (expected.p_value, 1, 1)
-    assert (chosen["n1"], chosen["n2"]) == (RUNS, RUNS - 1)
-    assert frame["p_holm"].tolist() == correct_by_holm(frame["p_value"]).tolist()
+    for asked, first, others in (("", "nsga2", ["spea2", "mocell"]), ("mocell", "mocell", ["nsga2", "spea2"])):
+        frame = rq2_runs(case, asked)
+        assert (set(frame["algorithm"]), list(frame["baseline"].unique())) == ({first}, others)
+        expected = compare_samples(means[first], means["spea2"])
+        chosen = only(frame, metric="safety_degree", baseline="spea2")
+        assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, 1 - expected.effect_size)
+    without = made_up(*(row(name, run, sd=sd) for name, sd in (("rs", 1.0), ("mine", 2.0)) for run in (0, 1)))
+    without = dataclasses.replace(without, titles={"mine": "My search"})
+    (answer,) = answer_questions([without], "rq2")
+    assert set(zip(answer.frame["algorithm"], answer.frame["baseline"], strict=True)) == {("rs", "mine")}
+    assert only(answer.frame, metric="safety_degree")["effect_size"] == 1
+    text = as_text([answer])
+    assert "RQ2: RS against the other algorithms" in text
+    assert "A12 above 0.5: RS is better." in text
+    assert "My search" in text
+    with pytest.raises(UnanswerableError, match="no finished run of nsga2"):
+        answer_questions([without], "rq2", "nsga2")
 
 
-def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
-    case = three_algorithms()
-    frame = rank_algorithms(case)
-    part = frame[frame["metric"] == "safety_degree"].set_index("algorithm")
-    means = case.solutions.groupby(["run", "algorithm"])["safety_degree"].mean().unstack().dropna()
-    assert part["runs"].tolist() == [RUNS - 1] * 3
-    assert part.loc["nsga2", "p_value"] == pytest.approx(scipy.stats.friedmanchisquare(*means.to_numpy().T).pvalue)
-    assert part.loc["spea2", "mean_rank"] == 1
-    assert part["mean_rank"].sum() == pytest.approx(6)
-    by_metric = frame.drop_duplicates("metric")
-    assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"]).tolist()
+def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> None:
+    """Of 100 evaluations one algorithm repeats settings, the other stops early; in the last generation only repeats may
+    be missing.
+    """
+    positions = {"nsga2": [*range(0, 90, 2), 95], "rs": range(40)}
+    rows = [row(name, run) for name in positions for run in (0, 1)]
+    seen = [{**row(name, run), "evaluation": i} for name in positions for run in (0, 1) for i in positions[name]]
+    case = made_up(*rows, evaluations=seen)
+    counts = count_evaluations(case)
+    assert counts[["requested", "simulated"]].to_numpy().tolist() == [[100, 46]] * 2 + [[40, 40]] * 2
+    (answer,) = answer_questions([case], "rq2")
+    assert answer.frame[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [[46, 40]]
+    note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it stops by its own rule)."
+    assert f"made-up: settings that a run simulates, mean: {note}" in answer.notes
+    assert "46" in as_text(answer_questions([case], "evaluations"))
+    (imported,) = answer_questions([made_up(*rows, has_runs=False)], "rq2")
+    assert imported.frame["evaluations"].isna().all()
+    assert "number of evaluations" in "".join(imported.notes)
 
 
 def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:

@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.analysis.case import NSGA2, Case, UnanswerableError, solutions_for_metric
 from safevar_sumo.analysis.research_questions import changes, comparisons
+from safevar_sumo.analysis.research_questions.fronts import count_evaluations
 from safevar_sumo.analysis.research_questions.statistics import FEWEST_RUNS
 from safevar_sumo.errors import unknown_name
 
@@ -22,14 +23,13 @@ SAFETY_TABLE = "rq3.3-safety"
 
 The question rq3.3 is answered by both tables.
 """
-WEATHER = "weather"
+WEATHER, EVALUATIONS = "weather", "evaluations"
 FRAMES: Mapping[str, Callable[..., pd.DataFrame]] = {
     "rq1": comparisons.rq1,
     "rq2": comparisons.rq2,
     "rq1-runs": comparisons.rq1_runs,
     "rq2-runs": comparisons.rq2_runs,
-    "rq2-pairs": comparisons.compare_pairs,
-    "rq2-ranks": comparisons.rank_algorithms,
+    EVALUATIONS: count_evaluations,
     "rq3.1": changes.rq31,
     "rq3.2": changes.rq32,
     "rq3.3": changes.rq33,
@@ -51,8 +51,8 @@ class TableAnswer(NamedTuple):
     cases: Sequence[Case] = ()
 
 
-def answer_questions(cases: Sequence[Case], question: str | None = None) -> list[TableAnswer]:
-    """Answer one question, or all questions.
+def answer_questions(cases: Sequence[Case], question: str | None = None, algorithm: str = "") -> list[TableAnswer]:
+    """Answer one question, or all questions; RQ2 compares `algorithm`, by default NSGA-II, with the others.
 
     Raises
     ------
@@ -69,14 +69,15 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
         frames, notes, case_notes = [], [], []
         for group in [cases] if name == WEATHER else [[case] for case in cases]:
             try:
-                frame = FRAMES[name](*group)
+                frame = FRAMES[name](*group, algorithm) if name in ("rq2", "rq2-runs") else FRAMES[name](*group)
             except UnanswerableError as error:
                 all_errors.append(error)
                 notes.append(f"{error.source}: {error.problem}.")
             else:
                 frames.append(frame)
                 compared = {*frame["setting"], *frame["other"]} if name == WEATHER else {case.name for case in group}
-                case_notes += [note for case in group if case.name in compared for note in _notes(name, case)]
+                first = str(frame["algorithm"].iloc[0]) if name == "rq2" else ""
+                case_notes += [note for case in group if case.name in compared for note in _notes(name, case, first)]
         table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
         answers.append(TableAnswer(name, table, tuple(dict.fromkeys([*notes, *case_notes])), cases))
     if all_errors and all(answer.frame.empty for answer in answers):
@@ -84,25 +85,37 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
     return answers
 
 
-def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
-    """The algorithms of RQ1, or the baselines of RQ2, with too few runs for a significant test.
+def algorithms_with_few_runs(case: Case, first: str = "") -> list[str]:
+    """The algorithms of RQ1, or the baselines of RQ2's `first` algorithm, with too few runs for a significant test.
 
     Imported solutions, whose runs are unknown, have none.
     """
     if not case.has_runs:
         return []
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
-    # RQ2 compares a baseline's runs with NSGA-II's: the smaller number counts.
-    run_count = runs.pop(NSGA2, 0) if question == "RQ2" else math.inf
-    return [name for name in case.algorithms if name in runs and min(runs[name], run_count) < FEWEST_RUNS[question]]
+    # RQ2 compares a baseline's runs with the first algorithm's: the smaller number counts.
+    run_count, fewest = (runs.pop(first, 0), FEWEST_RUNS["RQ2"]) if first else (math.inf, FEWEST_RUNS["RQ1"])
+    return [name for name in case.algorithms if name in runs and min(runs[name], run_count) < fewest]
 
 
-def _notes(question: str, case: Case) -> Iterator[str]:
-    """Notes on a case for the readers of a table."""
+def describe_evaluations(case: Case) -> str:
+    """How many settings the algorithms' runs simulate, and why some simulate fewer than the budget."""
+    texts = []
+    for algorithm, rows in count_evaluations(case).groupby("algorithm", sort=False):
+        requested, simulated, budget = rows[["requested", "simulated", "budget"]].mean().round()
+        reasons = ["it stops by its own rule"] if requested < budget else []
+        reasons += ["equal settings are simulated once"] if simulated < requested else []
+        words = f" ({' and '.join(reasons)})" if reasons else ""
+        texts.append(f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}")
+    return f"settings that a run simulates, mean: {'; '.join(texts)}."
+
+
+def _notes(question: str, case: Case, first: str) -> Iterator[str]:
+    """Notes on a case for the readers of a table; `first` is the algorithm that RQ2 compares with the others."""
     yield from case.remarks
     prefix, rq = f"{case.name}: ", question.split("-")[0].upper()
     if question in ("rq1", "rq2"):
-        if few := [ALGORITHM_TITLES.get(algorithm, algorithm) for algorithm in algorithms_with_few_runs(case, rq)]:
+        if few := [case.title_of(algorithm) for algorithm in algorithms_with_few_runs(case, first)]:
             yield (
                 f"{prefix}too few runs of {', '.join(few)} for a test ({FEWEST_RUNS[rq]} are needed): "
                 "no p-value of pooled solutions stands out."
@@ -116,7 +129,12 @@ def _notes(question: str, case: Case) -> Iterator[str]:
         if question == "rq1" and undefined_names:
             yield f"{prefix}the original vehicle's {undefined_names} is undefined, so that no test uses it."
         if question == "rq2" and not case.has_runs:
-            yield f"{prefix}igd, igd_plus and hypervolume need runs, which imported solutions do not have."
+            yield (
+                f"{prefix}igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is their "
+                "number of evaluations known."
+            )
+        elif question == "rq2" and len(case.evaluations):
+            yield prefix + describe_evaluations(case)
     if question in ("rq1-runs", "rq2-runs"):
         tests = comparisons.compare_over_runs(case).dropna(subset="effect_size")
         tests = tests[tests.index == rq]
@@ -125,7 +143,7 @@ def _notes(question: str, case: Case) -> Iterator[str]:
             yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({FEWEST_RUNS[rq]} are needed)."
     if question.startswith("rq3") or question in ("combinations", WEATHER):
         critical_count, solution_count = len(changes.critical_solutions(case)), len(case.solutions_of(NSGA2))
-        yield f"{prefix}{critical_count} of {ALGORITHM_TITLES[NSGA2]}'s {solution_count} solutions are critical."
+        yield f"{prefix}{critical_count} of {case.title_of(NSGA2)}'s {solution_count} solutions are critical."
     if question == "combinations" and changes.frequent_combinations(case).empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."
     if question == "rq3.3":

@@ -12,23 +12,26 @@ over runs if the solutions belong to no run.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from itertools import combinations, product
+from itertools import product
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
-from safevar_sumo.analysis.research_questions.fronts import INDICATOR_TITLES, MORE_IS_BETTER, compute_indicators
+from safevar_sumo.analysis.case import NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.analysis.research_questions.fronts import (
+    INDICATOR_TITLES,
+    MORE_IS_BETTER,
+    compute_indicators,
+    count_evaluations,
+)
 from safevar_sumo.analysis.research_questions.statistics import (
     ALPHA,
     FEWEST_RUNS,
     compare_samples,
     correct_by_holm,
-    critical_difference,
-    friedman_test,
     signed_rank_test,
 )
-from safevar_sumo.analysis.words import number_of, two_decimals
+from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import JsonObject
 
@@ -38,9 +41,7 @@ RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS]
 RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
 RQ1_RUNS_COLUMNS += ["mean", "original"]
 RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS]
-PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", *TEST_COLUMNS]
-RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm"]
-RANK_COLUMNS += ["critical_difference"]
+EVALUATION_COLUMNS = ["algorithm", "evaluations", "baseline_evaluations"]
 
 MORE_UNSAFE = "below 0.5: the runs are more unsafe than the original vehicle"
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
@@ -56,14 +57,22 @@ def rq1(case: Case) -> pd.DataFrame:
     return pd.DataFrame(_test_original(case), columns=RQ1_COLUMNS)
 
 
-def rq2(case: Case) -> pd.DataFrame:
-    """NSGA-II against every other algorithm: its runs' indicators, then its pooled solutions' metrics.
+def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
+    """One algorithm, as `opponents_of` chooses it, against every other: its runs' indicators, then its pooled
+    solutions' metrics.
 
-    `effect_size` is A12, oriented so that higher values mean that NSGA-II is better: a better front, more unsafe
-    solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Indicators of imported solutions, which belong to no
+    `effect_size` is A12, oriented so that higher values mean that the algorithm is better: a better front, more unsafe
+    solutions. `n1` counts the algorithm's values, `n2` the baseline's; `evaluations` and `baseline_evaluations` are
+    mean numbers of settings that a run simulated. Indicators and evaluations of imported solutions, which belong to no
     run, are undefined.
     """
-    return pd.DataFrame(_test_pairs(case, nsga2_pairs(case)), columns=RQ2_COLUMNS)
+    frame = pd.DataFrame(_test_opponents(case, algorithm))
+    simulated = pd.Series(dtype=float)
+    if case.has_runs and len(case.evaluations):
+        simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
+    sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
+    frame = frame.assign(**{name: frame[side].map(simulated).astype(float) for name, side in sides.items()})
+    return frame[[*RQ2_COLUMNS, *EVALUATION_COLUMNS]]
 
 
 def rq1_runs(case: Case) -> pd.DataFrame:
@@ -77,91 +86,46 @@ def rq1_runs(case: Case) -> pd.DataFrame:
     return tests[tests.index == "RQ1"][RQ1_RUNS_COLUMNS]
 
 
-def rq2_runs(case: Case) -> pd.DataFrame:
-    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics'
-    means over solutions.
+def rq2_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
+    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, and metrics' means
+    over solutions.
 
     `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
     """
-    tests = compare_over_runs(case)
-    nsga2_pairs(case)  # raises if RQ2 has no answer
-    return tests[tests.index == "RQ2"][RQ2_RUNS_COLUMNS]
+    tests = compare_over_runs(case, algorithm)
+    opponents_of(case, algorithm)  # raises if RQ2 has no answer
+    return tests[tests.index == "RQ2"][[*RQ2_RUNS_COLUMNS, "algorithm"]]
 
 
-def compare_over_runs(case: Case) -> pd.DataFrame:
+def compare_over_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
     """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2.
 
     `enough` is whether the test has enough runs to be significant.
     """
     rows = {"RQ1": _test_original(case, over_runs=True)}
-    if NSGA2 in case.algorithms and len(case.algorithms) > 1:
-        rows["RQ2"] = _test_pairs(case, nsga2_pairs(case), over_runs=True)
+    if len(case.algorithms) > 1:
+        rows["RQ2"] = _test_opponents(case, algorithm, over_runs=True)
     tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
     return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=tests["runs"] >= tests.index.map(FEWEST_RUNS))
 
 
-def compare_pairs(case: Case) -> pd.DataFrame:
-    """Compare every pair of algorithms by Mann-Whitney U, with one value per run: each indicator, and each metric's
-    mean over solutions.
+def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
+    """The algorithm that RQ2 compares, by default NSGA-II or else the study's first with results, and the others.
 
-    `effect_size` is A12, oriented so that higher values mean that `algorithm` is better than `other`: a better front,
-    more unsafe solutions. `p_holm` is `p_value` corrected by Holm's method for all pairs and metrics of this case.
+    Raises
+    ------
+    UnanswerableError
+        If the algorithm has no finished run, or there is no other algorithm.
     """
-    _require_algorithms(case, 2)
-    tests = pd.DataFrame(_test_pairs(case, combinations(case.algorithms, 2), over_runs=True))
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]))[PAIR_COLUMNS]
-
-
-def rank_algorithms(case: Case) -> pd.DataFrame:
-    """Mean ranks over runs of three algorithms or more, metric by metric, with Friedman's test.
-
-    Run i of every algorithm together form block i; a block in which an algorithm has no value is left out. Rank 1 is
-    the best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of
-    this case. Mean ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test at 0.01;
-    Demsar 2006).
-    """
-    _require_algorithms(case, 3)
-    samples, frames = _samples(case, over_runs=True), []
-    for metric, more_is_better in _directions(case).items():
-        blocks = pd.DataFrame({name: samples.get((name, metric)) for name in case.algorithms}, dtype=float).dropna()
-        ranks = blocks.rank(axis=1, ascending=not more_is_better)
-        frame = pd.DataFrame({"mean_rank": ranks.mean(), "median": blocks.median()}).reset_index(names="algorithm")
-        statistic, p = friedman_test(blocks.to_numpy())
-        frames.append(
-            frame.assign(
-                metric=metric,
-                runs=len(blocks),
-                statistic=statistic,
-                p_value=p,
-                critical_difference=critical_difference(len(frame), len(blocks)),
-            )
-        )
-    p_holm = correct_by_holm(frame["p_value"].iloc[0] for frame in frames)
-    table = pd.concat([frame.assign(p_holm=p) for frame, p in zip(frames, p_holm, strict=True)], ignore_index=True)
-    return table.assign(setting=case.name)[RANK_COLUMNS]
-
-
-def nsga2_pairs(case: Case) -> list[tuple[str, str]]:
-    """NSGA-II with every other algorithm; raises `UnanswerableError` if NSGA-II is missing, or there is no other
-    algorithm.
-    """
-    case.solutions_of(NSGA2)  # raises if there are none
-    pairs = [(NSGA2, name) for name in case.algorithms if name != NSGA2]
-    if not pairs:
+    case.require_solutions()
+    first = algorithm or (NSGA2 if NSGA2 in case.algorithms else case.algorithms[0])
+    case.solutions_of(first)  # raises if there are none
+    others = [name for name in case.algorithms if name != first]
+    if not others:
         raise UnanswerableError(
-            case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs"
+            case.name, f"only {first} has finished runs", "results of another algorithm to compare with, such as rs"
         )
-    return pairs
-
-
-def _require_algorithms(case: Case, number: int) -> None:
-    if case.has_runs and len(case.algorithms) < number:
-        names = ", ".join(case.algorithms) or "none"
-        raise UnanswerableError(
-            case.name,
-            f"has finished runs of {number_of(len(case.algorithms), 'algorithm')} ({names})",
-            f"results of {number} algorithms or more",
-        )
+    return first, others
 
 
 def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
@@ -181,16 +145,14 @@ def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
     return rows
 
 
-def _test_pairs(case: Case, pairs: Iterable[tuple[str, str]], *, over_runs: bool = False) -> list[JsonObject]:
-    """A row for each pair and metric; `other` and `baseline` both hold the second algorithm, of which a frame takes
-    one.
-    """
-    samples, rows = _samples(case, over_runs), []
-    for (first, second), (metric, more_is_better) in product(pairs, _directions(case).items()):
-        test = compare_samples(*(samples.get((name, metric), ()) for name in (first, second)))
+def _test_opponents(case: Case, algorithm: str, *, over_runs: bool = False) -> list[JsonObject]:
+    """A row for each baseline and metric."""
+    (first, others), samples, rows = opponents_of(case, algorithm), _samples(case, over_runs), []
+    for baseline, (metric, more_is_better) in product(others, _directions(case).items()):
+        test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
         if not more_is_better:  # so that above 0.5 the first algorithm is better
             test = test.reversed()
-        row = {"setting": case.name, "algorithm": first, "other": second, "baseline": second, "metric": metric}
+        row = {"setting": case.name, "algorithm": first, "baseline": baseline, "metric": metric}
         rows.append({**row, **test._asdict(), "runs": min(test.n1, test.n2)})
     return rows
 
@@ -226,8 +188,10 @@ def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) ->
 
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:
     """Titles of algorithms, quality indicators and the cases' metrics, by name."""
+    cases = list(cases)
     metrics = {metric.name: metric.title for case in cases for metric in case.scoring.metrics}
-    return ALGORITHM_TITLES | INDICATOR_TITLES | metrics
+    algorithms = {name: case.title_of(name) for case in cases for name in case.algorithms}
+    return algorithms | INDICATOR_TITLES | metrics
 
 
 def summary_lines(case: Case) -> list[str]:
@@ -237,10 +201,10 @@ def summary_lines(case: Case) -> list[str]:
         tests = compare_over_runs(case).replace(titles)
         for question, subject, heading, meaning in (
             ("RQ1", "algorithm", "{} against the original vehicle", MORE_UNSAFE),
-            ("RQ2", "baseline", "NSGA-II against {}", "above 0.5: NSGA-II is better"),
+            ("RQ2", "baseline", "{first} against {}", "above 0.5: {first} is better"),
         ):
-            if question == "RQ2":
-                nsga2_pairs(case)  # raises if RQ2 has no answer
+            first = case.title_of(opponents_of(case)[0]) if question == "RQ2" else ""  # raises if RQ2 has no answer
+            heading, meaning = heading.replace("{first}", first), meaning.replace("{first}", first)
             lines.append(f"{question} over runs: A12 {meaning}; * p < {ALPHA:g} after Holm's correction")
             for name, group in tests[tests.index == question].groupby(subject, sort=False):
                 marks = np.where(group["p_holm"] < ALPHA, "*", "")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, UnanswerableError
+from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.figures import (
     BLUE,
     FONT_SIZE,
@@ -25,19 +25,13 @@ from safevar_sumo.analysis.figures import (
 )
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq32
-from safevar_sumo.analysis.research_questions.comparisons import rank_algorithms
 from safevar_sumo.analysis.research_questions.fronts import (
-    INDICATOR_TITLES,
     REFERENCE_COORDINATE,
-    SURFACE_PERCENTAGES,
-    compute_attainment,
     compute_convergence,
     nondominated_points,
     points_of,
     reference_front,
 )
-from safevar_sumo.analysis.research_questions.statistics import ALPHA
-from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import make_directory
@@ -85,7 +79,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
     original = [{**case.original, **known_values}.get(objective.name, np.nan) for objective in objectives]
     for axis, pair in zip(axes, pairs, strict=True):
         for (algorithm, points), colour, marker in zip(fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
-            label = f"{_title(algorithm)} ({len(points)})"
+            label = f"{escape_dollars(case.title_of(algorithm))} ({len(points)})"
             x, y = points[:, pair].T
             axis.scatter(x, y, marker=marker, s=16, alpha=0.6, linewidths=0, color=colour, label=label)
         x, y = (original[i] for i in pair)
@@ -98,12 +92,17 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 
 def draw_convergence(case: Case) -> Figure:
-    """The hypervolume of all settings so far over the number of evaluations, as median and range over the runs."""
+    """The hypervolume of all settings so far over the number of evaluations, as median and range over the runs; a line
+    ends where its algorithm does.
+    """
     import seaborn as sns
 
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
-    labels = {algorithm: f"{_title(str(algorithm))} ({count} runs)" for algorithm, count in runs.items()}
+    labels = {
+        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)"
+        for algorithm, count in runs.items()
+    }
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
     sns.lineplot(
         growth.assign(algorithm=growth["algorithm"].map(labels)),
@@ -125,74 +124,6 @@ def draw_convergence(case: Case) -> Figure:
     return figure
 
 
-def draw_critical_differences(case: Case) -> Figure:
-    """Mean ranks of the algorithms for each quality indicator; Nemenyi's test does not distinguish ranks whose bars
-    overlap.
-
-    Raises
-    ------
-    UnanswerableError
-        If there are fewer than three algorithms, or too few runs in which all of them have solutions.
-    """
-    frame = rank_algorithms(case)
-    frame = frame[frame["metric"].isin(list(INDICATOR_TITLES))].dropna(subset="mean_rank")
-    runs, difference = frame[["runs", "critical_difference"]].max().fillna(0.0)
-    if not runs or difference >= frame["algorithm"].nunique() - 1:
-        problem = f"{number_of(int(runs), 'run')} in which every algorithm has solutions are too few for a figure"
-        raise UnanswerableError(
-            case.name, f"{problem} of critical differences: all bars would overlap", "results of more runs"
-        )
-    groups = frame.groupby("metric", sort=False)
-    title = f"{case.name}: mean ranks over {runs:.0f} runs, critical difference {difference:.2f}"
-    height = 0.9 + 0.6 * len(groups) + 0.34 * len(frame)
-    figure, axes = new_figure(title, len(groups), 1, (6.8, height))
-    for axis, (metric, ranks) in zip(axes.flat, groups, strict=True):
-        ranks = ranks.sort_values("mean_rank", ascending=False, kind="stable")
-        names = [f"{_title(row['algorithm'])} {row['mean_rank']:.2f}" for row in ranks.to_dict("records")]
-        axis.errorbar(
-            ranks["mean_rank"], names, xerr=difference / 2, linestyle="", marker="o", color=COLOURS[0], capsize=3
-        )
-        axis.set(ylabel=INDICATOR_TITLES[str(metric)], xlabel="mean rank, 1 is best")
-        axis.margins(y=0.25)
-    figure.supxlabel(
-        "bars of one critical difference: ranks whose bars overlap are not distinguished "
-        f"(Nemenyi's test at {ALPHA:g})",
-        fontsize=FONT_SIZE,
-    )
-    return figure
-
-
-def draw_attainment_surfaces(case: Case) -> Figure:
-    """What at least one run, half of the runs and every run of each algorithm attain in the first two objectives.
-
-    Raises
-    ------
-    UnanswerableError
-        If there are no runs with solutions.
-    """
-    surfaces, objectives = compute_attainment(case), case.scoring.objectives[:2]
-    figure, axes = new_panels(
-        f"{case.name}: empirical attainment", len(surfaces), 3, (3.0, 3.1), min_width=5.2, title_height=0.8
-    )
-    for axis in axes[1:]:
-        axis.sharex(axes[0])
-        axis.sharey(axes[0])
-    signs = np.array([objective.sign for objective in objectives])
-    # Each surface goes on to the worst value that any surface has of an objective.
-    worst = np.max([np.max(points * signs, axis=0) for surface in surfaces.values() for points in surface.values()], 0)
-    labels = dict(zip(SURFACE_PERCENTAGES, ("half of the runs", "every run"), strict=True))
-    for axis, (algorithm, surface) in zip(axes, surfaces.items(), strict=True):
-        for (percentage, points), colour, dashes in zip(surface.items(), COLOURS, ("-", "--", "-."), strict=False):
-            minimised = points * signs
-            border = np.vstack([[minimised[0, 0], worst[1]], minimised, [worst[0], minimised[-1, 1]]]) * signs
-            label = labels.get(percentage, "at least one run")
-            axis.step(*border.T, where="post", color=colour, linestyle=dashes, label=label)
-        axis.set_title(_title(algorithm), fontsize=FONT_SIZE)
-        _label_axes(axis, objectives)
-    _add_legend_below(figure, axes[0])
-    return figure
-
-
 def _label_axes(axis: Axes, objectives: Sequence[Objective]) -> None:
     labels = [
         OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
@@ -206,10 +137,6 @@ def _add_legend_below(figure: Figure, axis: Axes) -> None:
     figure.legend(
         handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT_SIZE
     )
-
-
-def _title(algorithm: str) -> str:
-    return escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm))
 
 
 def draw_change_counts(cases: Sequence[Case]) -> Figure:
@@ -312,8 +239,6 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.3-sizes-of-changes": draw_change_sizes,
     "pareto-fronts": draw_pareto_fronts,
     "convergence": draw_convergence,
-    "critical-differences": draw_critical_differences,
-    "attainment": draw_attainment_surfaces,
 }
 
 
@@ -329,8 +254,7 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     figures, errors = {}, []
     drawings: dict[str, Callable[[], Figure]] = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
-        if draw is not draw_critical_differences or len(case.algorithms) > 2:  # two are compared as a pair
-            drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)
+        drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)
     for name, draw_figure in drawings.items():
         try:
             figures[name] = draw_figure()

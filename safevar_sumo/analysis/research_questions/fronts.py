@@ -1,5 +1,5 @@
 """The quality of the fronts that runs find (docs/method.md, section 7): IGD on the objectives in their units, IGD+ and
-hypervolume on normalised ones, their growth with the evaluations, and attainment surfaces.
+hypervolume on normalised ones, and its growth with the evaluations; and the number of evaluations.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
 INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
 REFERENCE_COORDINATE = 1.1
 """Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
-SURFACE_PERCENTAGES = (50.0, 100.0)
-"""Percentages of the runs whose attainment surfaces are computed, beside what at least one run attains."""
 CURVE_POINTS = 50
 """Maximum number of points of a run's convergence."""
 
@@ -99,12 +97,33 @@ def _frames_of_runs(case: Case, frame: pd.DataFrame) -> Iterator[tuple[tuple[str
     yield from ((run, groups[run]) for run in runs if run in groups)
 
 
+def count_evaluations(case: Case) -> pd.DataFrame:
+    """The evaluations of every finished run; columns setting, algorithm, run, requested, simulated, budget.
+
+    Equal settings are simulated once, so `simulated` counts different settings. A run has requested its whole budget if
+    a new setting is in its last generation; else it ended with its last new setting.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs.
+    """
+    search, rows = case.study.search, []
+    for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+        last = int(group["evaluation"].max()) + 1
+        requested = search.evaluations if last > search.evaluations - search.population else last
+        rows.append((case.name, algorithm, run, requested, len(group), search.evaluations))
+    if not rows:
+        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
+    return pd.DataFrame(rows, columns=["setting", "algorithm", "run", "requested", "simulated", "budget"])
+
+
 def compute_convergence(case: Case) -> pd.DataFrame:
     """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations,
     hypervolume.
 
-    A run that ended early keeps its last hypervolume. The hypervolume is 0 as long as no setting dominates the
-    reference point.
+    The numbers end with the longest run of the algorithm; a shorter one keeps its last hypervolume. The hypervolume is
+    0 as long as no setting dominates the reference point.
 
     Raises
     ------
@@ -112,49 +131,17 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         If there are no runs or no solutions.
     """
     reference, search, frames = reference_front(case), case.study.search, []
-    counts = np.unique(
-        np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
-    )
+    counts = np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
+    ends = count_evaluations(case).groupby("algorithm")["requested"].max()
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
         points = normalised(minimised_values(case, group), reference)
         is_defined, numbers = np.isfinite(points).all(axis=1), group["evaluation"].to_numpy()
+        counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
         front, volumes = points[:0], []
-        for start, end in pairwise([0, *counts]):
+        for start, end in pairwise([0, *counts_of_run]):
             new_points = points[is_defined & (start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
             volumes.append(hypervolume(front))
-        frames.append(pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": counts, "hypervolume": volumes}))
-    if not frames:
-        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
+        columns = {"algorithm": algorithm, "run": run, "evaluations": counts_of_run, "hypervolume": volumes}
+        frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
-
-
-def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
-    """Empirical attainment surfaces of the first two objectives, by algorithm and share [%] of its runs with solutions.
-
-    A surface is K points, shape (K, 2), in the objectives' units, sorted by the first objective. For each point, that
-    percentage of these runs found a setting at least as good (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
-
-    Raises
-    ------
-    UnanswerableError
-        If there are no runs with solutions.
-    """
-    reference_front(case)  # raises if there is no solution
-    surfaces: dict[str, dict[float, FloatArray]] = {}
-    signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
-    for algorithm in case.algorithms:
-        case.runs_of(algorithm)  # raises if the solutions are imported
-        solutions = case.solutions_of(algorithm)
-        points = minimised_values(case, solutions)
-        is_defined = np.isfinite(points).all(axis=1)
-        if is_defined.any():
-            runs = solutions["run"].to_numpy(dtype=int)[is_defined]
-            percentages = sorted({100 / np.unique(runs).size, *SURFACE_PERCENTAGES})
-            # Columns: the two objectives, and the percentage of the surface to which the row belongs.
-            rows = moocore.eaf(points[is_defined, :2], runs, percentiles=percentages)
-            rows = rows[np.argsort(rows[:, 0], kind="stable")]
-            surfaces[algorithm] = {
-                percentage: rows[rows[:, 2] == percentage, :2] * signs for percentage in np.unique(rows[:, 2]).tolist()
-            }
-    return surfaces

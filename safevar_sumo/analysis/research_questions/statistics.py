@@ -1,5 +1,5 @@
-"""Statistical tests of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed ranks and
-Friedman's test, effect sizes, and Holm's correction for many tests.
+"""Statistical tests of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed ranks, effect
+sizes, and Holm's correction for many tests.
 """
 
 from __future__ import annotations
@@ -106,25 +106,3 @@ def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
     ascending = values.dropna().sort_values()
     corrected = (ascending * np.arange(len(ascending), 0, -1)).clip(upper=1.0).cummax()
     return np.asarray(corrected.reindex(values.index), dtype=float)
-
-
-def friedman_test(values: FloatArray) -> tuple[float, float]:
-    """Friedman's statistic and p-value of N runs of k algorithms, shape (N, k); 0 and 1 if all algorithms are equal,
-    NaN if N < 2.
-    """
-    if len(values) < 2:
-        return np.nan, np.nan
-    if not np.ptp(values, axis=1).any():
-        return 0.0, 1.0
-    test = scipy.stats.friedmanchisquare(*values.T)
-    return float(test.statistic), float(test.pvalue)
-
-
-def critical_difference(algorithm_count: int, run_count: int, alpha: float = ALPHA) -> float:
-    """Least difference of mean ranks that Nemenyi's test (1963) distinguishes: q sqrt(k (k + 1) / (6 N)) for k
-    algorithms and N runs; NaN without runs.
-    """
-    if not run_count:
-        return np.nan
-    q = scipy.stats.studentized_range.ppf(1 - alpha, algorithm_count, np.inf) / np.sqrt(2)
-    return float(q * np.sqrt(algorithm_count * (algorithm_count + 1) / (6 * run_count)))

@@ -8,7 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.answer import SAFETY_TABLE, TableAnswer, algorithms_with_few_runs
+from safevar_sumo.analysis.research_questions.answer import (
+    EVALUATIONS,
+    SAFETY_TABLE,
+    TableAnswer,
+    algorithms_with_few_runs,
+)
 from safevar_sumo.analysis.research_questions.changes import WEATHER_VALUES
 from safevar_sumo.analysis.research_questions.comparisons import titles_of
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
@@ -25,13 +30,13 @@ SAFETY_UNITS = {
     "aveDece": "aveDece [m/s^2]",
 }
 CELL_FORMATS = {
-    **dict.fromkeys(("mean", "original", "mean_rank", "critical_difference", "value"), ".2f"),
+    **dict.fromkeys(("mean", "original", "value"), ".2f"),
     **dict.fromkeys(("share", "pc"), ".1%"),
     **dict.fromkeys(("percent", "percent_other"), ".1f"),
     "difference": "+.1f",
     "effect_size": ".3f",
     **dict.fromkeys(("p_value", "p_holm"), "p"),
-    **dict.fromkeys(("rank", "rank_other", "n1", "n2", "runs", "solutions", "collisions"), "d"),
+    **dict.fromkeys(("rank", "rank_other", "n1", "n2", "runs", "budget", "solutions", "collisions"), "d"),
     **dict.fromkeys(("delta", "increase", "increase_other", "decrease", "decrease_other"), "+.3g"),
     **dict.fromkeys(("min", "Q1", "median", "Q3", "max"), "g"),
 }
@@ -41,7 +46,6 @@ HEADINGS = {
     "p_value": "p",
     "p_holm": "p Holm",
     "effect_size": "A12",
-    "critical_difference": "critical difference",
     "pc": "PC",
     "percent": "%",
     "percent_other": "% in the other",
@@ -88,10 +92,7 @@ LAYOUTS: Mapping[str, Sequence[Layout]] = {
     "rq2": [Layout(["baseline", "metric"], TESTS)],
     "rq1-runs": [Layout(["algorithm", "metric"], [*HOLM_TESTS, "runs"])],
     "rq2-runs": [Layout(["baseline", "metric"], [*HOLM_TESTS, "n1", "n2"])],
-    "rq2-pairs": [Layout(["algorithm", "other", "metric"], HOLM_TESTS)],
-    "rq2-ranks": [
-        Layout(["metric", "runs", "p_value", "p_holm", "critical_difference"], "mean_rank", "algorithm", ["setting"])
-    ],
+    EVALUATIONS: [Layout(["algorithm"], ["runs", "min", "median", "max", "budget"])],
     "rq3.1": [Layout(["j"], ["min", "Q1", "median", "Q3", "max"])],
     "rq3.2": [Layout(["characteristic", "rank"], "percent", "j", ["setting"])],
     "rq3.3": [
@@ -109,11 +110,10 @@ LAYOUTS: Mapping[str, Sequence[Layout]] = {
 HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
 TITLES = {
     "rq1": "RQ1: solutions against the original vehicle",
-    "rq2": "RQ2: NSGA-II against the other algorithms",
+    "rq2": "RQ2: {first} against the other algorithms",
     "rq1-runs": f"RQ1 over runs: run means against the original vehicle ({HOLM_LEGEND})",
-    "rq2-runs": f"RQ2 over runs: NSGA-II's runs against those of the other algorithms ({HOLM_LEGEND})",
-    "rq2-pairs": f"RQ2 for every pair of algorithms, over runs ({HOLM_LEGEND})",
-    "rq2-ranks": f"RQ2: ranks of the algorithms over runs (1 is best; {HOLM_LEGEND})",
+    "rq2-runs": f"RQ2 over runs: the runs of {{first}} against those of the other algorithms ({HOLM_LEGEND})",
+    EVALUATIONS: "Different settings that a run simulates",
     "rq3.1": "RQ3.1: number of changed characteristics",
     "rq3.2": "RQ3.2: % of critical solutions in which a characteristic is changed",
     "rq3.3": "RQ3.3: size of changes",
@@ -131,7 +131,7 @@ NOTES: Mapping[str, Sequence[str]] = {
         BOLD_NOTE,
     ],
     "rq2": [
-        "A12 above 0.5: NSGA-II is better. IGD, IGD+ and HV compare runs;",
+        "A12 above 0.5: {first} is better. IGD, IGD+ and HV compare runs;",
         "the other metrics compare pooled solutions.",
         "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones.",
         BOLD_NOTE,
@@ -142,18 +142,10 @@ NOTES: Mapping[str, Sequence[str]] = {
     ],
     "rq2-runs": [
         "One value for each run (for safety metrics, the mean over its solutions).",
-        "A12 above 0.5: NSGA-II is better.",
+        "A12 above 0.5: {first} is better.",
         HOLM_NOTE,
     ],
-    "rq2-pairs": [
-        "One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
-        "Holm's correction is for all pairs and metrics of a case.",
-    ],
-    "rq2-ranks": [
-        "p: Friedman's test; runs with the same number form a block.",
-        "Holm's correction is for all metrics of a case.",
-        f"Ranks closer than the critical difference are not distinguished (Nemenyi, {ALPHA:g}).",
-    ],
+    EVALUATIONS: ["Equal settings are simulated once, and an algorithm may stop before it has used its budget."],
     "rq3.1": ["Critical solutions of a run with exactly j characteristics changed, over the runs."],
     "rq3.2": ["Columns: number of characteristics changed; ranked by 'any'."],
     "rq3.3": [
@@ -172,10 +164,11 @@ NOTES: Mapping[str, Sequence[str]] = {
 def lay_out(answer: TableAnswer) -> list[Table]:
     """The tables of an answer, with notes below the last one; for an empty answer a table with the reason."""
     if answer.frame.empty:
-        return [Table(TITLES[answer.name], pd.DataFrame(), answer.notes)]
+        return [Table(TITLES[answer.name].format(first="one algorithm"), pd.DataFrame(), answer.notes)]
     frame, tables = _readable_frame(answer), []
+    first = " or ".join(frame["algorithm"].unique()) if answer.name.startswith("rq2") else ""
     for layout in LAYOUTS[answer.name]:
-        title = f"{TITLES[answer.name]}{layout.title}"
+        title = TITLES[answer.name].format(first=first) + layout.title
         if not layout.one_table_per:
             tables.append(Table(title, _arrange(frame, layout)))
             continue
@@ -186,7 +179,7 @@ def lay_out(answer: TableAnswer) -> list[Table]:
         for method in frame["method"].dropna().unique():
             p_value = "p with e" if method == EXACT_TEST else "p"
             notes.append(f"{p_value}: {method}.")
-    notes += NOTES.get(answer.name, ())
+    notes += [note.replace("{first}", first) for note in NOTES.get(answer.name, ())]
     if "metric" in frame:
         metrics = {metric.name: metric for case in answer.cases for metric in case.scoring.metrics}.values()
         notes.append(_note_on_metrics(metrics))
@@ -211,6 +204,10 @@ def _readable_frame(answer: TableAnswer) -> pd.DataFrame:
     if name == "rq3.1":
         quartiles = frame.groupby(["setting", "j"], sort=False)["count"].quantile(np.linspace(0, 1, 5)).unstack()
         frame = quartiles.set_axis(["min", "Q1", "median", "Q3", "max"], axis=1).reset_index()
+    if name == EVALUATIONS:
+        runs = frame.groupby(["setting", "algorithm"], sort=False)
+        simulated = runs["simulated"].agg(["min", "median", "max"])
+        frame = simulated.assign(runs=runs.size(), budget=runs["budget"].first()).reset_index()
     if name == "rq3.2":  # the rank by 'any', the only one, labels the whole row of a characteristic
         frame = frame.assign(rank=frame.groupby(["setting", "characteristic"], sort=False)["rank"].transform("first"))
     if name == "combinations":
@@ -220,10 +217,8 @@ def _readable_frame(answer: TableAnswer) -> pd.DataFrame:
         column: [_format(value, CELL_FORMATS[column]) for value in frame[column]]
         for column in frame.columns.intersection(list(CELL_FORMATS))
     }
-    columns_of_names = ["algorithm", "baseline", "metric", "quantity"]
-    if name == "rq2-pairs":  # where `other` is an algorithm, not a case
-        columns_of_names.append("other")
-    names = {column: frame[column].replace(titles) for column in columns_of_names if column in frame}
+    columns_of_names = frame.columns.intersection(["algorithm", "baseline", "metric", "quantity"])
+    names = {column: frame[column].replace(titles) for column in columns_of_names}
     cells = frame.assign(**texts, **names)
     return _mark_tests(cells, answer) if "p_value" in frame else cells
 
@@ -239,8 +234,8 @@ def _mark_tests(cells: pd.DataFrame, answer: TableAnswer) -> pd.DataFrame:
         p_column, is_significant = "p_holm", frame["p_holm"] < ALPHA
         is_bold_effect = is_significant
     else:
-        question, algorithm = ("RQ1", "algorithm") if answer.name == "rq1" else ("RQ2", "baseline")
-        few_runs = [(case.name, name) for case in answer.cases for name in algorithms_with_few_runs(case, question)]
+        algorithm, first = ("algorithm", "") if answer.name == "rq1" else ("baseline", str(frame["algorithm"].iloc[0]))
+        few_runs = [(case.name, name) for case in answer.cases for name in algorithms_with_few_runs(case, first)]
         has_few_runs = np.array([pair in few_runs for pair in zip(frame["setting"], frame[algorithm], strict=True)])
         p_column, is_significant = "p_value", (frame["p_value"] < ALPHA) & ~has_few_runs
         is_bold_effect = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
