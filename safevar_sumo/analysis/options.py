@@ -78,6 +78,18 @@ def unsafe_option() -> Any:
     )
 
 
+def margin_option() -> Any:
+    return option(
+        None,
+        "Distance to keep from a collision [m], between bumpers where the safety degree is from centre to centre.  "
+        "[default: the model's error that the study states, else 0.3]",
+        kind=float,
+        low=0,
+        high=100,
+        metavar="M",
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """Options of a question; a value outside its range raises an error.

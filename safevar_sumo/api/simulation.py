@@ -24,6 +24,7 @@ from safevar_sumo.records import (
     Observation,
     Outcome,
     SimulationRuns,
+    finite_or_none,
 )
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.scenarios import Scenario, distance_in_words
@@ -160,6 +161,7 @@ class Simulation:
                 for objective in self.scoring.objectives
                 if objective.name in self.metrics
             },
+            "gap": "m",
             "f_safe": "m, or -m/s",
             "f_diff": "fraction",
             "f_num_diff": "characteristics",
@@ -171,12 +173,22 @@ class Simulation:
         return trace_frame(self.runs, self._observations)
 
     @property
+    def _contact(self) -> float:
+        """The safety degree at which bodies touch [m]."""
+        return self.runs.trace.vehicle_length if self._scenario.centre_to_centre else 0.0
+
+    @property
+    def gap(self) -> float:
+        """The least distance between bodies during the encounter [m]; 0 on a collision, NaN without an encounter."""
+        return float(self.evaluation.gaps(self._contact)[0])
+
+    @property
     def verdict(self) -> str:
         """How the simulation ended, in words."""
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
-        distance = distance_in_words(self._scenario, safety_degree)
+        distance = distance_in_words(safety_degree, self._contact)
         return OUTCOME_VERBS[self.outcome] + (
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
         )
@@ -188,6 +200,7 @@ class Simulation:
             **driven_entry(self.no_verdict),
             "vcs": dict(self.setting),  # vehicle characteristics
             **record(self.evaluation, row=0),
+            "gap": finite_or_none(self.gap),
         }
 
     def _repr_html_(self) -> str:

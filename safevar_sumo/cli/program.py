@@ -29,7 +29,7 @@ COMMANDS_BY_GROUP = {
         "study": ("study", "Search a study; run the same command again to continue where it stopped."),
         "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
         "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
-        "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
+        "tolerance": ("questions", "Find how far each characteristic may go: alone, and all together."),
         "repair": (
             "questions",
             "Find the smallest change of the driving system that survives promised wear, and its price.",

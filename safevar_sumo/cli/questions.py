@@ -138,7 +138,7 @@ def opinion(source: str, point: str | None, jobs: int | None, as_json: bool, **v
 @add_question(
     ToleranceOptions,
     "STUDY|DIR",
-    file_option("--plot", "Draw the profiles, or the curve of --trade, to this file: png, pdf or svg."),
+    file_option("--plot", "Draw the profiles to this file: png, pdf or svg."),
     click.option(
         "--format",
         "format_name",
@@ -157,7 +157,7 @@ def tolerance(
     format_name: str,
     **values: OptionValue,
 ) -> JsonAnswer:
-    """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
+    """Find how far each characteristic of STUDY may go: alone, and all together."""
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
     if as_json and format_name != "text":

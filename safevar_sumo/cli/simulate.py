@@ -34,12 +34,19 @@ from safevar_sumo.cli.program import commands, print_json, print_note, print_war
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import whole_file
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, Outcome, finite_or_none
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.empty_road import summary_entry, why_no_verdict
-from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_points, system_at_point, vehicle_remarks
+from safevar_sumo.sumo.matrix import (
+    PointResult,
+    contact_degree,
+    point_record,
+    simulate_all_points,
+    system_at_point,
+    vehicle_remarks,
+)
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -187,12 +194,14 @@ def _simulate_sweep(
     evaluations = evaluate_settings(
         target.study, np.concatenate([system.characteristics.original[np.newaxis], settings])
     )
-    no_verdict = why_no_verdict(system)
+    no_verdict, contact = why_no_verdict(system), contact_degree(system)
+    gaps = evaluations.gaps(contact)
     _, *records = [  # without the original
         {
             "study": target.study.name,
             "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
             **record(evaluations, row),
+            "gap": finite_or_none(gaps[row]),
         }
         for row, setting in enumerate(evaluations.settings.tolist())
     ]
@@ -200,7 +209,7 @@ def _simulate_sweep(
         print_json([*records, *summary_entry(no_verdict)])
     else:
         print_heading(Console(), target.study.title, no_verdict)
-        print_sweep(Console(), system.characteristics, names, evaluations)
+        print_sweep(Console(), system.characteristics, names, evaluations, contact)
     reset_count = np.count_nonzero((settings != requested_settings).any(axis=1))
     if reset_count:
         print_note(
@@ -293,23 +302,30 @@ def _safety_comparison(simulation: Simulation) -> str:
         return "whether that is less safe cannot be decided"
     if degree == original:
         return "as safe as the original"
-    return f"{'less safe' if degree < original else 'safer'} than the original, SD {degree:.2f} against {original:.2f}"
+    gaps = "" if simulation.gap == degree else f", gap {simulation.gap:.2f} against {simulation.original.gap:.2f} m"
+    change = "less safe" if degree < original else "safer"
+    return f"{change} than the original, SD {degree:.2f} against {original:.2f}{gaps if degree > 0 else ''}"
 
 
 def print_sweep(
-    console: Console, characteristics: CharacteristicSet, names: Sequence[str], evaluations: Evaluations
+    console: Console, characteristics: CharacteristicSet, names: Sequence[str], evaluations: Evaluations, contact: float
 ) -> None:
     """Print a row for each setting, of which the first is the original: the named characteristics, outcome and
-    metrics.
+    metrics; where bodies touch at a safety degree of `contact` above 0 [m], gaps too.
     """
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
     table = WholeTable(right=(name + unit_text(unit, ", {}") for name, unit in zip(names, units, strict=True)))
     table.add_column("outcome")
-    for name in evaluations.metrics:
-        table.add_column(METRICS[name].heading if name in METRICS else name, justify="right")
+    columns_of_metrics = {
+        METRICS[name].heading if name in METRICS else name: values for name, values in evaluations.metrics.items()
+    }
+    if contact:
+        columns_of_metrics["gap, m"] = evaluations.gaps(contact)
+    for head in columns_of_metrics:
+        table.add_column(head, justify="right")
     for row, outcome in enumerate(evaluations.outcome):
-        metrics = [values[row] for values in evaluations.metrics.values()]
+        metrics = [values[row] for values in columns_of_metrics.values()]
         table.add_row(
             *(f"{value:g}" for value in evaluations.settings[row, columns]),
             str(outcome),

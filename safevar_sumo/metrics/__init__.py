@@ -21,7 +21,7 @@ from safevar_sumo.metrics.measures import (
     TIT,
     time_to_collision as time_to_collision,
 )
-from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe
+from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe, margin_of as margin_of
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
 OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS)}

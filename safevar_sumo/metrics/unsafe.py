@@ -13,7 +13,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.measures import RATING_POINTS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
@@ -27,18 +27,24 @@ COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
 """The default limit if nothing collides: this share of the original's safety degree, to this many significant digits.
 """
+DEFAULT_MARGIN = 0.3
+"""Distance to keep in a study that states no error of its model [m]."""
 POINT_LOSS, POINT_DECIMALS = 1.0, 6
 """The default limit in a rated study: the original's points minus this loss, to this many decimals."""
 
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A criterion of an unsafe vehicle: a collision; with `below`, a safety degree below this limit [m, or -m/s]; with
-    `points`, at most that many points of a rating.
+    """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with `below`, a safety degree
+    below this limit [m, or -m/s]; with `points`, at most that many points of a rating.
+
+    `contact` is the safety degree at which bodies touch [m]: 0, or a vehicle's length from centre to centre.
     """
 
     below: float | None = None
     points: float | None = None
+    keep: float = 0.0
+    contact: float = 0.0
     is_half: bool = field(default=False, compare=False, repr=False)
     """Whether `below` is half of the original's safety degree, the default if nothing collides."""
 
@@ -49,13 +55,15 @@ class Unsafe:
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision`, `safety degree below 0.847 m (half of the original's, a
-        screening limit)`.
+        """The criterion in words, rounded: `collision (safe: stops at least 0.30 m short)`, `safety degree below 1.4 m
+        (half of the original's, a screening limit)`.
         """
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.below is None:
-            return "collision"
+            kept = f"{self.keep:.2f}" if round(self.keep, 2) == self.keep else f"{self.keep:g}"
+            where = ", from bumper to bumper" if self.contact else ""
+            return f"collision (safe: stops at least {kept} m short{where})" if self.keep else "collision"
         share = " (half of the original's, a screening limit)" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
@@ -77,16 +85,20 @@ class Unsafe:
     def _holds(self, outcome: Any, column: Callable[[str], Any]) -> Any:
         if self.points is not None:
             return column(RATING_POINTS.name) <= self.points
-        return outcome == COLLISION if self.below is None else column(F_SAFE.name) < self.below
+        if self.below is not None:
+            return column(F_SAFE.name) < self.below
+        collides = outcome == COLLISION
+        return collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
 
     def margin(self, evaluations: Evaluations) -> FloatArray:
         """By how much evaluations are above the limit, in the limit's unit; shape (M,).
 
-        If the criterion is a collision, the limit is a safety degree of 0.
+        If the criterion is a collision without a distance to keep, the limit is a safety degree of 0.
         """
         if self.points is not None:
             return evaluations.column(RATING_POINTS.name) - self.points
-        return evaluations.f_safe - (self.below or 0.0)
+        limit = self.contact + self.keep if self.keep else 0.0
+        return evaluations.f_safe - (limit if self.below is None else self.below)
 
     @classmethod
     def parse(cls, criterion: Criterion) -> Unsafe:
@@ -154,6 +166,11 @@ class Unsafe:
                 "unsafe", "nothing collides, and the original vehicle has no safety degree to halve", CRITERIA
             )
         return unsafe
+
+
+def margin_of(study: Study, margin: float | None) -> float:
+    """The distance to keep [m]: the stated one, else the study's error of its model, else `DEFAULT_MARGIN`."""
+    return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if margin is None else margin
 
 
 Criterion = Unsafe | float | str

@@ -70,6 +70,13 @@ class Evaluations:
         """Outcomes and metrics by name."""
         return {"outcome": self.outcome, "collision_speed": self.collision_speed, **self.metrics}
 
+    def gaps(self, contact: float) -> FloatArray:
+        """Least distances between bodies during the encounter [m], shape (M,); 0 on a collision, NaN where undefined.
+
+        Bodies touch at a safety degree of `contact` [m].
+        """
+        return np.where(self.collided, 0.0, self.f_safe - contact)
+
     def column(self, name: str) -> FloatArray:
         """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is NaN everywhere."""
         if name in ("f_safe", "f_diff", "f_num_diff"):

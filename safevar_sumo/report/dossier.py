@@ -329,18 +329,13 @@ class _Dossier:
             words = ", ".join(f"{name} {{changes.{name}:.4g}}" for name in cause["changes"])
             yield self._say("explain", f"Enough by themselves: {words or 'no change'} ({{outcome}}).", at=f"{path}.")
         tolerance = self._answer("tolerance", {"alone": []})
-        has_limits = isinstance(tolerance, list)
-        first, at = (tolerance[0], "0.") if has_limits else (tolerance, "")
-        for index, row in enumerate(first["alone"]):
+        for index, row in enumerate(tolerance["alone"]):
             if row["safe"]:
                 text = "Alone: no unsafe value of {characteristic} found from {safe.0:ceil} to {safe.1:floor}"
-                yield self._say("tolerance", f"{text}{unit_text(row['unit'])}.", at=f"{at}alone.{index}.")
-        if first.get("joint"):
-            bound = "at most {unsafe_at_most:.2%} unsafe with {confidence:.0%} confidence"
-            yield self._say("tolerance", f"All together: {{factor:.1%}} of the domain, {bound}.", at=f"{at}joint.")
-        if has_limits and tolerance[-1]["joint"]:
-            text = "With the limits of the study: {unsafe} of {samples} settings unsafe, at most {at_most:.2%} of all."
-            yield self._say("tolerance", text, at="-1.joint.")
+                yield self._say("tolerance", f"{text}{unit_text(row['unit'])}.", at=f"alone.{index}.")
+        if tolerance.get("samples"):
+            text = "All together: {failures} of {samples} settings unsafe, at most {at_most:.2%} of all."
+            yield self._say("tolerance", text)
         if "risk" in self.questions:
             yield self._say("risk", "The share of unsafe vehicles is {probability:.3g}.")
         for question in self.questions:

@@ -92,7 +92,8 @@ def limits_data(tolerance: Tolerance) -> JsonObject:
     """The limits sheet as a table, without columns that say nothing on the page."""
     sheet = tolerance.sheet.to_frame().set_index("characteristic")
     hidden = ["part"] if tolerance.limits else ["part", "specified", "kept"]
-    return table_data(sheet.drop(columns=hidden), "Limits, rounded to the safe side")
+    notes = [f"Unsafe: {tolerance.unsafe.description}."]
+    return table_data(sheet.drop(columns=hidden), "Limits to obey all together, rounded to the safe side", notes)
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:

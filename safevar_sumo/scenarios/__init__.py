@@ -72,9 +72,12 @@ def weather_in_words(weather: Weather) -> str:
     return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"
 
 
-def distance_in_words(scenario: Scenario, safety_degree: float) -> str:
-    """A safety degree above 0 as text; adds `from centre to centre` where the scenario measures so."""
-    return f"{safety_degree:.2f} m{' from centre to centre' if scenario.centre_to_centre else ''}"
+def distance_in_words(safety_degree: float, contact: float) -> str:
+    """A safety degree above 0 as text, with the gap between bumpers where it is from centre to centre: where bodies
+    touch at a safety degree of `contact` above 0 [m].
+    """
+    gap = f" from centre to centre (gap {round(safety_degree - contact, 2) + 0.0:.2f} m)" if contact else ""
+    return f"{safety_degree:.2f} m{gap}"
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:

@@ -57,9 +57,9 @@ class PointResult(NamedTuple):
 def point_record(result: PointResult) -> JsonObject:
     """Plain values of the first setting of a result; a value is None if it is undefined.
 
-    Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted
-    [km/h]; the time to collision at the first warning [s]; the side of the contact, and the position along that side
-    [%].
+    Keys: the point and the outcome; impact speeds [m/s]; safety degree and gap [m]; the largest deviation from the test
+    speed before the ADS acted [km/h]; the time to collision at the first warning [s]; the side of the contact, and the
+    position along that side [%].
     """
     evaluations, runs = result.evaluations, result.runs
     test_speed_error, warning_ttc, side, place = (
@@ -70,6 +70,7 @@ def point_record(result: PointResult) -> JsonObject:
         "impact_speed": evaluations.collision_speed[0],
         "relative_impact_speed": runs.relative_speed[0],
         SAFETY_DEGREE: evaluations.f_safe[0],
+        "gap": evaluations.gaps(runs.trace.vehicle_length * result.point.scenario.centre_to_centre)[0],
         "test_speed_error": test_speed_error / KMH,
         "warning_ttc": warning_ttc,
     }
@@ -189,6 +190,17 @@ def simulate_all_points(system: System, settings: FloatArray, engine: Engine = E
     """
     by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine) for result in group}
     return [by_name[point.name] for point in system.points]
+
+
+def contact_degree(system: System) -> float:
+    """The safety degree at which bodies touch [m]: 0, or the vehicle's length in a scenario that measures from centre
+    to centre.
+    """
+    point = system.points[0]
+    if not point.scenario.centre_to_centre:
+        return 0.0
+    runs = drive_all(system.at(point), system.characteristics.original[np.newaxis], Engine.RECORDED)
+    return runs.trace.vehicle_length
 
 
 def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> Iterator[list[PointResult]]:

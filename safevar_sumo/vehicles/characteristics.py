@@ -21,6 +21,8 @@ from safevar_sumo.study import Study, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
+ROUNDING = 1e-6
+"""Share of a text's last digit by which a value may be off its rounded one, from rounding errors."""
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 """Pairs of the smallest width of a domain, and the share beta of the width above which the filter keeps changes (method
 section 2).
@@ -70,7 +72,20 @@ class Characteristic:
 
     def text(self, value: float) -> str:
         """A value as text, rounded so that one unit of its last digit is at most a quarter of the threshold."""
-        return f"{value:.{max(0, math.ceil(-math.log10(self.threshold / 4)))}f}"
+        return f"{value:.{self.digits}f}"
+
+    @property
+    def digits(self) -> int:
+        """Number of decimals of `text`."""
+        return max(0, math.ceil(-math.log10(self.threshold / 4)))
+
+    def rounded(self, value: float, *, upwards: bool) -> float:
+        """A limit rounded to the digits of `text`, upwards or downwards; never beyond the original."""
+        scaled, original = value * 10**self.digits, self.original
+        up, down = math.ceil(scaled - ROUNDING), math.floor(scaled + ROUNDING)
+        rounded = (up if upwards else down) / 10**self.digits
+        is_beyond = rounded > original >= value if upwards else rounded < original <= value
+        return original if is_beyond else rounded
 
     @property
     def suffix(self) -> str:

@@ -25,7 +25,6 @@ from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.sheet import safe_text
 from safevar_sumo.cli.program import commands
 from safevar_sumo.study import load_study
 from safevar_sumo.terminal import WholeTable, answer_as_html
@@ -59,7 +58,7 @@ def test_a_function_takes_and_documents_the_options_of_its_record(options: type[
     [
         ExplainOptions(),
         ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
-        ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), pairs=True),
+        ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), margin=0.5),
         RiskOptions(samples=4000, width=0.01),
         RulesOptions(samples=4000, unsafe="collision"),
         OpinionOptions(solutions="nsga2:3:0"),
@@ -96,7 +95,7 @@ def test_a_question_takes_the_point_that_its_command_takes() -> None:
 def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
     for question, *flags in (
         ("explain", "--limit", "1000", "--top", "1", "--fits", "0"),
-        ("tolerance", "--characteristics", "mass,tireFric", "--pairs", "--fits", "0"),
+        ("tolerance", "--characteristics", "mass,tireFric", "--margin", "0.5", "--fits", "0"),
         ("risk", "--samples", "300"),
         ("compare", str(slippery), "--samples", "100"),
     ):
@@ -106,9 +105,10 @@ def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
 
 def test_limits_are_rounded_to_the_safe_side() -> None:
     one = CharacteristicSet.of(load_study("wear")).members[0]
-    assert safe_text(one, 2.3178, upwards=True) == "2.32"
-    assert safe_text(one, 2.3278, upwards=False) == "2.32"
-    assert safe_text(one, 7.999, upwards=True) == "8.00"
+    assert one.rounded(2.3178, upwards=True) == 2.32
+    assert one.rounded(2.3278, upwards=False) == 2.32
+    assert one.rounded(7.999, upwards=True) == 8
+    assert replace(one, original=7.9992).rounded(7.999, upwards=True) == 7.9992, "not beyond the original"
 
 
 def test_a_notebook_shows_the_sentences_and_tables_of_the_terminal() -> None:

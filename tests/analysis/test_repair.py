@@ -19,6 +19,7 @@ from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.analysis.repair import attack, compute, smallest
 from safevar_sumo.analysis.repair.answer import write_repair
 from safevar_sumo.analysis.repair.problem import Parameter, RepairProblem
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
@@ -228,7 +229,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
     nothing: Any = None
     narrow = Parameter("a", "m", "", 1000.0, 1001.0, False, 1000.0)
-    problem = RepairProblem(evaluator=nothing, promise=nothing, parameters=[narrow], margin=0.3)
+    problem = RepairProblem(evaluator=nothing, promise=nothing, parameters=[narrow], unsafe=Unsafe(keep=0.3))
     assert problem.values(np.array([[0.45678]])).item() == 1000.457
 
 

@@ -85,11 +85,8 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
     below = ("--unsafe", "below=2.5", "--fits", "0")
     explained = json_of("explain", "out", *below, "--top", "2", "--limit", "500")
-    tolerance = json_of(
-        "tolerance", "bound.toml", *below, "--pairs", "--characteristics", "tireFric,mass,maxBrakeTorque"
-    )
+    tolerance = json_of("tolerance", "bound.toml", *below, "--characteristics", "tireFric,mass,maxBrakeTorque")
     boundaries = [cause["boundary"] for one in explained[:-1] for cause in one["minimal_causes"]]
-    nearest = [pair["nearest"] for pair in tolerance["pairs"] if pair["nearest"]]
     alone = [
         {scan["characteristic"]: value}
         for scan in tolerance["alone"]
@@ -97,9 +94,8 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         for value in ends
     ]
     assert boundaries
-    assert nearest
     assert len(alone) >= 6
-    reported = [*settings_in([one for one in explained if "summary" not in one]), *nearest, *alone]
+    reported = [*settings_in([one for one in explained if "summary" not in one]), *alone]
     assert [values for values in reported if not is_feasible(values)] == []
     assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
     for question in ("tolerance bound.toml --fits 0 --characteristics mass", "rules bound.toml --samples 200"):
@@ -144,4 +140,4 @@ def test_tolerance_refuses_characteristics_that_an_equality_ties_and_answers_for
     ):
         sv.tolerance(tied, characteristics=["mass", "radius"], unsafe="collision", jobs=1, fits=0)
     free = sv.tolerance(tied, characteristics=["radius"], unsafe="collision", jobs=1, fits=0)
-    assert free.joint.samples > 0
+    assert free.box is not None

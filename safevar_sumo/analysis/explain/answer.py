@@ -29,6 +29,7 @@ from safevar_sumo.results import CHOICES
 from safevar_sumo.scenarios import distance_in_words, equals_clear, weather_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Answer, WholeTable, constraints_in_words
 
@@ -291,7 +292,8 @@ def situation_in_words(
     if not nearest or nearest.collided[0] or original.collided[0] or RATING_POINTS.name in original.metrics:
         return f"{place}, the original vehicle {ending}."
     if nearest.outcome[0] == original.outcome[0]:
-        ending = f"{original.f_safe[0]:.2f} m"  # the verb is that of the worst vehicle
+        # The verb is that of the worst vehicle.
+        ending = distance_in_words(float(original.f_safe[0]), contact_degree(system))
     return (
         f"No collision in {number_of(number, 'vehicle')}; the worst {_ending_in_words(system, nearest)}, "
         f"the original {ending}, {place[0].lower()}{place[1:]}."
@@ -339,4 +341,4 @@ def _ending_in_words(system: System, run: Evaluations) -> str:
     verb = OUTCOME_VERBS[outcome]
     if np.isnan(degree):
         return verb
-    return f"{verb} with a safety degree of {distance_in_words(system.points[0].scenario, degree)}"
+    return f"{verb} with a safety degree of {distance_in_words(degree, contact_degree(system))}"

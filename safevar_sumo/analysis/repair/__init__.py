@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, document_options, option
+from safevar_sumo.analysis.options import Options, document_options, margin_option, option
 from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
@@ -32,14 +32,7 @@ class RepairOptions(Options):
         metavar='"NAME >= X"',
         form="repeated",
     )
-    margin: float | None = option(
-        None,
-        "Safety degree to keep [m].  [default: the model's error that the study states, else 0.3]",
-        kind=float,
-        low=0,
-        high=100,
-        metavar="M",
-    )
+    margin: float | None = margin_option()
     change: tuple[str, ...] = option(
         (),
         "Parameter of the driving system that may change; may be repeated.  [default: those under [repair], else those "

@@ -20,8 +20,10 @@ from safevar_sumo.analysis.repair.problem import Parameter, Promise
 from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
+from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
 from safevar_sumo.study.schema import NAME_PATTERN
 from safevar_sumo.sumo.empty_road import summary_entry
@@ -112,7 +114,7 @@ class Repairs:
 
     study: Study
     promise: Promise
-    margin: float
+    unsafe: Unsafe
     parameters: tuple[Parameter, ...]
     repairs: tuple[Repair, ...]
     worst_today: float
@@ -131,7 +133,7 @@ class Repairs:
         summary: JsonObject = {
             "record": "summary",
             "promise": self.promise.to_dict(),
-            "margin": self.margin,
+            "margin": self.unsafe.keep,
             "repairs": len(self.repairs),
             "not_repairable": [part._asdict() for part in self.not_repairable],
             "attacks": self.attacks,
@@ -205,7 +207,7 @@ class Repairs:
             where = " wherever any driving system can" if self.not_repairable else ""
             return (
                 f"The driving system of today keeps this promise ({self.promise.in_words}){where}: the worst vehicle "
-                f"tried has a safety degree of {self.worst_today:.2f} m, and {_proof_in_words(self.proof_of_today)}."
+                f"tried has a safety degree of {self._worst_in_words}, and {_proof_in_words(self.proof_of_today)}."
             )
         if self.repairs:
             first = self.repairs[0]
@@ -221,14 +223,19 @@ class Repairs:
             f"{self.largest_promise.in_words}."
         )
 
+    @property
+    def _worst_in_words(self) -> str:
+        return distance_in_words(self.worst_today, self.unsafe.contact)
+
     def sentences(self) -> Iterator[str | Table]:
         """The verdict; the price, the other repairs and the checks; what cannot be repaired."""
+        yield f"Unsafe: {self.unsafe.description}."
         if not self.no_verdict:
             yield self.verdict
         if self.repairs:
             first = self.repairs[0]
             degree = self.worst_today
-            worst = f"safety degree {degree:.2f} m" if degree >= 0 else f"a collision at {-degree:.2f} m/s"
+            worst = f"safety degree {self._worst_in_words}" if degree >= 0 else f"a collision at {-degree:.2f} m/s"
             yield f"  today              the worst vehicle of the promise: {worst}"
             yield f"  price on a new car {_price_in_words(first.price)}"
             for other in self.repairs[1:]:

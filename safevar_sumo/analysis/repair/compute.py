@@ -23,15 +23,14 @@ from safevar_sumo.analysis.repair.price import Prices, check_unseen
 from safevar_sumo.analysis.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.analysis.repair.smallest import Search
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject, differences
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-DEFAULT_MARGIN = 0.3
-"""Safety degree to keep of a study that states no error of its model [m]."""
 SOBOL_VEHICLES = 256
 """Sobol points of the promise among the first counterexamples."""
 MAX_ROUNDS = 30
@@ -92,7 +91,7 @@ def find_repairs(source: Study | Case, options: RepairOptions, evaluator: Evalua
     return Repairs(
         study=problem.study,
         promise=problem.promise,
-        margin=problem.margin,
+        unsafe=problem.unsafe,
         parameters=tuple(problem.parameters),
         repairs=tuple(repairs),
         worst_today=float(degrees[0] if proof_of_today is None else degrees[is_repairable][0]),
@@ -117,9 +116,9 @@ def _problem_of(evaluator: Evaluator, options: RepairOptions) -> RepairProblem:
     promise = Promise.of(study, evaluator.region, options.promise)
     if options.curve is not None and options.curve not in evaluator.characteristics.names:
         evaluator.characteristics.setting({options.curve: 0.0}, "curve")  # raises the error of an unknown name
-    margin = study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if options.margin is None else options.margin
+    unsafe = Unsafe(keep=margin_of(study, options.margin), contact=contact_degree(assemble(study)))
     problem = RepairProblem(
-        evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), margin=margin
+        evaluator=evaluator, promise=promise, parameters=parameters_of(study, options.change), unsafe=unsafe
     )
     return replace(problem, arrays=problem.takes_arrays())
 

@@ -18,6 +18,7 @@ from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
 from safevar_sumo.analysis.preventability import approach_parameters
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
 from safevar_sumo.study.characteristics import limit_mistakes
@@ -207,7 +208,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
-    """A study's ADS with P parameters that may change, and the safety degree `margin` to keep within a promise.
+    """A study's ADS with P parameters that may change, and the criterion to keep within a promise: safety degrees of at
+    least `margin`.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1]. With `arrays`, one
     ADS drives vehicles with different parameters; otherwise there is an instance for each set.
@@ -216,12 +218,16 @@ class RepairProblem:
     evaluator: Evaluator
     promise: Promise
     parameters: list[Parameter]
-    margin: float
+    unsafe: Unsafe
     arrays: bool = False
 
     @property
     def study(self) -> Study:
         return self.evaluator.study
+
+    @property
+    def margin(self) -> float:
+        return self.unsafe.keep + self.unsafe.contact
 
     @cached_property
     def today(self) -> FloatArray:

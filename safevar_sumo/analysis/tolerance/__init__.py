@@ -1,4 +1,4 @@
-"""How far may each characteristic go by itself, in pairs, and together with all others?
+"""How far may each characteristic go alone, and together with all others?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the
 computation.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
+from safevar_sumo.analysis.options import Options, document_options, margin_option, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_call
 from safevar_sumo.study import StudyLike
 
@@ -33,11 +33,11 @@ class ToleranceOptions(Options):
         metavar="A,B",
         form="commas",
         python=(
-            "Characteristics that vary alone, in pairs, and together in the joint box; the others keep their "
-            "values. By default all."
+            "Characteristics that vary, alone and together in the joint box; the others keep their values. By default "
+            "all."
         ),
     )
-    pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
+    margin: float | None = margin_option()
     fits: int = option(
         8,
         "Number of vehicle models that fit the published data about as well (sets of [spread]) with which each "
@@ -58,17 +58,6 @@ class ToleranceOptions(Options):
             "study: all other characteristics get the largest box that is safe with these."
         ),
     )
-    trade: tuple[str, ...] | None = option(
-        None,
-        "How far B may go at values of A, from its original to where A alone is unsafe; other characteristics that "
-        "have a limit are held at it.  [default: none]",
-        metavar="A,B",
-        form="commas",
-        python=(
-            "Two characteristics: find how far the second may go at values of the first, from its original to where "
-            "the first alone is unsafe; other characteristics that have a limit are held at it. By default none."
-        ),
-    )
 
 
 @document_options(ToleranceOptions)
@@ -77,17 +66,16 @@ def tolerance(
     *,
     unsafe: Criterion | None = None,
     characteristics: Sequence[str] | None = None,
-    pairs: bool = ToleranceOptions.pairs,
+    margin: float | None = ToleranceOptions.margin,
     fits: int = ToleranceOptions.fits,
     limits: Sequence[str] = ToleranceOptions.limits,
-    trade: Sequence[str] | None = None,
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
     point: str | None = None,
 ) -> Tolerance:
-    """Find how far characteristics may go: each by itself, with `pairs` also two together, and all together.
+    """Find how far characteristics may go: each alone, and all together.
 
     Parameters
     ----------

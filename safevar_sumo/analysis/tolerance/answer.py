@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.answer import situation_in_words
 from safevar_sumo.analysis.figures import (
     BLUE,
@@ -20,11 +21,9 @@ from safevar_sumo.analysis.figures import (
     escape_dollars,
     new_panels,
 )
-from safevar_sumo.analysis.tolerance.boxes import SafeBox
 from safevar_sumo.analysis.tolerance.joint import JointLimits
-from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
-from safevar_sumo.analysis.tolerance.sheet import LimitRow, LimitsSheet, describe_failure
-from safevar_sumo.analysis.tolerance.trade import Trade
+from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan
+from safevar_sumo.analysis.tolerance.sheet import LimitRow, LimitsSheet
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -38,72 +37,60 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_PAIRS = 12
-"""Maximum number of pairs in the table."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far characteristics may go: each by itself, two together, and all together.
+    """How far characteristics may go: each alone, and all together.
 
     Attributes
     ----------
+    contact
+        The safety degree at which bodies touch [m], as in `Unsafe`.
     original
         The evaluation of the original vehicle.
     alone
         A scan of each characteristic.
-    pairs
-        The planes of two characteristics; None if not requested.
-    joint
-        The largest safe box that is the same share of every domain.
+    together
+        The largest safe box, in which the specified limits are reached; None if no box was sought: of a rated study, or
+        around an unsafe original.
     no_verdict
         Why simulations tell nothing about the driving system; "" if they do.
     limits
         The limits that the user specified, by characteristic.
-    together
-        The largest safe box in which the limits are reached; None without limits, and if no box is sought.
-    first_failures
-        Evaluations of what fails first beyond the limit of a characteristic, by name.
-    trade
-        The trade-off of two characteristics; None if not requested.
+    beyond, beyond_alone
+        What fails first beyond a characteristic's limit, by its name: with the others at their limits, and alone.
     """
 
     study: Study
     unsafe: Unsafe
+    contact: float
     original: Evaluations
     alone: list[OneAtATimeScan]
-    pairs: list[Pair] | None
-    joint: SafeBox
-    no_verdict: str = ""
-    limits: Mapping[str, Limit] = field(default_factory=dict)
-    together: JointLimits | None = None
-    first_failures: Mapping[str, Evaluations] = field(default_factory=dict)
-    trade: Trade | None = None
+    together: JointLimits | None
+    no_verdict: str
+    limits: Mapping[str, Limit]
+    beyond: Mapping[str, str]
+    beyond_alone: Mapping[str, str]
+
+    @property
+    def box(self) -> JointLimits | None:
+        """The box if it is safe."""
+        return self.together if self.together is not None and self.together.kept else None
 
     @property
     def sheet(self) -> LimitsSheet:
-        """The limits sheet: all together are in the box with the specified limits, else in the proportional box."""
-        rows, factor, points = [], self.joint.factor, assemble(self.study).points
-        for scan in self.alone:
-            item = scan.characteristic
-            run = self.first_failures.get(item.name)
-            interval = None
-            if self.together is not None:
-                interval = self.together.box[item.name]
-            elif factor:
-                interval = (
-                    item.original - factor * (item.original - item.lower),
-                    item.original + factor * (item.upper - item.original),
-                )
-            rows.append(
-                LimitRow(
-                    scan=scan,
-                    together=interval,
-                    specified=self.limits.get(item.name),
-                    together_is_safe=self.together is None or self.together.kept,
-                    first_failure=None if run is None else describe_failure(run, points, self.unsafe),
-                )
+        """The limits sheet."""
+        rows = [
+            LimitRow(
+                scan=scan,
+                together=None if self.box is None else self.box.box[scan.characteristic.name],
+                is_sought=not is_rated(self.study),
+                specified=self.limits.get(scan.characteristic.name),
+                beyond=self.beyond.get(scan.characteristic.name, ""),
+                beyond_alone=self.beyond_alone.get(scan.characteristic.name, ""),
             )
+            for scan in self.alone
+        ]
         return LimitsSheet(self.study.name, rows)
 
     @property
@@ -112,22 +99,15 @@ class Tolerance:
         return [f"limit of {row.characteristic.name}: {row.verdict}" for row in self.sheet.rows if not row.kept]
 
     @property
-    def unsafe_pairs(self) -> list[Pair]:
-        return [pair for pair in self.pairs or [] if pair.nearest is not None]
-
-    @property
     def verdict(self) -> str:
-        """One sentence on the characteristics and pairs that are unsafe by themselves."""
+        """One sentence on the characteristics that are unsafe alone."""
         if self.no_verdict:
             return self.no_verdict
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
         if names := [scan.characteristic.name for scan in self.alone if scan.unsafe]:
             return f"Unsafe alone, all others as in the original: {', '.join(names)}."
-        if pairs := [" with ".join(pair.characteristics) for pair in self.unsafe_pairs]:
-            number = f"{len(pairs)} of {len(self.pairs or [])} pairs"
-            return f"No single characteristic makes it unsafe, but {number}: {', '.join(pairs)}."
-        return f"No single characteristic {'makes' if self.pairs is None else 'and no pair makes'} it unsafe."
+        return "No single characteristic makes it unsafe."
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each characteristic alone.
@@ -146,23 +126,21 @@ class Tolerance:
         ]
         return pd.DataFrame(rows, columns=columns)
 
-    def to_dict(self) -> JsonObject | list[JsonObject]:
-        """The JSON of `tolerance`: a record; with limits, a list of it, the limits' records, the box with the limits,
-        and the trade-off.
-        """
-        record = {
+    def to_dict(self) -> JsonObject:
+        """The JSON of `tolerance`: the criterion, the test of the limits together, each alone, and the limits."""
+        box = self.together
+        return {
             "study": self.study.name,
             **driven_entry(self.no_verdict),
             "unsafe": str(self.unsafe),
+            "margin": self.unsafe.keep,
+            "kept": not self.broken_limits,
+            "samples": None if box is None else box.samples,
+            "failures": None if box is None else box.unsafe,
+            "at_most": None if box is None else box.at_most,
             "alone": [scan.to_dict() for scan in self.alone],
-            "pairs": [pair._asdict() for pair in self.pairs or []],
-            "joint": self.joint._asdict(),
+            "limits": [row.to_dict() for row in self.sheet.rows],
         }
-        trade = {} if self.trade is None else {"trade": self.trade.to_dict()}
-        if not self.limits:
-            return {**record, **trade}
-        joint = {"joint": None} if self.together is None else self.together.to_dict()
-        return [record, *(row.to_dict() for row in self.sheet.rows), joint, *([trade] if trade else [])]
 
     _repr_html_ = answer_as_html
 
@@ -170,60 +148,42 @@ class Tolerance:
         return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
 
     def sentences(self) -> Iterator[str | Table]:
-        """The verdict, the limits of each characteristic by itself, the worst pairs, and the safe box."""
+        """The verdict, the limits that may be obeyed together with the test of them, and each characteristic alone."""
         yield f"Unsafe: {self.unsafe.description}. {situation_in_words(assemble(self.study), self.original)}"
         if not self.no_verdict:
             yield self.verdict
         yield from constraints_in_words(self.study)
-        yield _scan_table(self.alone)
+        yield from self.sheet.parts()
+        if not is_rated(self.study):
+            yield self._box_in_words()
+        yield _scan_table(self.alone, self.contact)
         yield "* the end of the domain: values beyond it were not simulated."
         yield meanings(scan.characteristic for scan in self.alone)
         yield from _across_fits_in_words(self.alone)
-        yield from self._pairs_in_words()
-        yield from self.sheet.parts()
         if is_rated(self.study):
             yield from map(_losses_in_words, self.alone)
-        else:
-            yield self._box_in_words() if self.together is None else self.together.in_words
-        if self.trade is not None:
-            yield self.trade.table() if self.trade.curve else f"{self.trade.title}."
-
-    def _pairs_in_words(self) -> Iterator[str | Table]:
-        worst = sorted(self.unsafe_pairs, key=lambda pair: -pair.unsafe_share)
-        title = f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}"
-        table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"), title=title)
-        for pair in worst[:MAX_PAIRS]:
-            nearest = ", ".join(f"{name} {value:.5g}" for name, value in (pair.nearest or {}).items())
-            share = pair.not_simulated_share
-            failed = f" ({100 * share:.1f} % could not be simulated)" if share else ""
-            table.add_row(" with ".join(pair.characteristics), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
-        yield table
-        if len(worst) > MAX_PAIRS:
-            yield f"... and {len(worst) - MAX_PAIRS} more (--json has all)."
 
     def _box_in_words(self) -> str:
-        box, subject = self.joint, "All together"
-        if len(box.characteristics) < len(self.study.vehicle.characteristics):
-            subject = f"{', '.join(box.characteristics)} together, the others as in the original"
-        if not box.factor:
-            return f"{subject}: no box around the original is safe."
-        failed, or_failed = "", ""
-        if box.failed:
-            failed, or_failed = f", and {box.failed} could not be simulated", " or cannot be simulated"
-        feasible = " that satisfy the constraints" if self.study.constraints else ""
+        """The result of the test of the box."""
+        box = self.together
+        if box is None or not (box.kept or self.limits):
+            return "No box around the original is safe."
+        failed = f", and {box.failed} could not be simulated" if box.failed else ""
+        of_all = " of all that satisfy the constraints" if self.study.constraints else " of all"
+        bound = f"with {100 * CONFIDENCE:.0f} % confidence at most {100 * box.at_most:.2f} %{of_all} are"
+        if not box.kept:
+            drawn = f"{box.unsafe} of {box.samples} settings drawn at random"
+            return (
+                f"The limits are not kept: {drawn if box.unsafe else 'settings that a search found'} within them, all "
+                f"other characteristics as in the original, are unsafe{failed}; {bound}."
+            )
         return (
-            f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its "
-            f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
-            f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of all settings in the "
-            f"box{feasible} are unsafe{or_failed}."
+            "The limits together are the largest box by volume that was found. None of its corners, and none of "
+            f"{box.samples} settings drawn at random in it, is unsafe{failed}; {bound}."
         )
 
     def figure(self) -> Figure:
-        """The safety degree, or points, over each domain; the original is marked, unsafe intervals are shaded. With a
-        trade-off, its curve instead.
-        """
-        if self.trade is not None:
-            return self.trade.figure(self.study.name)
+        """The safety degree, or points, over each domain; the original is marked, unsafe intervals are shaded."""
         column = RATING_POINTS.name if is_rated(self.study) else SAFETY_DEGREE
         title = f"{self.study.name}: one characteristic at a time (unsafe: {self.unsafe})"
         figure, axes = new_panels(title, len(self.alone), 4, (2.3, 1.75), min_width=4.6, title_height=1.0)
@@ -237,7 +197,7 @@ class Tolerance:
         return figure
 
 
-def _scan_table(scans: Sequence[OneAtATimeScan]) -> WholeTable:
+def _scan_table(scans: Sequence[OneAtATimeScan], contact: float) -> WholeTable:
     states = {"unsafe": "unsafe", "not_simulated": "could not be simulated", "infeasible": "violates a constraint"}
     shown = [state for state in states if state == "unsafe" or any(scan.intervals(state) for scan in scans)]
     heads = ("original", "safe from", "to", "SD at the ends", *(states[state] for state in shown))
@@ -252,6 +212,9 @@ def _scan_table(scans: Sequence[OneAtATimeScan]) -> WholeTable:
                 for value in scan.safe
             ]
             cells.append(" / ".join(map(two_decimals, scan.margins)))
+            if contact:
+                gaps = [None if degree is None else degree - contact for degree in scan.margins]
+                cells[-1] += f" (gap {' / '.join(map(two_decimals, gaps))})"
         cells += [", ".join(f"{low:.5g} to {high:.5g}" for low, high in scan.intervals(state)) for state in shown]
         table.add_row(f"{item.name} [{item.unit}]", f"{item.original:g}", *(cell or "nowhere" for cell in cells))
     return table

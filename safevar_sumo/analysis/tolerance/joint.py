@@ -1,4 +1,4 @@
-"""The largest box in which characteristics may vary together while some are held to limits."""
+"""The largest box in which characteristics may vary together, with limits that the user specifies."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Interval
-from safevar_sumo.analysis.tolerance.boxes import FIRST_SEARCH_POINTS, sample_box, sobol_and_corners
+from safevar_sumo.analysis.evaluator import Evaluator, Interval
+from safevar_sumo.analysis.tolerance.boxes import corners_of, sample_box, sobol_and_corners
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, FloatArray, JsonObject
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 
 PARTS, ROUNDS = 8, 3
@@ -22,6 +22,8 @@ MAX_GAP = 0.05
 """A free side ends at most this share of the domain before something unsafe, or the domain's end; a little more than
 `WIDENING`.
 """
+SEARCH_POINTS = 256
+"""Number of Sobol points, and of corners, at which a box is searched for something unsafe."""
 SLAB_POINTS = 64
 """Number of Sobol points, and of corners, at which the room beside a box is searched."""
 MAX_ATTEMPTS = 40
@@ -42,58 +44,31 @@ STAGE = "limits together"
 
 
 class JointLimits(NamedTuple):
-    """The largest box that was found, by relative volume, in which the characteristics of `fixed` reach their limits.
+    """The largest box that was found, by relative volume, in which characteristics reach the limits specified for them.
 
     Attributes
     ----------
-    fixed
-        The limits.
     box
-        The interval of each characteristic.
+        The interval of each characteristic, rounded inwards to the digits that are printed.
     samples, unsafe, failed
         Number of settings drawn at random in the box, of the unsafe ones, and of those that could not be simulated.
     at_most
         With 95 % confidence, at most this share of all settings in the box is unsafe or cannot be simulated.
-    known_unsafe_inside
-        Number of unsafe solutions of results in the box.
     kept
-        False if settings within the limits are unsafe, all other characteristics as in the original. In the box, the
-        other characteristics then keep their original values.
+        False if no box is safe: settings within the limits are unsafe, all other characteristics as in the original.
+        In the box, the other characteristics then keep their original values.
     beyond
         By the name of a characteristic, an unsafe setting whose value of it is just beyond the box; all its other
         values are in the box.
     """
 
-    fixed: Mapping[str, Limit]
     box: Mapping[str, Interval]
     samples: int
     unsafe: int
     failed: int
     at_most: float
-    known_unsafe_inside: int
     kept: bool
     beyond: Mapping[str, FloatArray]
-
-    def to_dict(self) -> JsonObject:
-        """The last record of `tolerance --limits --json`."""
-        record = {name: value for name, value in self._asdict().items() if name not in ("failed", "beyond")}
-        record["fixed"] = {name: [limit.at_least, limit.at_most] for name, limit in self.fixed.items()}
-        return {"joint": record}
-
-    @property
-    def in_words(self) -> str:
-        """The result of the box's test."""
-        bound = f"with {100 * CONFIDENCE:.0f} % confidence at most {100 * self.at_most:.2f} % of all are"
-        if not self.kept:
-            drawn = f"{self.unsafe} of {self.samples} settings drawn at random"
-            return (
-                f"The limits are not kept: {drawn if self.unsafe else 'settings that a search found'} within them, all "
-                f"other characteristics as in the original, are unsafe; {bound}."
-            )
-        return (
-            "With the specified limits, the limits with all others at theirs are the largest box by volume that was "
-            f"found. None of {self.samples} settings drawn at random in it is unsafe; {bound}."
-        )
 
 
 class _BoxSearch:
@@ -104,6 +79,10 @@ class _BoxSearch:
     ----------
     width
         Widths of the domains; 0 for a characteristic that does not vary.
+    domain
+        The extents of the domains.
+    limits
+        The values of the sides that are at limits, NaN for the free ones.
     is_free
         Which sides may move; the others are at their limits.
     longest
@@ -128,19 +107,31 @@ class _BoxSearch:
         self.evaluator, self.columns, self.unsafe, self.unsafe_settings = evaluator, columns, unsafe, unsafe_settings
         members = evaluator.characteristics
         self.original, is_varied = members.original, np.isin(range(len(members)), columns)
-        self.longest = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
-        self.width, self.is_free = self.longest.sum(axis=0), self.longest > 0
+        self.domain = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
+        self.width, self.limits = self.domain.sum(axis=0), np.full_like(self.domain, np.nan)
         for name, limit in limits.items():
-            column = members.names.index(name)
-            for side, value in enumerate((limit.at_least, limit.at_most)):
-                if value is not None:
-                    self.is_free[side, column] = False
-                    self.longest[side, column] = abs(value - self.original[column])
+            self.limits[:, members.names.index(name)] = limit.at_least, limit.at_most  # None is NaN
+        self.is_free = (self.domain > 0) & np.isnan(self.limits)
+        self.longest = np.where(np.isnan(self.limits), self.domain, np.abs(self.limits - self.original))
         self.fixed = np.where(self.is_free, 0.0, self.longest)
         self.corners, self.search_count = list[FloatArray](), 0
 
     def ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.original - sides[0], self.original + sides[1]
+
+    def printed_ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The ends of a box as they are printed: limits and ends of domains exactly, all others rounded inwards."""
+        members = self.evaluator.characteristics
+        ends = np.array(
+            [
+                [item.rounded(end, upwards=upwards) for item, end in zip(members, ends, strict=True)]
+                for ends, upwards in zip(self.ends(sides), (True, False), strict=True)
+            ]
+        )
+        ends = np.where(sides >= self.domain, np.stack([members.lower, members.upper]), ends)
+        ends = np.where(self.domain > 0, ends, self.original)
+        lower, upper = np.where(np.isnan(self.limits), ends, self.limits)
+        return lower, upper
 
     def hold(self, boxes: FloatArray, settings: FloatArray) -> BoolArray:
         """Which of B boxes, shape (B, 2, n), hold which of K settings; shape (B, K)."""
@@ -173,7 +164,7 @@ class _BoxSearch:
     def attack(self, sides: FloatArray) -> FloatArray:
         """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
         known = self.unsafe_inside(sides)
-        return known if len(known) else self.find_unsafe(self.points(sides, FIRST_SEARCH_POINTS))
+        return known if len(known) else self.find_unsafe(self.points(sides, SEARCH_POINTS))
 
     def learn(self, settings: FloatArray) -> None:
         """Add corners that are unsafe, from some of these unsafe settings.
@@ -181,15 +172,15 @@ class _BoxSearch:
         As many changes of a setting as possible are undone while it stays unsafe; the directions of the remaining
         changes are the corner. Unsafe settings on the way become known, too.
         """
-        for setting in settings[:: max(len(settings) // CAUSES_PER_ROUND, 1)]:
-            cause = setting
-            for column in np.flatnonzero((setting != self.original) & self.is_free.any(axis=0)):
-                smaller = cause.copy()
-                smaller[column] = self.original[column]
-                cause = smaller if len(self.find_unsafe(smaller[np.newaxis])) else cause
-            corner = np.sign(cause - self.original)
-            if not any((corner == known).all() for known in self.corners):
-                self.corners.append(corner)
+        causes = settings[:: max(len(settings) // CAUSES_PER_ROUND, 1)].copy()
+        for column in np.flatnonzero(self.is_free.any(axis=0)):
+            smaller = causes.copy()
+            smaller[:, column] = self.original[column]
+            is_unsafe = self.unsafe.of(self.evaluator.evaluate(smaller, STAGE))
+            self.unsafe_settings = np.concatenate([self.unsafe_settings, smaller[is_unsafe]])
+            causes[is_unsafe] = smaller[is_unsafe]
+        known = {corner.tobytes(): corner for corner in [*self.corners, *np.sign(causes - self.original)]}
+        self.corners = list(known.values())
 
     def are_safe(self, boxes: FloatArray) -> BoolArray:
         """Which of B boxes, shape (B, 2, n), are safe at the known corners and hold no known unsafe setting."""
@@ -237,15 +228,23 @@ class _BoxSearch:
         """
         for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
             while sides[side, column] < self.longest[side, column]:
-                wider = sides.copy()
-                length = sides[side, column] + WIDENING * self.width[column]
-                wider[side, column] = min(length, self.longest[side, column])
-                slab = np.concatenate([self.corner_settings(wider[np.newaxis])[0], self.points(wider, SLAB_POINTS)])
-                slab[:, column] = self.ends(wider)[side][column]  # moved to the new end
-                if len(self.unsafe_inside(wider)) or len(self.find_unsafe(slab)):
+                wider = self.wider(sides, side, column, WIDENING)
+                if len(self.unsafe_inside(wider)) or len(self.attack_end(wider, side, column)):
                     break
                 sides = wider
         return sides
+
+    def wider(self, sides: FloatArray, side: int, column: int, share: float) -> FloatArray:
+        """A box with one side moved outwards by a share of the domain, at most to its end."""
+        wider = sides.copy()
+        wider[side, column] = min(sides[side, column] + share * self.width[column], self.domain[side, column])
+        return wider
+
+    def attack_end(self, sides: FloatArray, side: int, column: int) -> FloatArray:
+        """Unsafe settings at the end of one side of a box, all other values in the box."""
+        settings = np.concatenate([self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)])
+        settings[:, column] = self.ends(sides)[side][column]
+        return self.find_unsafe(settings)
 
     def best(self, start: FloatArray) -> FloatArray:
         """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be.
@@ -266,9 +265,10 @@ class _BoxSearch:
     def beyond(self, sides: FloatArray) -> dict[str, FloatArray]:
         """For each characteristic, an unsafe setting in which it alone is beyond a box, by at most `MAX_GAP`."""
         beyond = dict[str, FloatArray]()
-        for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
-            wider = sides.copy()
-            wider[side, column] += MAX_GAP * self.width[column]
+        for side, column in zip(*np.nonzero(sides < self.domain), strict=True):
+            wider = self.wider(sides, side, column, MAX_GAP)
+            if not self.is_free[side, column]:
+                self.attack_end(wider, side, column)
             for setting in self.unsafe_inside(wider)[:1]:
                 beyond.setdefault(self.evaluator.characteristics.names[column], setting)
         return beyond
@@ -281,21 +281,21 @@ def find_joint_limits(
     limits: Mapping[str, Limit],
     scans: Sequence[OneAtATimeScan],
     unsafe_settings: FloatArray,
-    unsafe_solutions: FloatArray,
 ) -> JointLimits:
     """The largest box by relative volume in which `columns` vary, and in which those of `limits` reach their limits.
 
-    The box holds none of `unsafe_settings`, shape (K, n), and none of `unsafe_solutions`, shape (L, n), of a search.
+    The box holds none of `unsafe_settings`, shape (K, n).
 
     Notes
     -----
     A random search seeks the largest box that is safe at known corners, within what is safe alone; at first at that
     corner alone where every characteristic has gone towards its smaller margin. A search then attacks the box. Causes
     of what is unsafe, as few changes as possible, are further corners, and the box is sought anew until no search finds
-    anything. Sides that could go further are widened. At last independent settings test the box (`sample_box`).
+    anything. Sides that could go further are widened. At last all corners of the box as it is printed, and independent
+    settings, test it (`sample_box`).
     """
     unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
-    search = _BoxSearch(unverified, columns, unsafe, limits, np.concatenate([unsafe_settings, unsafe_solutions]))
+    search = _BoxSearch(unverified, columns, unsafe, limits, unsafe_settings)
     start, corner = search.longest.copy(), np.zeros(len(search.original))
     for column, scan in zip(columns, scans, strict=True):
         original = search.original[column]
@@ -309,28 +309,25 @@ def find_joint_limits(
         kept = not len(search.attack(search.fixed))
         # The last attempt gives up: it tests the limits alone, with all others as in the original.
         sides = search.best(start) if kept and attempt < MAX_ATTEMPTS else search.fixed
-        ends, stream = search.ends(sides), (evaluator.study.search.seed, 1, attempt)
+        ends, stream = search.printed_ends(sides), (evaluator.study.search.seed, 1, attempt)
         stage = "test of the limits together"
+        corners = corners_of(evaluator, columns, ends)
+        unsafe_corners = corners[unsafe.of(evaluator.evaluate(corners, stage))]
         unsafe_samples, count, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
-        if not kept or not len(unsafe_samples):
+        unsafe_inside = np.concatenate([unsafe_corners, unsafe_samples])
+        if not kept or not len(unsafe_inside):
             break
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_samples])
-        search.learn(unsafe_samples[:1])
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_inside])
+        search.learn(unsafe_inside[:1])
     else:
         kept = False
-    # Ends of the domain are stated exactly, not through their distance from the original.
-    box = {
-        item.name: (max(low, item.lower), min(high, item.upper))
-        for item, low, high in zip(evaluator.characteristics, *(end.tolist() for end in ends), strict=True)
-    }
+    lower, upper = (values.tolist() for values in ends)
     return JointLimits(
-        fixed=limits,
-        box=box,
+        box=dict(zip(evaluator.characteristics.names, zip(lower, upper, strict=True), strict=True)),
         samples=count,
         unsafe=len(unsafe_samples),
         failed=failed,
         at_most=at_most,
-        known_unsafe_inside=int(search.hold(sides[np.newaxis], unsafe_solutions).sum()),
         kept=kept,
-        beyond=search.beyond(sides),
+        beyond=search.beyond(sides) if kept else {},
     )

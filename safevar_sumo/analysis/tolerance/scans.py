@@ -1,13 +1,10 @@
-"""Scans of the domains of characteristics one at a time, and of the plane of two; all others keep their original
-values.
-"""
+"""Scans of the domains of characteristics one at a time; all others keep their original values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +13,9 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator, Interval
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject, finite_or_none
+from safevar_sumo.records import FloatArray, JsonObject, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles import Characteristic
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
 """Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
@@ -30,14 +27,6 @@ WHOLE_POINT_LOSS = 1 - 1e-6
 """A loss of more rating points than this counts as a whole point."""
 POINT_ROUNDING = 1e-9
 """A loss of at most so many rating points is a rounding error."""
-GRID_VALUES = 21
-"""Number of values of each of two characteristics, evenly spaced over its domain, ends included."""
-PLANE_ROUNDS = 4
-"""Number of rounds of the search for a plane's nearest unsafe setting (down to a 5120th of the domain)."""
-MAX_SQUARES = 12
-"""Maximum number of squares that such a round divides."""
-PARTS_PER_SIDE = 4
-"""Number of parts into which it divides the side of a square."""
 
 
 class EndsAcrossFits(NamedTuple):
@@ -141,25 +130,17 @@ class OneAtATimeScan:
         }
 
 
-def scan(
-    evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, others: FloatArray | None = None
-) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, one at a time.
-
-    While one varies, all other characteristics have the values in its row of `others`, shape (K, n), by default those
-    of the original.
-    """
-    if others is None:
-        others = np.tile(evaluator.characteristics.original, (len(columns), 1))
+def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, one at a time."""
     scanned = [evaluator.characteristics.members[column] for column in columns]
     number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
     values = [np.union1d(np.linspace(item.lower, item.upper, number), item.original) for item in scanned]
-    profiles = _evaluate_profiles(evaluator, columns, others, values, unsafe)
+    profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
         values = [_values_between_states(profile) for profile in profiles]
         if not any(map(len, values)):
             break
-        finer_profiles = _evaluate_profiles(evaluator, columns, others, values, unsafe)
+        finer_profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
         profiles = [
             pd.concat(coarse_and_fine, ignore_index=True).sort_values("value", ignore_index=True)
             for coarse_and_fine in zip(profiles, finer_profiles, strict=True)
@@ -198,16 +179,13 @@ def _values_between_states(profile: pd.DataFrame) -> FloatArray:
 
 
 def _evaluate_profiles(
-    evaluator: Evaluator, columns: Sequence[int], others: FloatArray, values: Sequence[FloatArray], unsafe: Unsafe
+    evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe
 ) -> list[pd.DataFrame]:
     """The profile of each characteristic at its `values`."""
-    ends = np.cumsum(list(map(len, values)))[:-1]
-    settings = np.concatenate(
-        [
-            _settings_with(setting, [column], its_values[:, np.newaxis])
-            for setting, column, its_values in zip(others, columns, values, strict=True)
-        ]
-    )
+    sizes = list(map(len, values))
+    ends = np.cumsum(sizes)[:-1]
+    settings = np.tile(evaluator.characteristics.original, (sum(sizes), 1))
+    settings[np.arange(len(settings)), np.repeat(columns, sizes)] = np.concatenate(values)
     evaluations = evaluator.evaluate(settings, "one characteristic at a time")
     state = np.select(
         [evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
@@ -217,113 +195,3 @@ def _evaluate_profiles(
     points = {name: column for name, column in evaluations.metrics.items() if name == RATING_POINTS.name}
     frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "state": state, **points})
     return [frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)]
-
-
-def _settings_with(setting: FloatArray, columns: Sequence[int], values: FloatArray) -> FloatArray:
-    """A setting with K rows of values in some columns, shape (K, n)."""
-    settings = np.tile(setting, (len(values), 1))
-    settings[:, list(columns)] = values
-    return settings
-
-
-class Pair(NamedTuple):
-    """The plane of two characteristics.
-
-    Attributes
-    ----------
-    unsafe_share, not_simulated_share
-        Unsafe share of the simulated part of the plane, and the share that could not be simulated, by the trapezoidal
-        rule on the grid. A setting that could not be simulated, or violates a constraint, is neither safe nor unsafe.
-    nearest
-        The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a
-        5120th of them; None if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of
-        the grid are not found.
-    """
-
-    characteristics: list[str]
-    unsafe_share: float
-    not_simulated_share: float
-    nearest: dict[str, float] | None
-
-
-def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
-    """Find the unsafe share of the plane of every pair of characteristics, and its unsafe setting nearest to the
-    original.
-    """
-    characteristics, planes = evaluator.characteristics, [list(plane) for plane in combinations(columns, 2)]
-    axes = np.linspace(characteristics.lower, characteristics.upper, GRID_VALUES).T
-    grids = [np.stack(np.meshgrid(*axes[plane], indexing="ij"), axis=-1).reshape(-1, 2) for plane in planes]
-
-    def evaluate(values: Sequence[FloatArray], stage: str) -> Evaluations:
-        settings = [
-            _settings_with(characteristics.original, plane, pairs) for plane, pairs in zip(planes, values, strict=True)
-        ]
-        return evaluator.evaluate(np.concatenate(settings), stage)
-
-    evaluations = evaluate(grids, "two characteristics at a time")
-    is_unsafe, is_valid, is_not_simulated = (
-        flags.reshape(len(planes), GRID_VALUES, GRID_VALUES)
-        for flags in (unsafe.of(evaluations), evaluations.valid, ~evaluations.valid & ~evaluations.infeasible)
-    )
-    searches = [_search_nearest(grid, characteristics, plane) for grid, plane in zip(is_unsafe, planes, strict=True)]
-    rounds = [next(search) for search in searches]
-    for _ in range(PLANE_ROUNDS):
-        to_evaluate = [settings for _, settings in rounds]
-        is_unsafe_setting = unsafe.of(evaluate(to_evaluate, "nearest unsafe settings"))
-        parts = np.split(is_unsafe_setting, np.cumsum(list(map(len, to_evaluate)))[:-1])
-        rounds = [search.send(part) for search, part in zip(searches, parts, strict=True)]
-    weights = np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)  # the trapezoidal rule's
-    unsafe_area, valid_area, not_simulated_area = (
-        np.sum(np.outer(weights, weights) * flags, axis=(1, 2)) for flags in (is_unsafe, is_valid, is_not_simulated)
-    )
-    names = [[characteristics.names[column] for column in plane] for plane in planes]
-    return [
-        Pair(
-            characteristics=names[k],
-            unsafe_share=float(unsafe_area[k] / valid_area[k]) if valid_area[k] else 0.0,
-            not_simulated_share=float(not_simulated_area[k] / weights.sum() ** 2),
-            nearest=dict(zip(names[k], nearest[0].tolist(), strict=True)) if len(nearest) else None,
-        )
-        for k, (nearest, _) in enumerate(rounds)
-    ]
-
-
-def _search_nearest(
-    grid: BoolArray, characteristics: CharacteristicSet, plane: list[int]
-) -> Generator[tuple[FloatArray, FloatArray], BoolArray]:
-    """Search the unsafe setting of a plane that is nearest to the original; `grid` tells where the plane's grid is
-    unsafe.
-
-    It is a branch and bound search. A square with an unsafe corner may hold a nearer unsafe setting, if it comes nearer
-    to the original than the nearest unsafe setting so far. Each round divides the `MAX_SQUARES` nearest of these
-    squares. Distances are in domain widths.
-
-    Each round yields the nearest unsafe setting so far, shape (1, 2), or (0, 2) if there is none, and the settings to
-    evaluate next, shape (K, 2); it is sent which of these are unsafe. Settings are values of the two characteristics.
-    """
-
-    def distances(offsets: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.sum((offsets / width) ** 2, axis=-1)))
-
-    original, lower, upper = (
-        ends[plane] for ends in (characteristics.original, characteristics.lower, characteristics.upper)
-    )
-    width = upper - lower
-    size = width / (GRID_VALUES - 1)
-    settings = lower + np.argwhere(np.ones_like(grid)) * size
-    steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
-    # `areas` are the lower corners of areas that `grids` divide into squares of `size`; at first of the whole plane.
-    nearest, areas, grids = np.zeros((0, 2)), lower[np.newaxis], grid[np.newaxis]
-    while True:
-        known = np.concatenate([nearest, settings[grids.ravel()]])
-        nearest = known[np.argsort(distances(known - original), kind="stable")[:1]]
-        # Squares with an unsafe corner.
-        area, i, j = np.nonzero(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
-        corners = areas[area] + np.stack([i, j], axis=1) * size
-        offset = corners - original
-        gaps = distances(np.maximum(np.maximum(offset, -offset - size), 0.0))
-        order = np.argsort(gaps, kind="stable")
-        is_nearer = gaps[order] < np.min(distances(nearest - original), initial=math.inf)
-        areas, size = corners[order[is_nearer][:MAX_SQUARES]], size / PARTS_PER_SIDE
-        settings = np.minimum(areas[:, np.newaxis] + steps * size, lower + width).reshape(-1, 2)
-        grids = (yield nearest, settings).reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Interval
+from safevar_sumo.analysis.evaluator import Evaluator, Interval
 from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.formats import LATEX_NEEDS, markdown_table, render_latex
 from safevar_sumo.analysis.research_questions.tables import Table
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import KMH_PER_MS, Evaluations, JsonObject
-from safevar_sumo.scenarios import Point, distance_in_words
+from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
+from safevar_sumo.scenarios import Point, Scenario
 from safevar_sumo.study import Limit
 from safevar_sumo.terminal import WholeTable
 from safevar_sumo.vehicles import Characteristic
@@ -26,28 +26,34 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NONE = "-"
-ROUNDING = 1e-6
-"""Share of a text's last digit by which a value may be off its rounded one, from rounding errors."""
+NONE, NO_BOX = "-", "no safe box"
 
 
-def describe_failure(run: Evaluations, points: Sequence[Point], unsafe: Unsafe) -> dict[str, str]:
-    """An unsafe evaluation in words: the name of its worst point ("" without a matrix), its outcome, and a
-    description.
-    """
-    point = points[0] if run.worst_points is None else points[int(run.worst_points[0])]
-    scenario, degree = point.scenario, float(run.f_safe[0])
-    speed = "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
-    name = point.name
+def describe_failures(
+    evaluator: Evaluator, settings: Mapping[str, FloatArray], points: Sequence[Point], unsafe: Unsafe
+) -> dict[str, str]:
+    """How unsafe settings fail at their worst points, in words, by the same names."""
+    if not settings:
+        return {}
+    runs = evaluator.evaluate(np.array(list(settings.values())), "what fails first")
+    worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
+    return {
+        name: _failure_in_words(points[point].scenario, unsafe, bool(collided), degree)
+        for name, point, collided, degree in zip(settings, worst.tolist(), runs.collided, runs.f_safe, strict=True)
+    }
+
+
+def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
+    """A failure at a safety degree, such as `the car hits a pedestrian at 40 km/h`."""
     if unsafe.points is not None:  # points are of the whole matrix
-        name, text = "", f"the car {unsafe.in_words}"
-    elif run.collided[0]:
+        return f"the car {unsafe.in_words}"
+    speed = "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
+    if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
         impact = "" if speed or impact_speed < 1 else f" with {impact_speed:.2g} km/h"
-        text = f"the car hits {scenario.obstacle()}{speed or impact}"
-    else:
-        text = f"the car keeps only {distance_in_words(scenario, degree)} from {scenario.obstacle()}{speed}"
-    return {"point": name, "outcome": str(run.outcome[0]), "description": text}
+        return f"the car hits {scenario.obstacle()}{speed or impact}"
+    centre = " from centre to centre" if scenario.centre_to_centre and unsafe.below else ""
+    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{centre} from {scenario.obstacle()}{speed}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,70 +65,91 @@ class LimitRow:
     scan
         How far it may go alone.
     together
-        How far it may go together with all others; None if nothing is safe, or no box was sought.
+        How far it may go together with all others; None if no box is safe, or none was sought.
+    is_sought
+        Whether a safe box was sought; not in a rated study.
     specified
         The user's limit; None without one.
-    together_is_safe
-        Whether all specified limits can be reached together.
-    first_failure
-        What fails first beyond the limit, alone or else with the others at their limits (`describe_failure`).
+    beyond, beyond_alone
+        What fails first beyond the limit, with the others at their limits, and with the others as in the original; ""
+        if nothing is known to fail.
     """
 
     scan: OneAtATimeScan
     together: Interval | None
+    is_sought: bool
     specified: Limit | None
-    together_is_safe: bool
-    first_failure: dict[str, str] | None
+    beyond: str
+    beyond_alone: str
 
     @property
     def characteristic(self) -> Characteristic:
         return self.scan.characteristic
 
     @property
-    def margin(self) -> float | None:
-        """The way from the specified limit to the limit alone [unit]."""
-        if self.specified is None or self.scan.safe is None:
+    def alone(self) -> Interval | None:
+        """The limits alone, rounded inwards; None if nothing is safe."""
+        if self.scan.safe is None:
             return None
-        (low, high), limit = self.scan.safe, self.specified
-        below = math.inf if limit.at_least is None else limit.at_least - low
-        above = math.inf if limit.at_most is None else high - limit.at_most
-        return min(below, above)
+        item, (low, high) = self.characteristic, self.scan.safe
+        return (
+            low if low <= item.lower else item.rounded(low, upwards=True),
+            high if high >= item.upper else item.rounded(high, upwards=False),
+        )
+
+    @property
+    def outside(self) -> float | None:
+        """How far the specified limit is outside the limit alone [unit]; None if nothing is safe."""
+        if self.scan.safe is None:
+            return None
+        (low, high), limit = self.scan.safe, self.specified or Limit()
+        below = 0.0 if limit.at_least is None else low - limit.at_least
+        above = 0.0 if limit.at_most is None else limit.at_most - high
+        return max(below, above, 0.0)
 
     @property
     def kept(self) -> bool:
         """Whether the car is safe within the specified limit, alone and together."""
-        alone_is_safe = self.scan.safe is not None and (self.margin is None or self.margin >= 0)
-        return self.specified is None or (alone_is_safe and self.together_is_safe)
+        return self.specified is None or (self.outside == 0 and (self.together is not None or not self.is_sought))
+
+    @property
+    def fails_first(self) -> str | None:
+        """What fails first beyond the limit, else beyond the limit alone."""
+        return self.beyond or self.beyond_alone or None
 
     def to_dict(self) -> JsonObject:
-        """A record of `tolerance --limits --json`."""
-        limit, item = self.specified or Limit(), self.characteristic
+        """A row of `limits` in the JSON."""
+        limit, item, nowhere = self.specified or Limit(), self.characteristic, (None, None)
+        (alone_low, alone_high), (low, high) = self.alone or nowhere, self.together or nowhere
         return {
-            "limit": {
-                "characteristic": item.name,
-                "unit": item.unit,
-                "original": item.original,
-                "alone": list(self.scan.safe or (None, None)),
-                "together": list(self.together or (None, None)),
-                "specified": {"low": limit.at_least, "high": limit.at_most, "source": limit.source},
-                "kept": self.kept,
-                "margin": self.margin,
-                "first_failure": self.first_failure,
-            }
+            "characteristic": item.name,
+            "unit": item.unit,
+            "original": item.original,
+            "together_low": low,
+            "together_high": high,
+            "alone_low": alone_low,
+            "alone_high": alone_high,
+            "specified_low": limit.at_least,
+            "specified_high": limit.at_most,
+            "kept": self.kept,
+            "fails_first": self.fails_first,
+            "sentence": self.sentence or None,
         }
 
     def texts(self, ends: Interval) -> tuple[str, str]:
-        """The ends of an interval as text, rounded to the safe side; "" where the domain ends."""
-        item, (low, high) = self.characteristic, ends
-        return (
-            "" if low <= item.lower else safe_text(item, low, upwards=True),
-            "" if high >= item.upper else safe_text(item, high, upwards=False),
-        )
+        """The ends of an interval as text; "" where the domain ends.
 
-    def in_words(self, ends: Interval | None) -> str:
-        """An interval in words: `from 2.32 mm`, `1 to 2 s`, `whole domain`."""
+        The original, and what the user specified, have their own digits.
+        """
+        item, (low, high), limit = self.characteristic, ends, self.specified or Limit()
+        own = (item.original, limit.at_least, limit.at_most)
+        lower, upper = (f"{end:g}" if end in own else item.text(end) for end in ends)
+        return ("" if low <= item.lower else lower, "" if high >= item.upper else upper)
+
+    def in_words(self, ends: Interval | None, otherwise: str) -> str:
+        """An interval in words: `from 2.32 mm`, `1 to 2 s`, `whole domain`; `otherwise` without one."""
         if ends is None:
-            return "nowhere safe"
+            return otherwise
         low, high = self.texts(ends)
         if not low and not high:
             return "whole domain"
@@ -141,30 +168,28 @@ class LimitRow:
 
     @property
     def verdict(self) -> str:
-        """Whether the specified limit is kept, and the margin in words."""
+        """Whether the specified limit is kept, in words."""
         if self.specified is None:
             return NONE
-        if self.margin is None:
-            return "outside"
-        margin = f"{abs(self.margin):.3g}{self.characteristic.suffix}"
-        if self.margin < 0:
-            return f"outside by {margin}"
-        return f"inside, margin {margin}" if self.together_is_safe else "inside alone, not together"
+        if self.outside:
+            return f"outside by {self.outside:.3g}{self.characteristic.suffix}"
+        return "kept" if self.kept else "outside" if self.outside is None else "kept alone, not together"
 
     @property
     def sentence(self) -> str:
-        """A sentence for a maintenance manual."""
-        item, failure, is_unsafe_alone = self.characteristic, self.first_failure, bool(self.scan.unsafe)
+        """A sentence for a maintenance manual: all of these may be obeyed together; "" if no box was sought."""
+        if not self.is_sought:
+            return ""
+        item = self.characteristic
         name = item.short_name[:1].upper() + item.short_name[1:]
-        ends = self.scan.safe if is_unsafe_alone else self.together
-        if self.scan.safe is None:
-            return f"{name}: the car is unsafe as new."
-        if failure is None or ends is None:
-            return f"{name}: nothing in {item.lower:g} to {item.upper:g}{item.suffix} is unsafe alone."
-        words = zip(("at least", "at most"), self.texts(ends), strict=True)
+        if self.together is None:
+            return f"{name}: {NO_BOX}."
+        words = zip(("at least", "at most"), self.texts(self.together), strict=True)
         keep = " and ".join(f"{word} {text}{item.suffix}" for word, text in words if text)
-        others = "" if is_unsafe_alone else " with the other characteristics at their limits,"
-        return f"{name}: keep {keep or f'{item.original:g}{item.suffix}'}; beyond,{others} {failure['description']}."
+        if not keep:
+            return f"{name}: anything from {item.lower:g} to {item.upper:g}{item.suffix}."
+        failure = f"; beyond, with the other characteristics at their limits, {self.beyond}" if self.beyond else ""
+        return f"{name}: keep {keep}{failure}."
 
     def draw(self, axis: Axes, height: float) -> None:
         """Draw a bar for the limits alone and one for those together, with values at their ends; 0 to 1 is the
@@ -173,28 +198,19 @@ class LimitRow:
         item, specified = self.characteristic, self.specified or Limit()
         domain = (item.lower, item.upper)
         axis.plot([0, 1], [height] * 2, color="0.8", linewidth=1, zorder=1)
-        for ends, offset, width, alpha in ((self.scan.safe, 0.2, 11, 0.35), (self.together, -0.36, 5, 1.0)):
+        for ends, offset, width, alpha in ((self.alone, 0.2, 11, 0.35), (self.together, -0.36, 5, 1.0)):
             if ends is None:
                 continue
             places = np.interp(ends, domain, (0, 1))
             axis.plot(places, [height] * 2, color=BLUE, linewidth=width, alpha=alpha, solid_capstyle="butt", zorder=2)
             for text, place, side in zip(self.texts(ends), places, ("left", "right"), strict=True):
-                if text and (offset > 0 or ends != self.scan.safe):  # the same values are not written twice
+                if text and (offset > 0 or ends != self.alone):  # the same values are not written twice
                     label = f"{text}{as_formula(item.suffix)}"
                     axis.text(place, height + offset, label, ha=side, fontsize=FONT_SIZE - 1.5)
         for value in (specified.at_least, specified.at_most):
             place = np.interp(math.nan if value is None else value, domain, (0, 1))
             axis.plot([place] * 2, [height - 0.3, height + 0.3], color=VERMILION, linewidth=1.5, zorder=3)
         axis.plot(np.interp(item.original, domain, (0, 1)), height, marker="o", color="black", markersize=4, zorder=4)
-
-
-def safe_text(characteristic: Characteristic, value: float, *, upwards: bool) -> str:
-    """A limit as text, rounded upwards or downwards; never beyond the original."""
-    digits, original = len(characteristic.text(value).partition(".")[2]), characteristic.original
-    scaled = value * 10**digits
-    rounded = (math.ceil(scaled - ROUNDING) if upwards else math.floor(scaled + ROUNDING)) / 10**digits
-    is_beyond = rounded > original >= value if upwards else rounded < original <= value
-    return f"{original:g}" if is_beyond else f"{rounded:.{digits}f}"
 
 
 @dataclass(frozen=True)
@@ -212,12 +228,11 @@ class LimitsSheet:
                     "characteristic": row.characteristic.short_name,
                     "part": row.characteristic.counterpart or NONE,
                     "new": f"{row.characteristic.original:g}{row.characteristic.suffix}",
-                    "limit alone": row.in_words(row.scan.safe),
-                    # No box of a rated study is sought.
-                    "limit with all others at theirs": NONE if row.scan.points else row.in_words(row.together),
+                    "all together": row.in_words(row.together, NO_BOX if row.is_sought else NONE),
+                    "alone": row.in_words(row.alone, "nowhere safe"),
                     "specified": row.specified_in_words,
                     "kept": row.verdict,
-                    "fails first": row.first_failure["description"] if row.first_failure else NONE,
+                    "fails first": row.fails_first or NONE,
                 }
                 for row in self.rows
             ]
@@ -239,13 +254,13 @@ class LimitsSheet:
         """
         frame = self.to_frame().drop(columns=["part", "fails first"])
         frame = frame[[name for name in frame if (frame[name] != NONE).any()]]
-        heads = {"limit alone": "alone", "limit with all others at theirs": "all at limits"}
-        title = "Limits of each alone, and of all at their limits, rounded to the safe side"
-        table = WholeTable(*frame.rename(columns=heads).columns, title=title)
+        title = "Limits to obey all together; alone, with all others as new. Rounded to the safe side"
+        table = WholeTable(*frame.columns, title=title)
         for cells in frame.itertuples(index=False):
             table.add_row(*cells)
         yield table
-        yield "\n".join(row.sentence for row in self.rows)
+        if sentences := "\n".join(row.sentence for row in self.rows if row.sentence):
+            yield sentences
 
     def figure(self) -> Figure:
         """A bar for each characteristic from the original to its limits, with their values."""
@@ -259,7 +274,7 @@ class LimitsSheet:
         axis.set(xlim=(-0.02, 1.02), ylim=(0.5 - number, 0.5), xticks=[])
         axis.set_xlabel(
             "domain from its lower to its upper end; dot: new; line: specified;\n"
-            "light: safe alone; dark: safe with all others at theirs",
+            "light: safe alone; dark: safe all together",
             fontsize=FONT_SIZE - 1,
         )
         return figure
