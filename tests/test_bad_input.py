@@ -61,7 +61,7 @@ TYPED = [
     ("opinion smoke", "smoke: is a study and has no solutions"),
     ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
     ("tolerance sun --characteristics mass,mass", "once"),
-    ("tolerance smoke --margin -1", "at least 0"),
+    ("tolerance smoke --margin -1", "is not in the range 0<=x<=100"),
     ("tolerance smoke --limits mas>=2100", "--limits: mas: there is no such characteristic; did you mean 'mass'?"),
     ("tolerance smoke --limits mass<=2500 --characteristics radius", "mass does not vary with these"),
     ("tolerance smoke --json --format csv", "--format: csv, and --json"),

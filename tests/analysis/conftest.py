@@ -18,10 +18,8 @@ def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     def choose_batch_size(study: Study, *selection: evaluation.Selection) -> tuple[int, bool]:
         return (100, False) if study.name == "made-up" else choose(study, *selection)
 
-    choose, read = batches.choose_batch_size, identity.inputs_of
+    choose, read = batches.choose_batch_size, identity.files_of
     monkeypatch.setattr(evaluation.Task, "packed", property(packed))
     monkeypatch.setattr(batches, "choose_batch_size", choose_batch_size)
-    for module in (batches, identity, evaluator):
-        monkeypatch.setattr(
-            module, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool)
-        )
+    for module in (batches, evaluator):
+        monkeypatch.setattr(module, "files_of", lambda study: {} if study.name == "made-up" else read(study))
