@@ -242,7 +242,8 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise_and_what_was_not_sea
     monkeypatch.setattr(compute, "prove", lambda *_: (attack.Proof(5, 0, 0.45), np.zeros((0, 1))))
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
     assert kept.worst_today == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
-    assert f"has a safety degree of {kept.worst_today:.2f} m, and 5 fresh worn cars, 0 unsafe" in kept.verdict
+    worst = f"{kept.worst_today:.2f} m from centre to centre (gap {kept.worst_today - 4.7:.2f} m)"
+    assert f"has a safety degree of {worst}, and 5 fresh worn cars, 0 unsafe" in kept.verdict
     assert "  not searched       no simulation reads colour" in list(replace(kept, unread=("colour",)).sentences())
     name = kept.parameters[0].name
     changed: Any = SimpleNamespace(values={name: kept.parameters[0].today})
