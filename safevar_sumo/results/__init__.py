@@ -26,6 +26,7 @@ from safevar_sumo.results.manifest import (
     ORIGINAL as ORIGINAL,
     RESULTS as RESULTS,
     SOLUTIONS as SOLUTIONS,
+    changed_values as changed_values,
     differences as differences,
     evaluation_keys as evaluation_keys,
     folders_of as folders_of,

@@ -181,7 +181,7 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
     other machines, other versions of this package with the same `RESULTS`, and new keys of a study do not.
     """
     for layer, inputs in identity_in(now).items():
-        for key, before, after in _changed_values(identity_in(stored)[layer], inputs):
+        for key, before, after in changed_values(identity_in(stored)[layer], inputs):
             if layer == "files":
                 change = "is new" if before is None else "has changed since"
                 text = f"{key} no longer exists" if after is None else f"{key} {change}"
@@ -257,10 +257,10 @@ def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 
 
-def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+def changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
     """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
     if isinstance(first, dict) and isinstance(second, dict):
         for name in sorted({*first, *second}):
-            yield from _changed_values(first.get(name), second.get(name), f"{key}.{name}" if key else name)
+            yield from changed_values(first.get(name), second.get(name), f"{key}.{name}" if key else name)
     elif json.dumps(first, sort_keys=True) != json.dumps(second, sort_keys=True):
         yield key, first, second

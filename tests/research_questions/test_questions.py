@@ -246,7 +246,7 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     )
     assert (result["rank"], result["rank_other"]) == (1, 1)
     with pytest.raises(
-        InputError, match=r"differ in the weather alone; these two also differ in step_length, metrics\.ttc_threshold"
+        InputError, match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold, step_length"
     ):
         answer_questions([clear, other], "weather")
     with pytest.raises(InputError, match="these two have equally clear weather"):

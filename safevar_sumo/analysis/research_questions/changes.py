@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import permutations, product
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
@@ -19,7 +18,8 @@ import pandas as pd
 from safevar_sumo.ads import REACTION_PARAMETERS
 from safevar_sumo.analysis.case import NSGA2, Case, UnanswerableError, are_collisions
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.results import changed_values, evaluation_keys
+from safevar_sumo.study import SAFETY_DEGREE, tables_of
 
 ANY = "any"
 WEATHER_VALUES = ["percent", "percent_other", "difference", "rank", "rank_other"]
@@ -253,14 +253,7 @@ def _differences(*pair: Case) -> list[str]:
     """Keys on which a simulation depends and in which two studies differ, without those of the weather and of the ADS's
     reaction to it.
     """
-    studies = [msgspec.to_builtins(case.study) for case in pair]
-    for study in studies:
-        for name in WEATHER_PARAMETERS:
-            study["ads"]["parameters"].pop(name, None)
-    top_keys = [key for key in ("matrix", "constraints", "step_length") if studies[0][key] != studies[1][key]]
-    return top_keys + [
-        f"{table}.{key}"
-        for table in ("scenario", "vehicle", "ads", "metrics")
-        for key in studies[0][table] | studies[1][table]
-        if studies[0][table].get(key) != studies[1][table].get(key)
-    ]
+    first, second = (evaluation_keys(tables_of(case.study)) for case in pair)
+    ignored = {"name", "weather", "search", *(f"ads.parameters.{name}" for name in WEATHER_PARAMETERS)}
+    differences = (key for key, _, _ in changed_values(first, second))
+    return [key for key in differences if not {key, key.partition(".")[0]} & ignored]

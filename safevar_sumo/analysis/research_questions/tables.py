@@ -16,7 +16,7 @@ from safevar_sumo.analysis.research_questions.answer import (
 )
 from safevar_sumo.analysis.research_questions.changes import WEATHER_VALUES
 from safevar_sumo.analysis.research_questions.comparisons import titles_of
-from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, NOTABLE_MAGNITUDES
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.study import unit_text
@@ -176,9 +176,7 @@ def lay_out(answer: TableAnswer) -> list[Table]:
             tables.append(Table(f"{title}: {' against '.join(map(str, names))}", _arrange(group, layout)))
     notes = []
     if "method" in frame:
-        for method in frame["method"].dropna().unique():
-            p_value = "p with e" if method == EXACT_TEST else "p"
-            notes.append(f"{p_value}: {method}.")
+        notes.append(f"p: {'; '.join(frame['method'].dropna().unique())}.")
     notes += [note.replace("{first}", first) for note in NOTES.get(answer.name, ())]
     if "metric" in frame:
         metrics = {metric.name: metric for case in answer.cases for metric in case.scoring.metrics}.values()
@@ -239,8 +237,6 @@ def _mark_tests(cells: pd.DataFrame, answer: TableAnswer) -> pd.DataFrame:
         has_few_runs = np.array([pair in few_runs for pair in zip(frame["setting"], frame[algorithm], strict=True)])
         p_column, is_significant = "p_value", (frame["p_value"] < ALPHA) & ~has_few_runs
         is_bold_effect = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
-    if "method" in frame:
-        cells["p_value"] += np.where(frame["method"] == EXACT_TEST, "e", "")
     for column, is_bold in ((p_column, is_significant), ("effect_size", is_bold_effect)):
         if column in cells:
             cells[column] = cells[column].where(~is_bold, cells[column].map(BoldText))
