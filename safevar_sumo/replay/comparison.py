@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.explain.braking_comparison import brake_onset
+from safevar_sumo.analysis.braking import brake_onset
 from safevar_sumo.analysis.words import OUTCOME_VERBS, change_texts
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts

@@ -131,7 +131,7 @@ def _make_cause_section(
         "table": table_data(frame.rename_axis("characteristic"), f"Changes of {title}"),
         "end": comparison.verdict(comparison.rows[-1]),
         "opinion": opinion,
-        "reason": str(failure.because),
+        "reason": failure.endings,
         "player_data": player,
         "replay_anchor": data.anchor("replay", failure.name),
     }

@@ -100,6 +100,6 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
     answer = run("explain", "part", "--jobs", "1")
-    assert "0 of 0 different vehicles are unsafe" in answer.stdout
+    assert "0 of 0 different solutions of the search are unsafe" in answer.stdout
     assert "nan %" not in answer.stdout
     assert "warning" not in answer.stderr

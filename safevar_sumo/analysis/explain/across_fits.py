@@ -51,7 +51,7 @@ class AcrossFits(NamedTuple):
     def __str__(self) -> str:
         sentence = (
             f"With {number_of(self.sets, 'vehicle model')} that fit the published data about as well, "
-            f"{self._words('unsafe', '')} of the vehicles are unsafe"
+            f"{self._words('unsafe', '')} of them are unsafe"
         )
         if ("preventable", "competent_driver") not in self.ranges:
             return f"{sentence}."

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 MAX_DISTINCT_CAUSES = 10
 """Maximum number of distinct causes in the table of all failures."""
+SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the whole domain"
+"""What the settings are of which some are unsafe."""
 MAX_NECESSARY = 4
 """Maximum number of characteristics that a sentence names as necessary."""
 
@@ -57,12 +59,14 @@ class Explained(Answer):
         Statistics of all analysed failures: the frames that `necessity_frame` and `count_distinct_causes` return.
     looked_at, failures, analysed
         Number of evaluated settings, of failures among these, and of failures that the statistics cover.
+    kind
+        What the evaluated settings are, in the plural.
     otherwise
         Number of solutions with another outcome than the recorded one.
     left_out
         Number of collisions that the search simulated, if no solution is one.
     preventability
-        Shares of the collisions among the evaluated settings that reference drivers avoid.
+        Which collisions among the evaluated settings reference drivers avoid.
     no_verdict
         Why simulations tell nothing about the driving system; "" if they do.
     across_fits
@@ -79,16 +83,12 @@ class Explained(Answer):
     looked_at: int
     failures: int
     analysed: int
+    kind: str
     otherwise: int
     left_out: int
     preventability: Preventability
     no_verdict: str = ""
     across_fits: AcrossFits | None = None
-
-    @property
-    def by_reason(self) -> Mapping[str, Explanation]:
-        """The chosen failures by the reasons for their choice."""
-        return {reason: failure for failure in self.explanations for reason in failure.reasons}
 
     @property
     def choices(self) -> list[Explanation]:
@@ -105,16 +105,13 @@ class Explained(Answer):
     @property
     def counts(self) -> str:
         """How many settings are unsafe, the criterion, and the unsafe share with other fitted vehicle models."""
-        vehicles = number_of(self.looked_at, "different vehicle")
-        counts = f"{self.failures} of {vehicles} are unsafe: {self.unsafe.description}."
+        counts = f"{self.failures} of {self.looked_at} {self.kind} are unsafe: {self.unsafe.description}."
         if self.otherwise:
             counts += f" {number_of(self.otherwise, 'setting')} with another outcome than recorded."
         if self.left_out:
             collisions = number_of(self.left_out, "collision")
             counts += f" The search also simulated {collisions}, which its objectives leave out."
-        if self.across_fits:
-            counts += f" {self.across_fits}"
-        return counts
+        return f"{counts} {self.across_fits}" if self.across_fits else counts
 
     @property
     def verdict(self) -> list[str]:
@@ -123,8 +120,9 @@ class Explained(Answer):
 
         The leading failure has the fewest changes; of several, it is the robust one, or else the most severe one.
         """
-        situation = situation_in_words(assemble(self.study), self.original, self.nearest, self.looked_at)
-        sentences, by_reason = [situation], self.by_reason
+        system, evaluated = assemble(self.study), f"{self.looked_at} {self.kind}"
+        sentences = [situation_in_words(system, self.original, self.nearest, evaluated)]
+        by_reason = {reason: failure for failure in self.explanations for reason in failure.reasons}
         robust, leading = by_reason.get(ROBUST), by_reason.get(REASONS["fewest"], next(iter(self.explanations), None))
         if leading is None or leading.cause is None:
             return sentences if self.no_verdict else [*sentences, "Nothing unsafe was found."]
@@ -132,38 +130,26 @@ class Explained(Answer):
             return [*sentences, "No change is needed for it to be unsafe."]
         if robust is not None and len(robust.changed) == len(leading.changed):
             leading = robust
-        sentences.append(leading.finding)
+        verb = "collides" if str(self.unsafe) == Outcome.COLLISION else "is unsafe"
+        sentences.append(leading.finding(verb))
         if leading.robustness.borderline and robust:
-            sentences.append(f"The robust failure with the fewest changes: {robust.finding}")
+            sentences.append(f"The robust failure with the fewest changes: {robust.finding(verb)}")
         elif leading.robustness.borderline:
             sentences.append("No failure tested is robust.")
-        return [text[0].upper() + text[1:] for text in [*sentences, str(self.preventability)] if text]
+        return [*sentences, *filter(None, [str(self.preventability)])]
 
     def sentences(self) -> list[str]:
-        """The answer in sentences: the verdict as a paragraph, the counts, why the first failure is unsafe, the limits
-        of its cause, and the most frequent necessary changes and minimal cause of all failures.
+        """The answer in sentences: the verdict as a paragraph, the counts, how the first failure ends, and the most
+        frequent necessary changes and minimal cause of all failures.
         """
         sentences = [" ".join(self.verdict), self.counts]
         if not self.explanations:
             return sentences
-        first = self.explanations[0]
-        full_names = {
-            item.name: item.name if item.short_name == item.name else f"{item.name} ({item.short_name})"
-            for item in first.characteristics
-        }
-        sentences.append(f"Why {first.name} fails: {first.because}")
-        if first.cause and first.cause.changes:
-            limits = ", ".join(
-                f"{full_names[item.name]} {item.original:g} -> "
-                f"{item.text(first.cause.boundary[item.name])}{item.suffix}"
-                for item in first.characteristics
-                if item.name in first.cause.boundary
-            )
-            sentences.append(f"How little is enough: {limits}.")
+        sentences.append(f"{self.explanations[0].name}: {self.explanations[0].endings}")
         if self.analysed and len(self.distinct):
             cause, _, share = next(self.distinct.itertuples(index=False))
             rows = self.necessity[self.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
-            necessary = ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows)
+            necessary = ", ".join(f"{row['characteristic']} {_necessary_share(row)}" for row in rows)
             sentences += [
                 f"In every cause of a failure most often ({self.sample}): {necessary or 'no change is common to all'}.",
                 f"{number_of(len(self.distinct), 'distinct minimal cause')}; the most frequent: "
@@ -177,21 +163,14 @@ class Explained(Answer):
         if not self.explanations:
             yield f"How far each characteristic may go: {question_command('tolerance', subject, point)}"
             return
-        first = self.explanations[0]
-        if first.cause and first.cause.changes:
-            yield f"Try it: {simulate_command(subject, first.cause.boundary, point)}"
+        cause = self.explanations[0].cause
+        if cause and cause.changes:
+            yield f"Try it: {simulate_command(subject, cause.boundary, point)}"
         yield from constraints_in_words(self.study)
         if not full:
             command = f"{question_command('explain', subject, point)} --full"
             yield f"{number_of(len(self.explanations), 'failure')} explained in full: {command}"
             return
-        if braking := first.because.original:
-            step = next(iter(first.robustness.shares_by_step))
-            yield (
-                f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers "
-                f"{braking.speed * step:.2f} m at {braking.speed:.1f} m/s. Along a characteristic the safety degree is "
-                "a sawtooth of about that height: more digits of a value than a command has mean nothing."
-            )
         for failure in self.explanations:
             yield from failure.details(subject, point)
         yield from self._statistics()
@@ -281,12 +260,12 @@ def _necessary_share(row: Mapping[Any, Any]) -> str:
 
 
 def situation_in_words(
-    system: System, original: Evaluations, nearest: Evaluations | None = None, number: int = 0
+    system: System, original: Evaluations, nearest: Evaluations | None = None, evaluated: str = ""
 ) -> str:
     """A sentence on the conditions and on how the original vehicle's run ends.
 
-    If none of `number` vehicles collides, the sentence begins with that; `nearest` is the evaluation of the least safe
-    of them.
+    If none of the `evaluated` vehicles collides, the sentence begins with that; `nearest` is the evaluation of the
+    least safe of them.
     """
     place, ending = _place_in_words(system), _ending_in_words(system, original)
     if not nearest or nearest.collided[0] or original.collided[0] or RATING_POINTS.name in original.metrics:
@@ -295,7 +274,7 @@ def situation_in_words(
         # The verb is that of the worst vehicle.
         ending = distance_in_words(float(original.f_safe[0]), contact_degree(system))
     return (
-        f"No collision in {number_of(number, 'vehicle')}; the worst {_ending_in_words(system, nearest)}, "
+        f"No collision in {evaluated}; the worst {_ending_in_words(system, nearest)}, "
         f"the original {ending}, {place[0].lower()}{place[1:]}."
     )
 
@@ -309,8 +288,8 @@ def study_verdict(case: Case, original: Evaluations) -> list[str]:
     if solutions.empty:
         return ["No solution."]
     failures = solutions[unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
-    counts = f"{len(failures)} of {number_of(len(solutions), 'different solution')} of the search are unsafe"
-    sentences = [f"{situation_in_words(system, original)} {counts}: {unsafe.description}."]
+    counts = f"{len(failures)} of {len(solutions)} {SOLUTIONS} are unsafe: {unsafe.description}."
+    sentences = [f"{situation_in_words(system, original)} {counts}"]
     if len(failures):
         fewest = failures.iloc[0]
         ending = ending_in_words(fewest["outcome"], fewest["f_safe"])

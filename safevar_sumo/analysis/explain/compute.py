@@ -15,8 +15,7 @@ from safevar_sumo.analysis.case import Case, are_collisions
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.across_fits import count_holding, measure_across_fits
-from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking
+from safevar_sumo.analysis.explain.answer import DRAWN, SOLUTIONS, Explained
 from safevar_sumo.analysis.explain.causes import (
     STEP_FACTORS,
     Cause,
@@ -32,13 +31,14 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.failure import DISTINCT_CAUSE, REASONS, ROBUST, Explanation
 from safevar_sumo.analysis.preventability import assess_preventability, avoided_by, judge_collisions
+from safevar_sumo.analysis.words import ending_in_words
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import simulate, simulate_all_points, worst_points
+from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
 Reasons = dict[int, tuple[str, ...]]
@@ -97,6 +97,7 @@ def explain_failures(
         looked_at=len(population.evaluations),
         failures=len(population.rows),
         analysed=len(sample),
+        kind=DRAWN if isinstance(source, Study) else SOLUTIONS,
         otherwise=population.otherwise,
         left_out=left_out,
         preventability=preventability,
@@ -230,7 +231,7 @@ def _explain_rows(
     is_assessed = _is_assessed(study, failures)
     verdicts = iter(judge_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
     explanations = []
-    for index, (row, (comparison, points)) in enumerate(zip(reasons, comparisons, strict=True)):
+    for index, (row, (endings, points)) in enumerate(zip(reasons, comparisons, strict=True)):
         explanations.append(
             Explanation(
                 characteristics=characteristics,
@@ -241,7 +242,7 @@ def _explain_rows(
                 safety_degree=finite_or_none(failures.f_safe[index]),
                 causes=tuple(islice(remaining_causes, len(causes[row]))),
                 robustness=robustnesses[index],
-                because=comparison,
+                endings=endings,
                 points=points,
                 preventable=avoided_by(next(verdicts)) if is_assessed[index] else "",
             )
@@ -255,11 +256,17 @@ def _time_step(study: Study) -> float:
     return simulate(system.at(system.points[0]), system.characteristics.original[np.newaxis]).trace.step
 
 
-PointComparison = tuple[BrakingComparison, tuple[str, ...]]
-"""A failure's comparison with the original vehicle at the failure's worst point, and the names of the points of a test
-matrix at which it is unsafe (in a rated study, of the cells whose colour is worse than the original's), in the study's
-order.
+PointComparison = tuple[str, tuple[str, ...]]
+"""How the runs of the original vehicle and of a failure end at the failure's worst point, in a sentence; and the names
+of the points of a test matrix at which it is unsafe (in a rated study, of the cells whose colour is worse than the
+original's), in the study's order.
 """
+
+
+def _endings_in_words(point: str, evaluations: Evaluations, row: int) -> str:
+    """How the runs of the original vehicle, in row 0, and of another vehicle end at a point."""
+    original, changed = (ending_in_words(str(evaluations.outcome[k]), float(evaluations.f_safe[k])) for k in (0, row))
+    return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 
 
 def compare_at_points(
@@ -271,10 +278,10 @@ def compare_at_points(
     is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)
     comparisons = []
     for vehicle in range(1, len(worst)):  # vehicle 0 is the original
-        point, evaluations, runs = results[worst[vehicle]]
         names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
-        unsafe_points = tuple(filter(None, names))  # without a matrix, the only point has no name
-        comparisons.append((compare_braking(runs, vehicle, evaluations.f_safe, point.name), unsafe_points))
+        at_worst = results[worst[vehicle]]
+        sentence = _endings_in_words(at_worst.point.name, at_worst.evaluations, vehicle)
+        comparisons.append((sentence, tuple(filter(None, names))))  # without a matrix, the only point has no name
     return comparisons
 
 
@@ -293,7 +300,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     comparisons = []
     for setting, loss in zip(settings, losses, strict=True):
         point = system.matrix[int(np.argmax(loss))]
-        ((_, evaluations, runs),) = simulate_all_points(system.at(point), np.stack([original[0], setting]))
+        evaluations = evaluate(system.at(point), np.stack([original[0], setting]))
         worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
-        comparisons.append((compare_braking(runs, 1, evaluations.f_safe, point.name), worse_cells))
+        comparisons.append((_endings_in_words(point.name, evaluations, 1), worse_cells))
     return comparisons

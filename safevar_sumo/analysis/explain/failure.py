@@ -1,6 +1,4 @@
-"""One explained failure: its causes, why it is less safe than the original, and whether it is robust; in JSON and in
-words.
-"""
+"""One explained failure: its causes, how it ends beside the original, whether it is robust; in JSON and in words."""
 
 from __future__ import annotations
 
@@ -9,9 +7,8 @@ from dataclasses import dataclass, field
 
 from rich.table import Table
 
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison
 from safevar_sumo.analysis.explain.causes import Cause, Robustness
-from safevar_sumo.analysis.words import list_of_changes, number_of, simulate_command, two_decimals
+from safevar_sumo.analysis.words import ending_in_words, join_phrases, list_of_changes, number_of, simulate_command
 from safevar_sumo.records import KMH_PER_MS, JsonObject, Outcome
 from safevar_sumo.results import SolutionId
 from safevar_sumo.study import unit_text
@@ -24,8 +21,6 @@ REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest":
 """The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
 DISTINCT_CAUSE = "a cause of its own"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
-MAX_CHANGES_LISTED = 4
-"""Maximum number of changes that the verdict lists, the largest first."""
 MAX_CAUSES = 3
 """Maximum number of minimal causes printed for a failure."""
 
@@ -50,8 +45,8 @@ class Explanation:
         All minimal causes; none if the setting is not unsafe.
     robustness
         Whether the neighbours of the setting are unsafe too.
-    because
-        Why the setting is less safe than the original: the comparison of how both vehicles brake.
+    endings
+        How the runs of the original vehicle and of this one end, in a sentence.
     preventable
         The weakest reference driver who avoids a collision, in words; empty without a collision and in a rated study.
     points
@@ -67,7 +62,7 @@ class Explanation:
     safety_degree: float | None
     causes: tuple[Cause, ...]
     robustness: Robustness
-    because: BrakingComparison
+    endings: str
     preventable: str = ""
     points: tuple[str, ...] = ()
 
@@ -100,25 +95,21 @@ class Explanation:
             return f"a collision at {speed_in_words(self.safety_degree)}"
         return f"a safety degree of only {self.safety_degree:.2f} m"
 
-    @property
-    def finding(self) -> str:
-        """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with 10 changes: ...; 3 of
-        them are enough`.
+    def finding(self, verb: str) -> str:
+        """The limits of its cause and what was found, such as `With sensor range below 21.4 m the vehicle collides
+        (robust: ...). Found with 3 changes: a collision at 1.5 m/s, 5 km/h, robust: ....`
         """
-        number, cause = len(self.changed), self.cause
-        relative_changes = {
-            item.short_name: (self.setting[item.name] - item.original) / abs(item.original)
+        boundary = self.cause.boundary if self.cause else {}
+        limits = [
+            f"{item.short_name} {'above' if boundary[item.name] > item.original else 'below'} "
+            f"{item.text(boundary[item.name])}{item.suffix}"
             for item in self.characteristics
-            if item.name in self.changed
-        }
-        largest = sorted(relative_changes, key=lambda name: -abs(relative_changes[name]))[:MAX_CHANGES_LISTED]
-        changes = ", ".join(f"{name} {100 * relative_changes[name]:+.0f} %" for name in largest)
-        changes += f" and {number - MAX_CHANGES_LISTED} more" if number > MAX_CHANGES_LISTED else ""
-        finding = f"{self.effect} ({self.name}, {self.robustness})"
-        if cause is None or len(cause.changes) == number:
-            return f"{finding} needs {number_of(number, 'change')}: {changes}."
-        enough = f"{len(cause.changes)} of them {'are' if len(cause.changes) > 1 else 'is'} enough"
-        return f"{finding} was found with {number} changes: {changes}; {enough}{cause.notes}."
+            if item.name in boundary
+        ]
+        return (
+            f"With {join_phrases(limits)} the vehicle {verb}{self.cause.notes if self.cause else ''}. "
+            f"Found with {number_of(len(self.changed), 'change')}: {self.effect}, {self.robustness}."
+        )
 
     def to_dict(self) -> JsonObject:
         """An entry for a failure in `explain --json`."""
@@ -133,43 +124,32 @@ class Explanation:
             "changed": list(self.changed),
             "minimal_causes": [cause.to_dict() for cause in self.causes],
             "robustness": self.robustness.share,
-            "because": str(self.because),
+            "avoided_by": self.preventable or None,
             "reasons": list(self.reasons),
-            **({"points": list(self.points)} if self.points else {}),
+            "points": list(self.points),
         }
 
     def details(self, subject: str, point: str) -> Iterator[str | Table]:
         """Everything about the failure, as sentences and tables; printed commands name `subject` and `point`."""
         yield f"\n{self.name} ({self.title})"
-        changes = list_of_changes(self.characteristics, self.setting)
-        yield f"{self.outcome}, SD {two_decimals(self.safety_degree)} with {changes}"
+        yield f"{self.endings} {list_of_changes(self.characteristics, self.setting)}. It is {self.robustness}."
         for cause in self.causes[:MAX_CAUSES]:
-            changes = list_of_changes(self.characteristics, cause.changes)
-            yield f"Minimal cause: {changes}: {cause.outcome}, SD {two_decimals(cause.safety_degree)}"
-            changed = [item for item in self.characteristics if item.name in cause.changes]
             table = WholeTable(
-                "characteristic", right=("original", "here", "limit (all scaled)", "limit (this one only)")
+                "minimal cause", right=("original", "here", "limit (all scaled)", "limit (this one only)")
             )
+            changed = [item for item in self.characteristics if item.name in cause.changes]
             for item in changed:
                 texts = (item.text(values[item.name]) for values in (cause.changes, cause.boundary, cause.alone))
                 table.add_row(item.name + unit_text(item.unit, " [{}]"), f"{item.original:g}", *texts)
-            yield table
-            yield meanings(changed)
-            if changed:
-                yield f"{cause.limit} It is a cause{cause.notes}: {simulate_command(subject, cause.changes, point)}"
+            yield from (table, meanings(changed))
+            ending = ending_in_words(cause.outcome, cause.safety_degree)
+            yield f"Alone it {ending}{cause.notes}: {simulate_command(subject, cause.changes, point)}. {cause.limit}"
         if len(self.causes) > MAX_CAUSES:
             yield f"... and {len(self.causes) - MAX_CAUSES} more of the same number of changes (--json has all)."
-        if len(self.causes) > 1:
-            in_all_causes = set.intersection(*(set(cause.changes) for cause in self.causes))
-            necessary = ", ".join(name for name in self.changed if name in in_all_causes)
-            yield f"Necessary, as all of them need it: {necessary or 'nothing'}."
-        yield f"Because: {self.because}"
-        if self.because.point:  # the study has a test matrix
-            yield f"Fails at {number_of(len(self.points), 'point')}: {'; '.join(self.points) or 'none'}."
+        if self.points:
+            yield f"Fails at {number_of(len(self.points), 'point')}: {'; '.join(self.points)}."
         if self.preventable:
             yield f"In the same vehicle: {self.preventable}."
-        if self.causes:
-            yield f"It is {self.robustness}."
 
 
 def speed_in_words(degree: float) -> str:

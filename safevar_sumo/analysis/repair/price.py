@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace as replace_in
 
-from safevar_sumo.analysis.explain.braking_comparison import brake_onset
+from safevar_sumo.analysis.braking import brake_onset
 from safevar_sumo.analysis.model_spread import studies_of_sets
 from safevar_sumo.analysis.opinion.compute import assemble_both_systems
 from safevar_sumo.analysis.repair.problem import PREFIX, RepairProblem, degrees_of
