@@ -40,10 +40,13 @@ class Ads:
         Delays of its reaction [s]; a study may raise them in bad weather.
     max_vehicles
         Largest number of vehicles at once; None if any number will do.
+    tau_parameter
+        The parameter in whose place an ADS that is SUMO's driver takes the headway `tau` of the setting; "" for others.
     """
 
     __slots__ = ()
     recognition_delay = hesitation = 0.0
+    tau_parameter = ""
     max_vehicles: int | None = None
 
     @abstractmethod

@@ -29,6 +29,7 @@ AVOIDING_GAINS = 0.23, 0.8
 FOLLOWING_GAP = 100.0  # m, largest gap at which it follows
 GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1  # m, m/s: errors below which it keeps the gap
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
+LAST_DECELERATION = 0.5  # m/s^2, assumption: at v_safe alone Krauss would creep to its gap, and never stop
 
 
 class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -104,6 +105,7 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
         Half the width of the corridor that it watches [m].
     """
 
+    tau_parameter = "headway"
     acceleration: PositiveParameter = 2.6
     deceleration: PositiveParameter = 4.5
 
@@ -135,6 +137,7 @@ class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         Planned time until braking begins [s].
     """
 
+    tau_parameter = "reaction_time"
     cruise_speed: PositiveParameter = 13.89
     standing_gap: NonNegativeParameter = 2.5
     braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.6
@@ -146,13 +149,14 @@ class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def drive(self, seen: Observation, memory: tuple[Nominal, float]) -> tuple[Command, tuple[Nominal, float]]:
         """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the reaction time t.
 
-        From v_safe the vehicle comes to rest behind a standing obstacle.
+        From v_safe the vehicle comes to rest behind a standing obstacle, towards the end at `LAST_DECELERATION`.
         """
         nominal, step = memory
         deceleration = self.braking_share * nominal.decel
         reaction_speed = deceleration * self.reaction_time
         gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), LARGEST_GAP)
         safe_speed = np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
+        safe_speed = np.maximum(safe_speed, np.sqrt(2 * LAST_DECELERATION * gap))
         acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (step + nominal.actuator_lag)
         throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
         brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)

@@ -37,6 +37,7 @@ class VariedAds(Ads):
 
     def __init__(self, ads: Ads, names: tuple[str, ...], values: FloatArray) -> None:
         self._ads, self._names, self._values = ads, names, values
+        self.tau_parameter = ads.tau_parameter
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         columns = [np.tile(column, n // len(column)) for column in self._values.T]
@@ -64,3 +65,13 @@ class VariedAds(Ads):
         varied, memory_of_varied = memory
         warned: BoolArray | None = varied.warns(memory_of_varied)
         return warned
+
+
+def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
+    """The ADS, with the headways `tau` of N vehicles [s] if it is SUMO's driver."""
+    if tau is None or not ads.tau_parameter:
+        return ads
+    if not isinstance(ads, VariedAds):
+        return VariedAds(ads, (ads.tau_parameter,), tau[:, np.newaxis])
+    values = np.tile(ads._values, (len(tau) // len(ads._values), 1))
+    return VariedAds(ads._ads, (*ads._names, ads.tau_parameter), np.column_stack([values, tau]))

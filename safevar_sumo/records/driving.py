@@ -89,7 +89,7 @@ class Nominal(NamedTuple):
     """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
     `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of its SUMO type; `actuator_lag` [s] is the
-    time constant with which its wheels follow the pedals (`tau` of its SUMO type). `tables` drives the vehicle on its
+    time constant with which its wheels follow the pedals. `tables` drives the vehicle on its
     first call, and returns `speeds`, `full_throttle`, `coasting` and `braking`.
     """
 

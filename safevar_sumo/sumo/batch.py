@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, open_rows
@@ -35,7 +36,7 @@ from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.world import Contacts, SumoWorld
-from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, slope_of
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, SumoType, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
 Watcher = Callable[[SumoWorld], None]
@@ -139,10 +140,11 @@ def _simulate(
     listen: Listener | None,
 ) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
-    prepared = _insert_vehicles(system, settings, world)
+    prepared, types = _insert_vehicles(system, settings, world)
     vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
     state = vehicle.at_start(prepared, world.speeds())
-    ads_memory, observer = system.ads.start(n, system.nominal, step), observer_of(system.points, world)
+    ads, observer = with_tau(system.ads, types.tau), observer_of(system.points, world)
+    ads_memory = ads.start(n, system.nominal, step)
     size = n // len(system.points)
     perception = Perception([point.weather for point in system.points], step, size)
     last_step = np.repeat([round(point.scenario.duration / step) for point in system.points], size)
@@ -164,8 +166,8 @@ def _simulate(
         observation, state = vehicle.sense(prepared, state, observation)
         if listen is not None:
             listen(observation)
-        command, ads_memory = system.ads.drive(observation, ads_memory)
-        _note_warnings(warning_ttc, system.ads.warns(ads_memory), outcomes.is_open, speed, scene)
+        command, ads_memory = ads.drive(observation, ads_memory)
+        _note_warnings(warning_ttc, ads.warns(ads_memory), outcomes.is_open, speed, scene)
         command, state = robot.drive(command, state, outcomes.is_open)
         position = world.vehicle_positions(VUT)
         log.write(sample, position, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
@@ -189,15 +191,18 @@ def _simulate(
     )
 
 
-def _insert_vehicles(system: System, settings: FloatArray, world: DrivenWorld) -> Prepared:
-    """Put the vehicles onto the roads; returns their constants."""
+def _insert_vehicles(system: System, settings: FloatArray, world: DrivenWorld) -> tuple[Prepared, SumoType]:
+    """Put the vehicles onto the roads; returns their constants and types."""
     vehicle, n = system.vehicle, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
-    world.insert(vehicle.sumo_type(prepared))
-    if isinstance(world, SumoWorld) and isinstance(system.ads, TraciController):  # other ADSs get observations
-        world.sensors = _sensors_in_weather(system, prepared, n)
-    return prepared
+    types = vehicle.sumo_type(prepared)
+    if isinstance(world, SumoWorld) and isinstance(system.ads, TraciController):
+        world.insert_with_drivers(TraciController.types(system.nominal, types))
+        world.sensors = _sensors_in_weather(system, prepared, n)  # other ADSs get observations
+    else:
+        world.insert(types)
+    return prepared, types
 
 
 def _note_warnings(

@@ -35,7 +35,10 @@ def why_no_verdict(system: System) -> str:
     kind = problem.split()[0]  # the first word: distances differ from point to point
     count = sum(other_problem.startswith(kind) for other_problem in problems.values())
     where = f" at {count} of {len(results)} points, such as {point}" if len(results) > 1 else ""
-    return f"The original vehicle {problem}{where}: no verdict."
+    return (
+        f"On a first drive, with nobody in sight, the original vehicle {problem}{where}. So its drives with somebody "
+        "in sight do not show how it reacts to them: no verdict."
+    )
 
 
 def driven_entry(no_verdict: str) -> dict[str, bool]:

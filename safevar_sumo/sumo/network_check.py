@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -41,8 +41,15 @@ DRIVER_ATTRIBUTES = re.compile(
 """Attributes of SUMO's own driver."""
 SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
 """Attributes of the type of the vehicle under test that the vehicle model replaces by values of the setting."""
+ACTING_ATTRIBUTES = (
+    *("carFollowModel", "tau", "decel", "emergencyDecel", "minGap", "speedFactor", "desiredMaxSpeed"),
+    *("actionStepLength", "delta", "stepping"),
+)
+"""Attributes with which SUMO's driver drives under a controller written for TraCI; he never dawdles (sigma)."""
 NO_EFFECT = {"sigma": "0", "speedDev": "0", "speedFactor": "1"}
 """Values of attributes of SUMO's own driver that no remark mentions."""
+EXACT_MODELS = ("Krauss", "KraussOrig1", "IDM", "ACC", "CACC")
+"""Car-following models of which SUMO's driver under a controller drives as in SUMO."""
 SIGMA_MODELS, DETERMINISTIC_MODELS = ("Krauss", "KraussOrig1", "KraussPS"), ("IDM", "IDMM", "ACC", "CACC")
 """Car-following models that are random unless sigma is 0, and models that are never random."""
 LEGAL_OPTIONS = (
@@ -68,11 +75,11 @@ def check_network(name: str, source: str) -> None:
         _check_files(network)
 
 
-def network_remarks(name: str, *, sumo_drives: bool) -> list[str]:
+def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     """Remarks on attributes of a user's traffic that the simulation does not use, and SUMO's warnings; none on shipped
     networks.
 
-    With `sumo_drives`, SUMO's own driver influences the vehicle, as with a controller written for TraCI.
+    `acting` are the attributes of SUMO's own driver that act, as with a controller written for TraCI.
     """
     if is_shipped(name):
         return []
@@ -82,13 +89,17 @@ def network_remarks(name: str, *, sumo_drives: bool) -> list[str]:
         f"{attribute} = {value}"
         for element in parse_xml(file).findall(f"*[@id='{VUT}']")
         for attribute, value in element.items()
-        if attribute in SETTING_ATTRIBUTES
-        or (DRIVER_ATTRIBUTES.fullmatch(attribute) and not sumo_drives and value != NO_EFFECT.get(attribute))
+        if attribute not in acting
+        and (attribute in SETTING_ATTRIBUTES or DRIVER_ATTRIBUTES.fullmatch(attribute))
+        and value != NO_EFFECT.get(attribute)
     ]
     remarks = []
     if unused_attributes:
         unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(unused_attributes))}"
         remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
+    model = next((vtype.get("carFollowModel", "") for vtype in parse_xml(file).findall(f"vType[@id='{VUT}']")), "")
+    if acting and model not in ("", *EXACT_MODELS):
+        remarks.append(f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone")
     if warnings := _warnings_file(network).read_text(encoding="utf-8"):
         remarks.append(f"{network.folder}: {warnings}")
     return remarks

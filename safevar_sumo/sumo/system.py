@@ -33,7 +33,7 @@ from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
-from safevar_sumo.sumo.network_check import check_network, network_remarks
+from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
 from safevar_sumo.vehicles import (
     CHANGES,
@@ -48,6 +48,7 @@ from safevar_sumo.vehicles import (
     guard_change,
     region_of,
 )
+from safevar_sumo.vehicles.base import Prepared
 
 RESULT_COLUMNS = (
     "algorithm",
@@ -64,6 +65,8 @@ RESULT_COLUMNS = (
 )
 """Names of result columns, which no characteristic or metric may use."""
 OBJECTIVES_KEY = "search.objectives"
+MIN_HEADWAY = 0.5
+"""Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
 
 
 class Measuring(NamedTuple):
@@ -127,6 +130,13 @@ CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script
 """The legal forms of a controller written for TraCI."""
 
 
+UNKNOWN_TO_DRIVER = (
+    "SUMO's driver, who drives without a command and limits commanded speeds, plans with the decel and minGap of the "
+    "traffic file. He knows neither the delays of the vehicle and its sensors nor its brakes: that can make him collide"
+)
+"""Remark on a controller written for TraCI."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class System:
     """A study's models, points, metrics and constraints, ready to simulate.
@@ -177,9 +187,10 @@ class System:
         remarks = [
             remark
             for network in dict.fromkeys(point.scenario.network for point in self.points)
-            for remark in network_remarks(network, sumo_drives=uses_traci)
+            for remark in network_remarks(network, self._acting_attributes if uses_traci else ())
         ]
         remarks += self.vehicle.remarks
+        remarks += self._remarks_on_driver()
         for weather in {point.weather.name: point.weather for point in self.points}.values():
             if weather.visibility != 1 and uses_traci and not self._has_limited_range():
                 remarks.append(
@@ -193,10 +204,35 @@ class System:
                 )
         return remarks
 
+    @property
+    def _acting_attributes(self) -> set[str]:
+        """Attributes of the traffic file with which SUMO's driver drives under a controller written for TraCI."""
+        return {*ACTING_ATTRIBUTES} - ({"tau"} if self._has_tau else set())
+
+    @property
+    def _has_tau(self) -> bool:
+        return self.vehicle.sumo_type(self._prepared_original()).tau is not None
+
+    def _remarks_on_driver(self) -> list[str]:
+        """Remarks on the headway `tau` and on what SUMO's driver does not know."""
+        if isinstance(self.ads, TraciController):
+            return [UNKNOWN_TO_DRIVER]
+        if not self._has_tau:
+            return []
+        name = self.ads.tau_parameter
+        if not name:
+            return ["tau has no effect: it is the headway of SUMO's driver, and the study has another ADS"]
+        is_default = getattr(self.ads, name) == getattr(type(self.ads)(), name)
+        return [] if is_default else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
+
     def _has_limited_range(self) -> bool:
-        original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
-        sensors = self.vehicle.sensors(self.vehicle.prepare(original, 1.0, 0.1))  # road friction 1, time step 0.1 s
+        sensors = self.vehicle.sensors(self._prepared_original())
         return sensors is not None and bool(np.isfinite(sensors.reach).all())
+
+    def _prepared_original(self) -> Prepared:
+        """The constants of the original vehicle."""
+        original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
+        return self.vehicle.prepare(original, 1.0, 0.1)  # road friction 1, time step 0.1 s
 
 
 def assemble(study: Study, source: str = "") -> System:
@@ -317,6 +353,16 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
 
 def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, source: str) -> None:
     table, units = study.vehicle.characteristics, vehicle.UNITS
+    if (
+        "actuatorLag" in units
+        and "tau" in table
+        and ("actuatorLag" not in table or table["tau"].original < MIN_HEADWAY)
+    ):
+        problem = (
+            f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway of SUMO's driver"
+        )
+        legal = f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is vehicle.characteristics.actuatorLag"
+        raise InputError(source, problem, legal)
     for name, entry in table.items():
         key = f"vehicle.characteristics.{name}"
         if name in RESULT_COLUMNS:

@@ -7,7 +7,6 @@ speeds and accelerations are converted to pedal positions of the vehicle model.
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,20 +18,10 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.ads.base import Trim, pedals_for, trim_at
-from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.traci_view import (
-    COMMANDS,
-    OWN_LOOP,
-    Arguments,
-    SensedTraffic,
-    TraciView,
-    Value,
-    real_traci,
-    refused,
-)
+from safevar_sumo.sumo.traci_view import OWN_LOOP, SensedTraffic, TraciView, Value, real_traci, refused
 from safevar_sumo.sumo.world import current_world
 from safevar_sumo.vehicles import SumoType
 
@@ -54,17 +43,20 @@ class TraciController(Ads):
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         world, drivers = current_world(), []
-        values = nominal.mass, nominal.accel, nominal.decel, nominal.max_speed, nominal.actuator_lag
-        world.set_types(SumoType(*(np.full(n, value) for value in values)))
         traffic = SensedTraffic(world, step)
         with substitute_traci():
             for copy in range(n):
-                commands, controller = CommandedSpeed(nominal, step), self._create()
-                view = TraciView(world, copy, traffic, commands.command)
+                view, controller = TraciView(world, copy, traffic), self._create()
                 if hasattr(controller, "start"):
                     self._call(view, "start", controller.start)
-                drivers.append((view, commands, getattr(controller, "step", controller)))
+                drivers.append((view, getattr(controller, "step", controller)))
         return _Memory(nominal, traffic, drivers, initial_trim=None)
+
+    @staticmethod
+    def types(nominal: Nominal, types: SumoType) -> SumoType:
+        """The types that controllers may know: those of the original vehicle, with the headways of SUMO's drivers."""
+        mass, accel, decel, max_speed, lag = (np.full_like(types.mass, value) for value in nominal[:5])
+        return SumoType(mass, accel, decel, max_speed, lag, types.tau)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         initial_trim, accelerations = memory.initial_trim, np.zeros(len(memory.drivers))
@@ -73,11 +65,11 @@ class TraciController(Ads):
         else:
             memory.traffic.record_step()
         with substitute_traci():
-            for i, (view, commands, step) in enumerate(memory.drivers):
+            for i, (view, step) in enumerate(memory.drivers):
                 if memory.traffic.is_on_road(i):
                     view.time, speed = seen.time, float(seen.speed[i])
                     self._call(view, "step", step)
-                    accelerations[i] = commands.acceleration(speed, seen.time, view.speed_of_sumo(speed))
+                    accelerations[i] = view.commanded_acceleration(speed)
         command = pedals_for(memory.nominal, seen.speed, accelerations, initial_trim)
         return command, memory._replace(initial_trim=initial_trim)
 
@@ -93,73 +85,18 @@ class TraciController(Ads):
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the sensed traffic, each vehicle's view, commands and step function, and the initial trim;
-    the trim is None before the first step.
+    """The original vehicle, the sensed traffic, each vehicle's view and step function, and the initial trim, which is
+    None before the first step.
     """
 
     nominal: Nominal
     traffic: SensedTraffic
-    drivers: list[tuple[TraciView, CommandedSpeed, Controller]]
+    drivers: list[tuple[TraciView, Controller]]
     initial_trim: Trim | None
 
 
 _active_view: TraciView | None = None
 """The view of the vehicle whose controller runs at the moment."""
-
-SUMO_CONTROL = -1.0
-"""Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
-LEGAL_NUMBERS = (
-    "a finite number from 0 on; any acceleration; a whole mode up to 127; speed or mode -1 for SUMO's driver"
-)
-
-
-class CommandedSpeed:
-    """A controller's commands, and the acceleration that results from them under SUMO's speed modes.
-
-    A command holds until the next one. `setAcceleration` and `slowDown` change the speed evenly until `_end_time`;
-    then SUMO's own driver takes over.
-    """
-
-    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
-
-    def __init__(self, nominal: Nominal, step: float) -> None:
-        self._step = step
-        self._limits = {"setAccel": nominal.accel, "setDecel": nominal.decel, "setMaxSpeed": math.inf}
-        self._mode, self._speed = self.DEFAULT_MODE, SUMO_CONTROL
-        self._end_time, self._speed_rate = -1.0, 0.0
-
-    def command(self, name: str, time: float, speed: float, values: Arguments) -> None:
-        """Process a command of the vehicle domain; raises `InputError` if an argument is no legal number."""
-        for argument, number in zip(COMMANDS[name], values, strict=True):
-            returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-            is_legal = math.isfinite(number) and (number >= 0 or argument == "acceleration" or returns_control)
-            if not is_legal or (argument == "mode" and number not in range(-1, 128)):
-                raise InputError(f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS)
-        value, *durations = map(float, values)
-        if name == "setSpeedMode":
-            self._mode = self.DEFAULT_MODE if value == SUMO_CONTROL else int(value)
-        elif name in self._limits:
-            self._limits[name] = value
-        elif name == "setSpeed":
-            self._speed, self._end_time = value, time
-        else:
-            is_slowing = name == "slowDown"
-            duration = max(durations[0], self._step) if is_slowing else durations[0]
-            self._speed, self._end_time = SUMO_CONTROL, time + duration
-            self._speed_rate = (value - speed) / duration if is_slowing else value
-
-    def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
-        """The acceleration by the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
-        decel = self._limits["setDecel"]
-        next_speed = sumo_speed if self._speed == SUMO_CONTROL else self._speed
-        if time < self._end_time:
-            next_speed = speed + self._speed_rate * self._step
-        if self._mode & self.LIMIT_TO_SAFE_SPEED and next_speed > sumo_speed:
-            next_speed = min(next_speed, max(sumo_speed, speed - decel * self._step))
-        acceleration = (min(next_speed, self._limits["setMaxSpeed"]) - speed) / self._step
-        if self._mode & self.LIMIT_ACCELERATION:
-            acceleration = min(acceleration, self._limits["setAccel"])
-        return max(acceleration, -decel) if self._mode & self.LIMIT_DECELERATION else acceleration
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import inspect
 import math
 import re
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -15,28 +15,17 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.engine import Engine, engine_api
+from safevar_sumo.sumo.traci_commands import COMMANDS, DRIVER_COMMANDS, CommandedSpeed
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 Value = Any
 """An argument or a result of a function of TraCI."""
 Arguments = tuple[Value, ...]
-Command = Callable[[str, float, float, Arguments], None]
-"""Processes a command of the vehicle domain: its name, the time [s], the vehicle's speed [m/s], and its arguments."""
 Values = dict[str, Value]
 """What TraCI's functions return of an actor, by function; its length, too."""
 Variables = dict[int, tuple[str, Arguments]]
 """Requested variables, each with its function and that function's arguments after the actor's id."""
 
-COMMANDS: Mapping[str, tuple[str, ...]] = {
-    "setSpeed": ("speed",),
-    "slowDown": ("speed", "duration"),
-    "setAcceleration": ("acceleration", "duration"),
-    "setAccel": ("accel",),
-    "setDecel": ("decel",),
-    "setMaxSpeed": ("speed",),
-    "setSpeedMode": ("mode",),
-}
-"""The commands that a controller may give, each with its numeric arguments."""
 LISTS = ("getIDList", "getIDCount")
 POSITIONS = ("getPosition", "getPosition3D")
 MOTION = (*POSITIONS, "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
@@ -146,6 +135,7 @@ INVALID_NUMBER = -1073741824
 LEADER_RANGE = 1000.0
 """Distance within which SUMO looks for a leader [m]."""
 OWN_LOOP = "safevar_sumo itself starts, advances and ends the simulation"
+BYPASS = "it would bypass the vehicle's model or its sensors"
 
 
 @cache
@@ -157,7 +147,10 @@ def real_traci() -> Api:
 def refused(domain: str, name: str, problem: str) -> InputError:
     """The error for a controller's call of a function, of traci itself if `domain` is ""."""
     legal = "the body of your script's loop, without this call, as a function step(traci, vehicle_id), with calls of "
-    return InputError(f"traci.{domain}.{name}".replace("..", "."), problem, legal + ", ".join(CALLS.get(domain, CALLS)))
+    legal += ", ".join(CALLS.get(domain, CALLS))
+    if (domain, name) == ("vehicle", "setType"):
+        problem, legal = "makes it another vehicle, but the study's vehicle drives", ", ".join(DRIVER_COMMANDS)
+    return InputError(f"traci.{domain}.{name}".replace("..", "."), problem, legal)
 
 
 class Snapshot(NamedTuple):
@@ -247,22 +240,35 @@ def _scaled(own: Values, values: Values, scale: float) -> Values:
 class TraciView:
     """TraCI's functions for one vehicle, with the ids of the traffic file."""
 
-    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic, command: Command) -> None:
+    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic) -> None:
         self._api, self._copy, self._vut, self._traffic = world.api, copy, copied_id(copy, VUT), traffic
-        self._step, self._command_vut = world.step_length, command
+        self._step, self._commands = world.step_length, CommandedSpeed(world.step_length)
+        self._steps_of_action = round(self._api.vehicle.getActionStepLength(self._vut) / self._step)
+        self._last_speed = 0.0
         self._subscriptions: dict[tuple[str, str], Variables] = {}
         self.time = 0.0
         self.last_error: InputError | None = None
         """The last error raised to the controller, even if the controller caught it."""
 
-    def speed_of_sumo(self, speed: float) -> float:
-        """Speed that SUMO's driver, with the original vehicle's type, would choose next for road and leader [m/s]."""
+    def commanded_acceleration(self, speed: float) -> float:
+        """The acceleration by the commands and SUMO's driver at a speed [m/s] of the vehicle [m/s^2]."""
+        vehicle, vut, last_speed, self._last_speed = self._api.vehicle, self._vut, self._last_speed, speed
+        accel, decel = vehicle.getAccel(vut), vehicle.getDecel(vut)
+        sumo_speed = 2 * speed - last_speed  # between two actions the driver keeps his acceleration
+        if round(self.time / self._step) % self._steps_of_action == 0:
+            sumo_speed = self._speed_of_sumo(speed, accel, decel)
+        return self._commands.acceleration(speed, self.time, sumo_speed, accel, decel)
+
+    def _speed_of_sumo(self, speed: float, accel: float, decel: float) -> float:
+        """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the leader [m/s]."""
         vehicle, vut, (_, actors, leader) = self._api.vehicle, self._vut, self._traffic.seen[self._copy]
-        sumo_speed = min(speed + vehicle.getAccel(vut) * self._step, vehicle.getAllowedSpeed(vut))
+        ignores_limit = self._commands.mode & CommandedSpeed.BEYOND_LIMIT
+        limit = vehicle.getMaxSpeed(vut) if ignores_limit else vehicle.getAllowedSpeed(vut)
+        sumo_speed = min(speed + accel * self._step, max(limit, speed - decel * self._step))
         if leader is not None:
             name, gap = leader
             id_, leader_speed = copied_id(self._copy, name), actors["vehicle"][name]["getSpeed"]
-            follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(id_), id_)
+            follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getApparentDecel(id_), id_)
             sumo_speed = min(sumo_speed, follow_speed)
         return float(sumo_speed)
 
@@ -278,7 +284,8 @@ class TraciView:
         """
         try:
             if name not in CALLS.get(domain, ()):
-                raise refused(domain, name, f"is not for a controller of {VUT!r}: {OWN_LOOP}")
+                reason = OWN_LOOP if domain in ("", "simulation") else BYPASS
+                raise refused(domain, name, f"is not for a controller of {VUT!r}: {reason}")
             bound = _signature(domain, name).bind(*arguments, **named)
             if name not in COMMANDS and name not in SUBSCRIPTIONS:
                 return self._query(domain, name, *bound.args)
@@ -293,7 +300,9 @@ class TraciView:
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> None:
         if vehicle != VUT:
             raise refused(domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}")
-        self._command_vut(name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values)
+        self._commands.command(name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values)
+        if name in DRIVER_COMMANDS:
+            self._sumo_value(domain, name, VUT, *values)
 
     def _query(self, domain: str, name: str, *arguments: Value) -> Value:
         if name in LISTS:
@@ -303,7 +312,7 @@ class TraciView:
             return self._sensed_value(domain, name, *arguments)
         if name == "getLeader":
             return self._leader(*arguments[1:])
-        return self.time if name == "getTime" else self._sumo_value(domain, name, *arguments)
+        return self._commands.mode if name == "getSpeedMode" else self._sumo_value(domain, name, *arguments)
 
     def _sensed_value(self, domain: str, name: str, actor: str, *others: Value) -> Value:
         """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO reports one that is

@@ -76,18 +76,19 @@ class SumoWorld:
         """The ids of an actor in its copies."""
         return _copied_ids(name, self.n)
 
-    def set_types(self, types: SumoType) -> None:
+    def _set_types(self, types: SumoType) -> None:
+        """Set the attributes of the vehicles under test, except their decelerations."""
         vehicletype = self.api.vehicletype
         self._set(vehicletype.setMass, types.mass)
         self._set(vehicletype.setAccel, types.accel)
         self._set(vehicletype.setMaxSpeed, types.max_speed)
-        self._set(vehicletype.setTau, types.tau)
-        self._set_decelerations(types.decel)
+        if types.tau is not None:
+            self._set(vehicletype.setTau, types.tau)
 
-    def _set_decelerations(self, decel: FloatArray) -> None:
-        """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
+    def _set_decelerations(self, decel: FloatArray, emergency_decel: FloatArray | None = None) -> None:
+        """Set the largest decelerations of the vehicles under test, by default the same in emergencies [m/s^2]."""
         self._set(self.api.vehicletype.setDecel, decel)
-        self._set(self.api.vehicletype.setEmergencyDecel, decel)
+        self._set(self.api.vehicletype.setEmergencyDecel, decel if emergency_decel is None else emergency_decel)
 
     def _set(self, set_value: Callable[[str, float], None], values: FloatArray) -> None:
         for id_, value in zip(self.ids(VUT), values.tolist(), strict=True):
@@ -95,9 +96,23 @@ class SumoWorld:
 
     def insert(self, types: SumoType) -> None:
         """Insert all actors, the vehicles under test with these types; raises the errors of `depart`."""
-        self.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
+        self._set_types(types)
+        self._set_decelerations(np.maximum(types.decel, INSERTION_DECELERATION))
         self.depart()
         self._set_decelerations(types.decel)
+
+    def insert_with_drivers(self, types: SumoType) -> None:
+        """Insert all actors, the vehicles under test with these types, but with the decelerations that the traffic file
+        gives SUMO's drivers; raises the errors of `depart`.
+        """
+        vehicletype = self.api.vehicletype
+        planned = [(vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in self.ids(VUT)]
+        self._set_types(types)
+        self._set_decelerations(np.full(self.n, INSERTION_DECELERATION))
+        self.depart()
+        self._set_decelerations(*np.array(planned).T)
+        for id_ in self.ids(VUT):  # SUMO drew a factor for each vehicle
+            self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
 
     def insert_at_any_speed(self) -> None:
         """Insert all actors; the types of the vehicles under test change."""

@@ -42,7 +42,7 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
     types = vehicle.sumo_type(vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP))
     simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))
-    mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
+    mass, accel, decel, max_speed, lag = (float(values[0]) for values in types[:5])
     return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=simulate_tables)
 
 

@@ -41,17 +41,19 @@ Characteristics = Mapping[str, FloatArray]
 
 
 class SumoType(NamedTuple):
-    """The attributes of N SUMO vehicle types, each of shape (N,), in kg, m/s^2, m/s^2, m/s and s.
+    """N vehicles as SUMO and driving systems see them; every column has shape (N,).
 
-    `tau`, which is SUMO's desired headway, holds the actuator lag here. It has no effect in SUMO, as SUMO's driver
-    models do not drive the vehicle.
+    Mass [kg], largest acceleration and deceleration [m/s^2] and top speed [m/s] are those of a SUMO vehicle type.
+    `actuator_lag` is the time constant with which the wheels follow the pedals [s]. `tau` is the time headway that
+    SUMO's driver of the vehicle keeps [s]; None if it is not among the characteristics.
     """
 
     mass: FloatArray
     accel: FloatArray
     decel: FloatArray
     max_speed: FloatArray
-    tau: FloatArray
+    actuator_lag: FloatArray
+    tau: FloatArray | None = None
 
 
 LONGEST_DELAY = 3600.0
@@ -307,8 +309,9 @@ class GuardedVehicle(Vehicle):
         arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)
         constants = self._guard.call("prepare", self.model.prepare, *arguments)
         types = self._guard.call("sumo_type", self.model.sumo_type, constants)
-        legal = dict.fromkeys(SumoType._fields, POSITIVE)
-        return _Prepared(n, constants, SumoType(**self._guard.columns("sumo_type", types, (n,), legal)))
+        names = [name for name in SumoType._fields if name != "tau" or getattr(types, name, None) is not None]
+        columns = self._guard.columns("sumo_type", types, (n,), dict.fromkeys(names, POSITIVE))
+        return _Prepared(n, constants, SumoType(**columns))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types

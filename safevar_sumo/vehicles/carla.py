@@ -208,7 +208,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             accel=np.minimum(drive, p.grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, p.grip) / p.mass,
             max_speed=p.engine_limit / OVERALL_RATIOS[-1] * p.radius,
-            tau=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise),
+            actuator_lag=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise),
         )
 
     def at_rest(self, prepared: _Prepared) -> CarlaState:

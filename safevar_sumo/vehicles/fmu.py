@@ -32,11 +32,17 @@ CONSTANTS: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", 
 rise over run.
 """
 OUTPUTS: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
-TYPE_UNITS: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
+TYPE_UNITS: Mapping[str, str] = {
+    "mass": "kg",
+    "accel": "m/s^2",
+    "decel": "m/s^2",
+    "max_speed": "m/s",
+    "actuator_lag": "s",
+}
 SPEED_TOLERANCE = 1e-6
 """Largest difference between an FMU's speed at the start and the initial speed [m/s]."""
 DEFAULT_LAG = 0.1
-"""Actuator lag that a driving system assumes if the study gives no `tau` [s]."""
+"""Actuator lag that a driving system assumes if the study gives no `actuator_lag` [s]."""
 SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
 SENSOR_FIELDS = {"latency": "latency", "range": "reach"}  # fields of `Sensors` by the study's names
 REQUIRED = {
@@ -95,7 +101,7 @@ class FmuVehicle(Vehicle):
     def __init__(self, description: Description, units: Mapping[str, str], table: Parameters, guard: Guard) -> None:
         source, self._guard, self.UNITS = guard.source, guard, dict(units)
         self._communication_step = description.communication_step(table["step"], source, "vehicle")
-        self._sensor_entries, self._type_entries = table["sensors"], {"tau": DEFAULT_LAG, **table["sumo_type"]}
+        self._sensor_entries, self._type_entries = table["sensors"], {"actuator_lag": DEFAULT_LAG, **table["sumo_type"]}
         for key, entries in {**table, "sumo_type": self._type_entries}.items():
             names, expected = REQUIRED.get(key, ((), ""))
             for name in names:

@@ -173,7 +173,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             accel=np.minimum(drive, grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, grip) / p.mass,
             max_speed=p.largest_rpm / RPM_PER_RAD_S / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
-            tau=np.full_like(p.mass, p.step + self.pedal_lag),
+            actuator_lag=np.full_like(p.mass, p.step + self.pedal_lag),
         )
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:

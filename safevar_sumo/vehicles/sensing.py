@@ -37,6 +37,11 @@ HALF_WORN_RATIO = 39.9 / 31.7
 HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
 """Loss of friction at 3 mm over the loss at 1.6 mm [-], as friction is proportional to 1 / stopping distance."""
 
+RELEASED_BRAKE = 1e-6
+"""Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command that fades out between
+two steps must not hold the engine off.
+"""
+
 
 class SensingState(NamedTuple):
     """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the wheels [m/s^2].
@@ -116,6 +121,7 @@ class _PreparedSumo(NamedTuple):
     grip: float | FloatArray
     max_speed: FloatArray
     actuator_lag: FloatArray
+    tau: FloatArray
     sensor_range: FloatArray
     latency: FloatArray
     brake_delay: FloatArray
@@ -125,6 +131,8 @@ class _PreparedSumo(NamedTuple):
 
 class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
+
+    `tau` is SUMO's: the time headway of a driver who is one of SUMO's car-following models.
 
     Parameters
     ----------
@@ -140,6 +148,7 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         "decel": "m/s^2",
         "maxSpeed": "m/s",
         "tau": "s",
+        "actuatorLag": "s",
         "sensorRange": "m",
         "reactionTime": "s",
         "brakeDelay": "s",
@@ -168,7 +177,8 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             decel=decel,
             grip=self.tyre_friction * road_friction * slope.down,
             max_speed=c["maxSpeed"],
-            actuator_lag=c["tau"],
+            actuator_lag=c["actuatorLag"],
+            tau=c["tau"],
             sensor_range=c["sensorRange"],
             latency=c["reactionTime"],
             brake_delay=c["brakeDelay"],
@@ -179,17 +189,18 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     def sumo_type(self, prepared: _PreparedSumo) -> SumoType:
         p = prepared
         limits = np.minimum(p.drive, p.grip), np.minimum(p.decel, p.grip)
-        return SumoType(p.mass, *limits, p.max_speed, tau=p.actuator_lag)
+        return SumoType(p.mass, *limits, p.max_speed, p.actuator_lag, p.tau)
 
     def _acceleration(
         self, p: _PreparedSumo, state: SensingState, throttle: FloatArray, brake: FloatArray
     ) -> FloatArray:
         """The wheels follow the pedals with the actuator lag T: da/dt = (target - a) / T."""
-        commanded = np.where(brake > 0, -brake * p.brake_gain * p.decel, throttle * p.drive)
+        is_braking = brake > RELEASED_BRAKE
+        commanded = np.where(is_braking, -brake * p.brake_gain * p.decel, throttle * p.drive)
         target = np.minimum(np.maximum(commanded, -p.grip), p.grip)
         acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
         # Braking ends a positive acceleration at once, without lag.
-        return np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
+        return np.where(is_braking, np.minimum(acceleration, 0.0), acceleration)
 
 
 class _PreparedWorn(NamedTuple):
@@ -298,7 +309,7 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
         p, ones = prepared, np.ones_like(prepared.mass)
         limits = np.minimum(p.drive, p.grip * p.slope.down), self._deceleration(p, ones)
-        return SumoType(p.mass, *limits, self.max_speed * ones, tau=p.brake_delay + p.step)
+        return SumoType(p.mass, *limits, self.max_speed * ones, p.brake_delay + p.step)
 
     def _acceleration(
         self, p: _PreparedWorn, state: SensingState, throttle: FloatArray, brake: FloatArray

@@ -51,7 +51,7 @@ inputs.step = "interval"
 inputs.initial_speed = "start_speed"
 outputs = { speed = "v", throttle = "throttle_now", brake = "brake_now" }
 sensors = { latency = "reactionTime", range = "sensorRange" }
-sumo_type = { mass = "mass", accel = "most_accel", decel = "most_decel", max_speed = "maxSpeed", tau = "tau" }
+sumo_type = { mass = "mass", accel = "most_accel", decel = "most_decel", max_speed = "maxSpeed", actuator_lag = "actuatorLag" }
 [vehicle.characteristics]
 """
 

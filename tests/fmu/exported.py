@@ -57,7 +57,7 @@ from safevar_sumo.vehicles import LEVEL
 from safevar_sumo.vehicles.base import Slope
 from safevar_sumo.vehicles.sensing import SumoVehicle
 
-PARAMETERS = ("mass", "accel", "decel", "maxSpeed", "tau", "brakeDelay", "brakeGain")
+PARAMETERS = ("mass", "accel", "decel", "maxSpeed", "tau", "actuatorLag", "brakeDelay", "brakeGain")
 
 
 class ExportedVehicle(Fmi2Slave):
@@ -65,7 +65,7 @@ class ExportedVehicle(Fmi2Slave):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        for name in ("mass", "accel", "decel", "maxSpeed", "tau", "brakeDelay", "brakeGain", "interval", "friction"):
+        for name in ("mass", "accel", "decel", "maxSpeed", "tau", "actuatorLag", "brakeDelay", "brakeGain", "interval", "friction"):
             setattr(self, name, 1.0)
             self.register_variable(Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
         for name in ("accelerator", "brake_pedal", "start_speed"):

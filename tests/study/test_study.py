@@ -302,12 +302,12 @@ ROWS = load_study("native").vehicle.characteristics
 
 def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> None:
     stated = {"decel": Limit(at_least=5, source="workshop"), "mass": Limit(at_most=1900)}
-    texts = ["decel >= 6.5", "tau<=.3", " mass >= 1.4e3", "mass <= 1800"]
+    texts = ["decel >= 6.5", "actuatorLag<=.3", " mass >= 1.4e3", "mass <= 1800"]
     limits = limits_of(texts, ROWS, stated)
-    assert list(limits) == ["mass", "decel", "tau"]
+    assert list(limits) == ["mass", "decel", "actuatorLag"]
     assert limits["decel"] == Limit(at_least=6.5)
     assert limits["decel"].interval(ROWS["decel"]) == (6.5, 9.5)
-    assert limits["tau"].interval(ROWS["tau"]) == (0.1, 0.3)
+    assert limits["actuatorLag"].interval(ROWS["actuatorLag"]) == (0.1, 0.3)
     assert limits["mass"].interval(ROWS["mass"]) == (1400, 1800)
     assert limits_of([], ROWS, stated) == {"mass": stated["mass"], "decel": stated["decel"]}
 
@@ -325,9 +325,12 @@ def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> No
         ("decel >= 6, decel >= 7", "decel >= is given twice\nexpected: each limit once"),
         ("decel >= 9, decel <= 8", "decel: at least 9 and at most 8 m/s^2\nexpected: at_least <= at_most"),
         ("decel >= 4", "decel >= 4 is outside its domain\nexpected: a number in [4.5, 9] m/s^2"),
-        ("tau <= 1e999", "tau <= inf is outside its domain"),
+        ("actuatorLag <= 1e999", "actuatorLag <= inf is outside its domain"),
         ("decel >= 9.2", "decel >= 9.2: the original, 9 m/s^2, does not keep it\nexpected: a number in [4.5, 9] m/s^2"),
-        ("tau <= 0.15", "tau <= 0.15: the original, 0.2 s, does not keep it\nexpected: a number in [0.2, 0.6] s"),
+        (
+            "actuatorLag <= 0.15",
+            "actuatorLag <= 0.15: the original, 0.2 s, does not keep it\nexpected: a number in [0.2, 0.6] s",
+        ),
     ],
 )
 def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:

@@ -151,7 +151,10 @@ def test_a_false_claim_that_no_actor_reacts_is_detected(reacting: Path, monkeypa
         sv.run(study, out="results/it", jobs=1)
 
 
-STANDS = "The original vehicle never reaches the encounter (it gets 0.0 of 11.9 m): no verdict."
+FIRST = "On a first drive, with nobody in sight, the original vehicle "
+NO_VERDICT = ". So its drives with somebody in sight do not show how it reacts to them: no verdict."
+STANDS = f"{FIRST}never reaches the encounter (it gets 0.0 of 11.9 m){NO_VERDICT}"
+BRAKES = f"{FIRST}brakes without an obstacle"
 
 
 def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, object]]) -> str:
@@ -164,10 +167,7 @@ def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, obj
         (lambda seen: (0, 1), STANDS),
         (lambda seen: (0, 0), STANDS),
         (lambda seen: (0.02, seen.gap < 5), STANDS.replace("0.0 of", "0.5 of")),
-        (
-            lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5),
-            "The original vehicle brakes without an obstacle: no verdict.",
-        ),
+        (lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5), BRAKES + NO_VERDICT),
         (lambda seen: (seen.speed < 5, seen.speed > 5), ""),  # a cruise control with the pedals' full strokes
         # Stands on its brake, but only because of the pedestrian.
         (lambda seen: (0.9, np.isfinite(seen.gap)), ""),
@@ -182,18 +182,16 @@ def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
 def test_a_robot_drives_who_does_nothing_to_the_target_but_braking_for_nobody_is_told_with_its_points() -> None:
     test = study_at(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear", "test")
     assert reason(test, lambda seen: (0, 0)) == ""
-    assert reason(test, lambda seen: (0, 1)) == "The original vehicle brakes without an obstacle: no verdict."
+    assert reason(test, lambda seen: (0, 1)) == BRAKES + NO_VERDICT
     assert reason(test, lambda seen: (0, 0.1 * (seen.time == 0))).startswith(
-        "The original vehicle never reaches the encounter (it gets "
+        f"{FIRST}never reaches the encounter (it gets "
     )
 
 
 @pytest.mark.slow
 def test_the_reason_counts_the_points_and_names_one() -> None:
     said = reason("euro_ncap_car_to_car", lambda seen: (0, seen.speed > 3))  # not at 10 km/h
-    assert said.startswith(
-        "The original vehicle brakes without an obstacle at 24 of 27 points, such as CCRs, speed 20, "
-    )
+    assert said.startswith(f"{BRAKES} at 24 of 27 points, such as CCRs, speed 20, ")
 
 
 @pytest.mark.parametrize(

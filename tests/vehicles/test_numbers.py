@@ -99,7 +99,7 @@ def test_sumo_is_told_what_carlas_vehicle_can_do() -> None:
     )
     assert result.accel[0] == pytest.approx(min(vehicle.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
     assert result.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
-    assert result.tau[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
+    assert result.actuator_lag[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
     assert result.mass[0] == 2404
 
 
@@ -161,7 +161,7 @@ def test_who_brakes_sumos_vehicle_does_not_go_on_speeding_up_until_the_lag_of_it
     """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the brake ends it at
     once.
     """
-    vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo", tau=0.5, brakeDelay=0.0)
+    vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo", actuatorLag=0.5, brakeDelay=0.0)
     state = vehicle.at_rest(p)
     for _ in range(40):
         state = vehicle.advance(p, state, Command(np.ones(1), np.zeros(1)))

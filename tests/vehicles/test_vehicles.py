@@ -139,7 +139,7 @@ ACTS = {
         "accel": (speed_at(3), +1),
         "decel": (stopping_distance(0.6), -1),
         "maxSpeed": (speed_at(60), +1),
-        "tau": (speed_at(1), -1),
+        "actuatorLag": (speed_at(1), -1),
         "brakeDelay": (stopping_distance(0.6), +1),
         "brakeGain": (stopping_distance(0.6), -1),
     },
@@ -150,8 +150,8 @@ ACTS = {
         "payload": (stopping_distance(0.6), +1),
     },
 }
-SENSED = {"sumo": {"sensorRange", "reactionTime"}, "worn": {"sensorRange", "sensorLatency", "payloadCentre"}}
-"""Characteristics that act on the observation, or on the limits of single axles (test_worn.py)."""
+SENSED = {"sumo": {"sensorRange", "reactionTime", "tau"}, "worn": {"sensorRange", "sensorLatency", "payloadCentre"}}
+"""Characteristics that act on the observation, on the driver (test_ads.py), or on single axles (test_worn.py)."""
 
 
 @pytest.mark.parametrize(("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting])

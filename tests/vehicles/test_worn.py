@@ -82,7 +82,7 @@ def test_sumo_is_told_what_the_worn_car_can_do() -> None:
     dry, icy = CAR.sumo_type(prepared(1.0)), CAR.sumo_type(prepared(0.1))
     assert dry.accel[0] == pytest.approx(3900 / (1500 + 75))
     assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.09 * GRAVITY, 0.09 * GRAVITY))
-    assert dry.tau[0] == pytest.approx(0.1 + 0.05)
+    assert dry.actuator_lag[0] == pytest.approx(0.1 + 0.05)
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def _represent_sumo(vehicle: SumoVehicle, values: Characteristics, original: Map
         front_brake_share=bmw.T_sb,
         front_drive_share=bmw.T_se,
         brake_delay=values["brakeDelay"],
-        brake_lag=values["tau"],
+        brake_lag=values["actuatorLag"],
         drive_ratio=values["accel"] / original["accel"],
         **_brakes_for(vehicle.reference_mass * values["decel"] * values["brakeGain"], original["mass"]),
     )

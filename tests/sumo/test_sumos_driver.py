@@ -1,0 +1,217 @@
+"""SUMO's driver, under a controller written for TraCI and as the ADS `krauss`, beside bare SUMO."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.network import CopiedNetwork
+from safevar_sumo.sumo.system import System, assemble
+from tests.sumo.test_traci_controller import changed, system
+
+CONTROLLERS = """
+def at(traci, time):
+    return abs(traci.simulation.getTime() - time) < 1e-6
+
+def idle(traci, v):
+    pass
+
+def too_fast(traci, v):
+    traci.vehicle.setSpeed(v, 30.0)
+
+def blind(traci, v):
+    traci.vehicle.setSpeedMode(v, 0)
+    traci.vehicle.setSpeed(v, min(8.0, 1.5 * traci.simulation.getTime()))
+
+def slows(traci, v):
+    if at(traci, 5.0):
+        traci.vehicle.slowDown(v, 3.0, 1.234)
+    if at(traci, 9.0):
+        traci.vehicle.setSpeed(v, -1)
+
+def accelerates(traci, v):
+    if at(traci, 2.0):
+        traci.vehicle.setAcceleration(v, -1.0, 1.5)
+    if at(traci, 6.0):
+        traci.vehicle.setAcceleration(v, 1.2, 2.0)
+
+def careful(traci, v):
+    traci.vehicle.setTau(v, 2.0)
+    traci.vehicle.setMinGap(v, 5.0)
+    assert traci.vehicle.getTau(v) == 2.0 and traci.vehicle.getSpeedMode(v) == 31
+
+def weak(traci, v):
+    traci.vehicle.setMaxSpeed(v, 9.0)
+    traci.vehicle.setAccel(v, 1.5)
+    traci.vehicle.setDecel(v, 3.0)
+
+def slow(traci, v):
+    traci.vehicle.setSpeedFactor(v, 0.5)
+    traci.vehicle.setImperfection(v, 0)
+    traci.vehicle.setLaneChangeMode(v, 0)
+
+def returns_late(traci, v):
+    is_late = traci.simulation.getTime() > 6.6
+    traci.vehicle.setEmergencyDecel(v, 6.0)
+    traci.vehicle.setSpeedMode(v, 31 if is_late else 30)
+    traci.vehicle.setSpeed(v, -1 if is_late else 13.0)
+
+def obeys_late(traci, v):
+    traci.vehicle.setSpeedMode(v, 31 if traci.simulation.getTime() > 6.6 else 30)
+    traci.vehicle.setSpeed(v, 13.0)
+
+def follows(traci, v):
+    leader, speed = traci.vehicle.getLeader(v, 100), traci.vehicle.getSpeed(v)
+    traci.vehicle.setSpeedMode(v, 0)
+    if leader and leader[1] < 2 + speed**2 / 6:
+        traci.vehicle.slowDown(v, 0, max(speed / 3, 0.1))
+    else:
+        traci.vehicle.setSpeed(v, min(12, speed + 0.2))
+"""
+NAMES = re.findall(r"def (\w+)\(traci, v\)", CONTROLLERS)
+NET = NETWORKS / "lead_vehicle_stopped"
+NO_DELAY = {name: {"original": 1e-9, "lower": 1e-9} for name in ("actuatorLag", "reactionTime", "brakeDelay")}
+"""Characteristics of a vehicle without delays; with the grip of `NO_DELAYS` it brakes as hard as anybody asks."""
+NO_DELAYS = {"characteristics": NO_DELAY, "parameters": {"tyre_friction": 3.0}}
+
+
+def bare_sumo(traffic: Path, step: Callable[[Any, str], None], n: int = 161) -> np.ndarray:
+    """Speed and gap at n samples, where SUMO alone drives."""
+    rows = []
+    with open_world(CopiedNetwork(NET / "network.net.xml", traffic, NET / "scenario.sumocfg"), 0) as world:
+        for _ in range(n):
+            world.api.simulationStep()
+            rows.append((world.api.vehicle.getSpeed("vut"), 80.3 - world.api.vehicle.getPosition("vut")[0]))
+            step(world.api, "vut")
+    return np.array(rows)
+
+
+def refuse_difference(runs: System, traffic: Path, step: Callable[[Any, str], None]) -> None:
+    """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its end."""
+    trace = simulate(runs, changed(runs)).trace
+    n, bare = np.count_nonzero(trace.active), bare_sumo(traffic, step)
+    assert n > 70
+    assert trace.speed[:n, 0] == pytest.approx(bare[:n, 0], abs=1e-6)
+    assert trace.gap[n - 1, 0] == pytest.approx(bare[n - 1, 1], abs=0.1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_vehicle_without_delays_drives_as_in_bare_sumo(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space: dict[str, Any] = {}
+    exec(CONTROLLERS, space)
+    runs = system(name, tmp_path, monkeypatch, CONTROLLERS, vehicle=NO_DELAYS)
+    refuse_difference(runs, NET / "traffic.rou.xml", space[name])
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        'decel="3" emergencyDecel="5" minGap="1" sigma="0"',
+        'speedFactor="0.7" actionStepLength="0.5" sigma="0"',
+        'carFollowModel="ACC"',
+        'carFollowModel="CACC"',
+    ],
+)
+def test_sumos_driver_has_the_attributes_of_the_traffic_file(
+    attributes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All but tau, which the study varies: without delays it drives as in bare SUMO."""
+    network = tmp_path / "net"
+    shutil.copytree(NET, network)
+    traffic = network / "traffic.rou.xml"
+    old, new = 'speedDev="0" sigma="0" color="0,0.45,0.7"', f'speedDev="0" mass="900" tau="0.3" {attributes}'
+    traffic.write_text(traffic.read_text().replace(old, new))
+    runs = system(
+        "idle",
+        tmp_path,
+        monkeypatch,
+        CONTROLLERS,
+        vehicle=NO_DELAYS,
+        scenario={"parameters": {"network": str(network)}},
+    )
+    unused = f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
+    assert any(remark.startswith(unused) for remark in runs.remarks)
+    traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
+    refuse_difference(runs, traffic, lambda *_: None)
+
+
+def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = system("idle", tmp_path, monkeypatch, CONTROLLERS)
+    run = simulate(runs, changed(runs))
+    assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
+    assert run.trace.gap[run.trace.active][-1] < 2  # of the 2.5 m that he wants
+    assert any("knows neither the delays of the vehicle" in remark for remark in runs.remarks)
+    close, far = (simulate(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
+    assert close > far + 1  # m/s: the study's headway is his
+
+
+def braking(run: SimulationRuns) -> np.ndarray:
+    """The decelerations of a run, of at least 0.1 m/s^2."""
+    deceleration = -np.diff(run.trace.speed[:, 0]) / run.trace.step
+    return deceleration[deceleration > 0.1]
+
+
+def native(**characteristics: object) -> tuple[System, SimulationRuns]:
+    runs = assemble(load_study("native", vehicle={**NO_DELAYS, "characteristics": characteristics}))
+    return runs, simulate(runs, changed(runs))
+
+
+def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_does(tmp_path: Path) -> None:
+    """Without delays; `braking_share` 0.6 of 9 m/s^2 is SUMO's decel of 5.4 m/s^2."""
+    bare_hardest = []
+    for tau in (0.5, 1.0, 1.5, 2.0):
+        text = (NET / "traffic.rou.xml").read_text().replace('vut" vClass', f'vut" tau="{tau}" decel="5.4" vClass')
+        (tmp_path / "traffic.rou.xml").write_text(text)
+        bare = bare_sumo(tmp_path / "traffic.rou.xml", lambda *_: None)
+        bare_hardest.append(-np.diff(bare[:, 0]).min() / 0.1)
+        _, run = native(**NO_DELAY, tau={"original": tau})
+        assert run.trace.gap[run.trace.active][-1] == pytest.approx(bare[-1, 1], abs=0.1)
+        assert braking(run).max() == pytest.approx(bare_hardest[-1], rel=0.2)
+    assert np.all(np.diff(bare_hardest) < 0)
+
+
+def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> None:
+    runs = assemble(load_study("native"))
+    by_tau = [braking(simulate(runs, changed(runs, tau=tau))) for tau in (0.5, 1.0, 1.5, 2.0)]
+    assert np.all(np.diff([one.max() for one in by_tau]) < -0.5)
+    assert np.all(np.diff([one.mean() for one in by_tau]) < -0.3)
+    lags = np.concatenate(
+        [changed(runs, actuatorLag=lag, sensorRange=20, reactionTime=0.5) for lag in (0.1, 0.2, 0.4, 0.6)]
+    )
+    assert np.all(np.diff(simulate(runs, lags).collision_speed) > 0.3)
+
+
+def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
+    def remarks(model: str, **parameters: float) -> list[str]:
+        return assemble(load_study("native", ads={"model": model, "parameters": parameters})).remarks
+
+    runs = assemble(load_study("native", ads={"model": "idm"}))
+    fast, slow = (simulate(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
+    assert fast > slow + 1
+    assert remarks("idm") == remarks("krauss") == []
+    assert any("tau has no effect" in remark for remark in remarks("acc"))
+    assert remarks("krauss", reaction_time=2.0) == [
+        "ads.parameters.reaction_time has no effect: the vehicle's tau takes its place"
+    ]
+
+
+@pytest.mark.parametrize("of_older_studies", [{"tau": {"original": 0.2, "lower": 0.1, "upper": 0.6}}])
+def test_a_tau_that_is_a_lag_is_refused_and_the_new_key_is_named(of_older_studies: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"tau.original = 0.2: tau is the headway(.|\n)*characteristics.actuatorLag"):
+        assemble(load_study("native", vehicle={"characteristics": of_older_studies}))
