@@ -145,7 +145,8 @@ def test_every_characteristic_acts_or_is_outside(name: str) -> None:
         prepared = vehicle.prepare(
             {**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True
         )
-        flat = [*prepared.plant, prepared.engine_mass, *(vehicle.sensors(prepared) or ())]
+        tau = vehicle.sumo_type(prepared).tau
+        flat = [*prepared.plant, prepared.engine_mass, *(vehicle.sensors(prepared) or ()), 0 if tau is None else tau]
         return [float(value) for part in flat for value in np.ravel(part)]
 
     for member in system.characteristics:

@@ -51,7 +51,11 @@ inputs.step = "interval"
 inputs.initial_speed = "start_speed"
 outputs = { speed = "v", throttle = "throttle_now", brake = "brake_now" }
 sensors = { latency = "reactionTime", range = "sensorRange" }
-sumo_type = { mass = "mass", accel = "most_accel", decel = "most_decel", max_speed = "maxSpeed", actuator_lag = "actuatorLag" }
+sumo_type.mass = "mass"
+sumo_type.accel = "most_accel"
+sumo_type.decel = "most_decel"
+sumo_type.max_speed = "maxSpeed"
+sumo_type.actuator_lag = "actuatorLag"
 [vehicle.characteristics]
 """
 

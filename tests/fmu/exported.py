@@ -65,7 +65,7 @@ class ExportedVehicle(Fmi2Slave):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        for name in ("mass", "accel", "decel", "maxSpeed", "tau", "actuatorLag", "brakeDelay", "brakeGain", "interval", "friction"):
+        for name in (*PARAMETERS, "interval", "friction"):
             setattr(self, name, 1.0)
             self.register_variable(Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
         for name in ("accelerator", "brake_pedal", "start_speed"):
