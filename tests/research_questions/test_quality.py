@@ -236,10 +236,10 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("question", "keys"),
     [
-        ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original"),
+        ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original enough_runs"),
         (
             "rq2",
-            "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm evaluations "
+            "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm enough_runs evaluations "
             "baseline_evaluations",
         ),
         ("rq3.2", "setting characteristic j percent"),

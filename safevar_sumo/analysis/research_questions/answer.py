@@ -6,7 +6,6 @@ In the frames, the columns `setting` and `other` hold the names of cases.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -76,26 +75,12 @@ def answer_questions(cases: Sequence[Case], question: str | None = None, algorit
             else:
                 frames.append(frame)
                 compared = {*frame["setting"], *frame["other"]} if name == WEATHER else {case.name for case in group}
-                first = str(frame["algorithm"].iloc[0]) if name == "rq2" else ""
-                case_notes += [note for case in group if case.name in compared for note in _notes(name, case, first)]
+                case_notes += [note for case in group if case.name in compared for note in _notes(name, case, frame)]
         table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
         answers.append(TableAnswer(name, table, tuple(dict.fromkeys([*notes, *case_notes])), cases))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
     return answers
-
-
-def algorithms_with_few_runs(case: Case, first: str = "") -> list[str]:
-    """The algorithms of RQ1, or the baselines of RQ2's `first` algorithm, with too few runs for a significant test.
-
-    Imported solutions, whose runs are unknown, have none.
-    """
-    if not case.has_runs:
-        return []
-    runs = Counter(algorithm for algorithm, _ in case.finished_runs)
-    # RQ2 compares a baseline's runs with the first algorithm's: the smaller number counts.
-    run_count, fewest = (runs.pop(first, 0), FEWEST_RUNS["RQ2"]) if first else (math.inf, FEWEST_RUNS["RQ1"])
-    return [name for name in case.algorithms if name in runs and min(runs[name], run_count) < fewest]
 
 
 def describe_evaluations(case: Case) -> str:
@@ -110,14 +95,15 @@ def describe_evaluations(case: Case) -> str:
     return f"settings that a run simulates, mean: {'; '.join(texts)}."
 
 
-def _notes(question: str, case: Case, first: str) -> Iterator[str]:
-    """Notes on a case for the readers of a table; `first` is the algorithm that RQ2 compares with the others."""
+def _notes(question: str, case: Case, frame: pd.DataFrame) -> Iterator[str]:
+    """Notes on a case for the readers of its frame."""
     yield from case.remarks
     prefix, rq = f"{case.name}: ", question.split("-")[0].upper()
     if question in ("rq1", "rq2"):
-        if few := [case.title_of(algorithm) for algorithm in algorithms_with_few_runs(case, first)]:
+        few = frame.loc[~frame["enough_runs"], "algorithm" if question == "rq1" else "baseline"].unique()
+        if names := ", ".join(map(case.title_of, few)):
             yield (
-                f"{prefix}too few runs of {', '.join(few)} for a test ({FEWEST_RUNS[rq]} are needed): "
+                f"{prefix}too few runs of {names} for a test ({FEWEST_RUNS[rq]} are needed): "
                 "no p-value of pooled solutions stands out."
             )
         for metric in case.scoring.metrics:
@@ -136,15 +122,14 @@ def _notes(question: str, case: Case, first: str) -> Iterator[str]:
         elif question == "rq2" and len(case.evaluations):
             yield prefix + describe_evaluations(case)
     if question in ("rq1-runs", "rq2-runs"):
-        tests = comparisons.compare_over_runs(case).dropna(subset="effect_size")
-        tests = tests[tests.index == rq]
-        if few_count := len(tests) - tests["enough"].sum():
+        tests = frame.dropna(subset="effect_size")
+        if few_count := len(tests) - tests["enough_runs"].sum():
             how_many = "all" if few_count == len(tests) else f"{few_count} of the"
             yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({FEWEST_RUNS[rq]} are needed)."
     if question.startswith("rq3") or question in ("combinations", WEATHER):
         critical_count, solution_count = len(changes.critical_solutions(case)), len(case.solutions_of(NSGA2))
         yield f"{prefix}{critical_count} of {case.title_of(NSGA2)}'s {solution_count} solutions are critical."
-    if question == "combinations" and changes.frequent_combinations(case).empty:
+    if question == "combinations" and frame.empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."
     if question == "rq3.3":
         units = (f"{item.name} {item.unit}" for item in case.characteristics if item.unit != "-")

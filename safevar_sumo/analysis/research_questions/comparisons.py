@@ -4,13 +4,14 @@ The paper pools the solutions of all runs and compares them with a second sample
 once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
 small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests.
 
-In the frames, the column `setting` holds the case's name, and `method` the name of the test; undefined values are NaN.
-Functions of a case raise `UnanswerableError` if no run is finished, if an algorithm that they compare is missing, and
-over runs if the solutions belong to no run.
+In the frames, the column `setting` holds the case's name, `method` the name of the test, and `enough_runs` whether a
+test with so many runs can be significant; undefined values are NaN. Functions of a case raise `UnanswerableError` if no
+run is finished, if an algorithm that they compare is missing, and over runs if the solutions belong to no run.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from itertools import product
 
@@ -36,12 +37,11 @@ from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import JsonObject
 
 TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
-RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original"]
-RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS]
+RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original", "enough_runs"]
+RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS, "algorithm", "enough_runs"]
 RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
-RQ1_RUNS_COLUMNS += ["mean", "original"]
-RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS]
-EVALUATION_COLUMNS = ["algorithm", "evaluations", "baseline_evaluations"]
+RQ1_RUNS_COLUMNS += ["mean", "original", "enough_runs"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS, "algorithm", "enough_runs"]
 
 MORE_UNSAFE = "below 0.5: the runs are more unsafe than the original vehicle"
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
@@ -71,8 +71,8 @@ def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
     if case.has_runs and len(case.evaluations):
         simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
     sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
-    frame = frame.assign(**{name: frame[side].map(simulated).astype(float) for name, side in sides.items()})
-    return frame[[*RQ2_COLUMNS, *EVALUATION_COLUMNS]]
+    evaluations = {name: frame[side].map(simulated).astype(float) for name, side in sides.items()}
+    return frame[RQ2_COLUMNS].assign(**evaluations)
 
 
 def rq1_runs(case: Case) -> pd.DataFrame:
@@ -94,19 +94,16 @@ def rq2_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
     """
     tests = compare_over_runs(case, algorithm)
     opponents_of(case, algorithm)  # raises if RQ2 has no answer
-    return tests[tests.index == "RQ2"][[*RQ2_RUNS_COLUMNS, "algorithm"]]
+    return tests[tests.index == "RQ2"][RQ2_RUNS_COLUMNS]
 
 
 def compare_over_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
-    """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2.
-
-    `enough` is whether the test has enough runs to be significant.
-    """
+    """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2."""
     rows = {"RQ1": _test_original(case, over_runs=True)}
     if len(case.algorithms) > 1:
         rows["RQ2"] = _test_opponents(case, algorithm, over_runs=True)
     tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough=tests["runs"] >= tests.index.map(FEWEST_RUNS))
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]))
 
 
 def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
@@ -140,8 +137,10 @@ def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
             test = compare_samples(values, np.full(0 if np.isnan(original) else len(values), original))
         if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
             test = test.reversed()
-        row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": test.n1}
-        rows.append({**row, **test._asdict(), "mean": values.mean(), "original": original})
+        runs = test.n1 if over_runs else _finished_runs(case, algorithm)
+        row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": runs}
+        row |= {"mean": values.mean(), "original": original, "enough_runs": runs >= FEWEST_RUNS["RQ1"]}
+        rows.append({**row, **test._asdict()})
     return rows
 
 
@@ -152,9 +151,15 @@ def _test_opponents(case: Case, algorithm: str, *, over_runs: bool = False) -> l
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
         if not more_is_better:  # so that above 0.5 the first algorithm is better
             test = test.reversed()
+        runs = min((test.n1, test.n2) if over_runs else (_finished_runs(case, name) for name in (first, baseline)))
         row = {"setting": case.name, "algorithm": first, "baseline": baseline, "metric": metric}
-        rows.append({**row, **test._asdict(), "runs": min(test.n1, test.n2)})
+        rows.append({**row, **test._asdict(), "runs": runs, "enough_runs": runs >= FEWEST_RUNS["RQ2"]})
     return rows
+
+
+def _finished_runs(case: Case, algorithm: str) -> float:
+    """The number of an algorithm's finished runs; without limit for imported solutions, whose runs are unknown."""
+    return sum(name == algorithm for name, _ in case.finished_runs) if case.has_runs else math.inf
 
 
 def _directions(case: Case) -> dict[str, bool]:
@@ -210,7 +215,7 @@ def summary_lines(case: Case) -> list[str]:
                 marks = np.where(group["p_holm"] < ALPHA, "*", "")
                 effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
                 line = f"  A12 of {heading.format(name)}: {', '.join(effects)}"
-                if untestable := ", ".join(group.loc[~group["enough"] & group["effect_size"].notna(), "metric"]):
+                if untestable := ", ".join(group.loc[~group["enough_runs"] & group["effect_size"].notna(), "metric"]):
                     line += f"; too few runs for a test ({FEWEST_RUNS[question]} are needed): {untestable}"
                 lines.append(line)
     except UnanswerableError as error:

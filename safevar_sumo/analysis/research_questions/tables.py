@@ -8,12 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.answer import (
-    EVALUATIONS,
-    SAFETY_TABLE,
-    TableAnswer,
-    algorithms_with_few_runs,
-)
+from safevar_sumo.analysis.research_questions.answer import EVALUATIONS, SAFETY_TABLE, TableAnswer
 from safevar_sumo.analysis.research_questions.changes import WEATHER_VALUES
 from safevar_sumo.analysis.research_questions.comparisons import titles_of
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, NOTABLE_MAGNITUDES
@@ -218,28 +213,23 @@ def _readable_frame(answer: TableAnswer) -> pd.DataFrame:
     columns_of_names = frame.columns.intersection(["algorithm", "baseline", "metric", "quantity"])
     names = {column: frame[column].replace(titles) for column in columns_of_names}
     cells = frame.assign(**texts, **names)
-    return _mark_tests(cells, answer) if "p_value" in frame else cells
+    return _mark_tests(cells, frame) if "p_value" in frame else cells
 
 
-def _mark_tests(cells: pd.DataFrame, answer: TableAnswer) -> pd.DataFrame:
+def _mark_tests(cells: pd.DataFrame, frame: pd.DataFrame) -> pd.DataFrame:
     """Make significant p-values and their effect sizes bold.
 
-    Where p-values have Holm's correction, the corrected ones count. Without it (RQ1 and RQ2 over pooled solutions), the
-    algorithm needs enough runs, and effect sizes also have to be notable.
+    Where p-values have Holm's correction, the corrected ones count. Without it (RQ1 and RQ2 over pooled solutions), a
+    test needs enough runs, and effect sizes also have to be notable.
     """
-    frame = answer.frame
     if "p_holm" in frame:
         p_column, is_significant = "p_holm", frame["p_holm"] < ALPHA
         is_bold_effect = is_significant
     else:
-        algorithm, first = ("algorithm", "") if answer.name == "rq1" else ("baseline", str(frame["algorithm"].iloc[0]))
-        few_runs = [(case.name, name) for case in answer.cases for name in algorithms_with_few_runs(case, first)]
-        has_few_runs = np.array([pair in few_runs for pair in zip(frame["setting"], frame[algorithm], strict=True)])
-        p_column, is_significant = "p_value", (frame["p_value"] < ALPHA) & ~has_few_runs
+        p_column, is_significant = "p_value", (frame["p_value"] < ALPHA) & frame["enough_runs"]
         is_bold_effect = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
     for column, is_bold in ((p_column, is_significant), ("effect_size", is_bold_effect)):
-        if column in cells:
-            cells[column] = cells[column].where(~is_bold, cells[column].map(BoldText))
+        cells[column] = cells[column].where(~is_bold, cells[column].map(BoldText))
     return cells
 
 
