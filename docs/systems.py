@@ -37,9 +37,9 @@ def repair_of(study: sv.Study) -> tuple[str, str, str]:
     answer = sv.repair(study, promise=PROMISE)
     if not answer.repairs:
         return ("none is needed" if answer.proof_of_today else "none"), "-", "-"
-    first, needless = answer.to_frame().iloc[0], answer.repairs[0].price.needless
-    scenes = f"{needless[2]} -> {needless[1]} of {needless[0]}" if needless else "unknown"
-    return first["parameters"], f"{first['metres_earlier_worst']:.2f} m", scenes
+    first = answer.repairs[0]
+    scenes = f"{first.price.needless_braking_today} -> {first.price.needless_braking} of {first.price.benign_scenes}"
+    return answer.changes_in_words(first), f"{first.price.metres_earlier:.2f} m", scenes
 
 
 def main() -> None:

@@ -196,16 +196,9 @@ def risk(
     RepairOptions,
     "STUDY|RESULTS",
     file_option("--out", "Write a study file with the first repair there, which extends STUDY.", metavar="FILE.toml"),
-    file_option("--plot", "Draw the curve to this file: png, pdf or svg."),
 )
 def repair(
-    source: str,
-    point: str | None,
-    jobs: int | None,
-    as_json: bool,
-    out: Path | None,
-    plot: Path | None,
-    **values: OptionValue,
+    source: str, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: OptionValue
 ) -> JsonAnswer:
     """Find the smallest change of the driving system of STUDY that survives the promised wear, and what it costs."""
     from safevar_sumo.analysis.repair.answer import write_repair
@@ -213,11 +206,8 @@ def repair(
 
     options, subject = RepairOptions(**values), load_results_or_study(source, point)
     check_study_output(out, "--out", [study_in(subject)])
-    check_output(plot, "--plot")
-    if plot is not None and options.curve is None:
-        raise InputError("--plot", "there is no curve to draw", "--plot with --curve")
     result = answer_question(find_repairs, subject, options, jobs=jobs)
-    answer = _show(result, as_json, plot)
+    answer = _show(result, as_json)
     if out is not None and result.repairs:
         write_repair(out, result)
         click.echo(f"The study with it: {out}", err=as_json)

@@ -40,11 +40,6 @@ class RepairOptions(Options):
         metavar="PARAMETER",
         form="repeated",
     )
-    curve: str | None = option(
-        None,
-        "Also compute how much earlier the driving system has to brake for ten promises of this characteristic.",
-        metavar="NAME",
-    )
 
 
 @document_options(RepairOptions)
@@ -54,7 +49,6 @@ def repair(
     promise: Sequence[str] = RepairOptions.promise,
     margin: float | None = RepairOptions.margin,
     change: Sequence[str] = RepairOptions.change,
-    curve: str | None = RepairOptions.curve,
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,
