@@ -18,6 +18,7 @@ from safevar_sumo.analysis.case import load_cases
 from safevar_sumo.analysis.research_questions.answer import QUESTION_NAMES, answer_questions
 from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
 from safevar_sumo.analysis.research_questions.formats import ENDINGS, FORMATS
+from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
     as_it_is_now,
     as_it_is_now_option,
@@ -112,10 +113,19 @@ def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
 )
 @click.option("--paper", is_flag=True, help="With the research questions of the paper, as tables and figures.")
 @point_option
+@click.option(
+    "--margin", type=click.FloatRange(0, 100), metavar="M", help=ToleranceOptions.definitions()["margin"].help
+)
 @as_it_is_now_option
 @jobs_option
 def report(
-    directories: tuple[str, ...], out: Path, only: str | None, paper: bool, point: str | None, jobs: int | None
+    directories: tuple[str, ...],
+    out: Path,
+    only: str | None,
+    paper: bool,
+    point: str | None,
+    margin: float | None,
+    jobs: int | None,
 ) -> None:
     """Write one self-contained page about the results directories DIR...: first what to hand over, then the details."""
     from safevar_sumo.report import report as make_report
@@ -130,6 +140,7 @@ def report(
             only=sections,
             paper=paper,
             point=point,
+            margin=margin,
             jobs=jobs,
             progress=True,
             as_it_is_now=as_it_is_now(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -40,16 +40,16 @@ EXPLAIN_SIMULATIONS = 30_000
 """Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
 
 
-def page_options() -> JsonObject:
-    """Each question's options on the page: smaller samples than the commands take."""
+def page_options(margin: float | None = None) -> Mapping[str, Options]:
+    """Each question's options on the page: smaller samples than the commands take; `margin` as in `tolerance`."""
     all_options: tuple[Options, ...] = (
         ExplainOptions(limit=EXPLAIN_SIMULATIONS),
         OpinionOptions(),
-        ToleranceOptions(),
+        ToleranceOptions(margin=margin),
         RiskOptions(samples=SAMPLED_VEHICLES),
         RulesOptions(samples=SAMPLED_VEHICLES),
         CompareOptions(),
-        RepairOptions(),
+        RepairOptions(margin=margin),
     )
     return {options.question: options for options in all_options}
 

@@ -21,6 +21,7 @@ from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.compute import explain_failures
+from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair.compute import find_repairs
@@ -121,9 +122,11 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
     }
 
 
-def commands_to_reproduce(inputs: Sequence[ReportInput], sections: Collection[str]) -> list[tuple[str, str]]:
+def commands_to_reproduce(
+    inputs: Sequence[ReportInput], sections: Collection[str], options: Mapping[str, Options]
+) -> list[tuple[str, str]]:
     """The commands that give the numbers of the page, each after what it reproduces."""
-    commands, options = [], page_options()
+    commands = []
     for data in inputs:
         directory, flag = str(data.directory), " --as-it-is-now" if data.later_changes else ""
         if data.case.has_runs:
@@ -178,6 +181,7 @@ def report(
     only: Sequence[str] = (),
     paper: bool = False,
     point: str | None = None,
+    margin: float | None = None,
     jobs: int | None = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
@@ -197,6 +201,8 @@ def report(
         With the research questions, as tables and figures.
     point
         Name of the only point of the study's matrix that the page is about; research questions need whole studies.
+    margin
+        Distance to keep [m] of tolerances and repairs; by default the model's error that a study states, else 0.3 m.
     jobs
         Worker processes for simulations, by default one for each core.
     progress
@@ -228,7 +234,7 @@ def report(
         for change in data.later_changes:
             warn(f"{data.directory}: {change}")
     with open_progress(progress) as show_progress:
-        page = _make_page(inputs, only, jobs, show_progress, paper=paper)
+        page = _make_page(inputs, only, page_options(margin), jobs, show_progress, paper=paper)
     if out is not None:
         write_whole(Path(out), page)
     return page
@@ -261,7 +267,13 @@ def make_report(
 
 
 def _make_page(
-    inputs: Sequence[ReportInput], only: Sequence[str], jobs: int | None, progress: Progress, *, paper: bool
+    inputs: Sequence[ReportInput],
+    only: Sequence[str],
+    options: Mapping[str, Options],
+    jobs: int | None,
+    progress: Progress,
+    *,
+    paper: bool,
 ) -> str:
     names = ", ".join(data.case.name for data in inputs)
     are_rated = [is_rated(data.case.study) and not data.point for data in inputs]
@@ -278,7 +290,7 @@ def _make_page(
     }
     chosen = only or [name for name in SECTIONS if is_possible.get(name, True)]
     sections = {name: heading for name, heading in SECTIONS.items() if name in chosen}
-    studies = [_study_data(data, sections, jobs, progress) for data in inputs]
+    studies = [_study_data(data, sections, options, jobs, progress) for data in inputs]
     progress("tables and figures", 0, 1)
     cases = [data.case for data in inputs] if "questions" in sections else []
     return _render(
@@ -286,19 +298,20 @@ def _make_page(
         title=f"Safety report: {names}",
         sections=sections,
         studies=studies,
-        comparison=_comparison_data(inputs, jobs, progress) if "compare" in sections else {},
+        comparison=_comparison_data(inputs, options["compare"], jobs, progress) if "compare" in sections else {},
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
-        commands=commands_to_reproduce(inputs, sections) if "reproduce" in sections else [],
+        commands=commands_to_reproduce(inputs, sections, options) if "reproduce" in sections else [],
         general_limits=GENERAL_LIMITS,
         player=player_files(),
         js=_web_file("report.js"),
     )
 
 
-def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, progress: Progress) -> JsonObject:
+def _study_data(
+    data: ReportInput, sections: Collection[str], options: Mapping[str, Options], jobs: int | None, progress: Progress
+) -> JsonObject:
     """Make the data of one study that the templates of these sections need."""
-    options = page_options()
     explained: Explained | None = None
     if ("verdict" in sections or "causes" in sections) and len(data.case.solutions):
         explain = partial(explain_failures, statistics="causes" in sections)
@@ -349,10 +362,12 @@ def _study_data(data: ReportInput, sections: Collection[str], jobs: int | None, 
     }
 
 
-def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: Progress) -> JsonObject:
+def _comparison_data(
+    inputs: Sequence[ReportInput], options: Options, jobs: int | None, progress: Progress
+) -> JsonObject:
     """The page's data about two studies side by side, or the reason why they cannot be compared."""
     first, second = (data.case for data in inputs)
-    compare, options = partial(compare_systems, other=second), page_options()["compare"]
+    compare = partial(compare_systems, other=second)
     try:
         result = answer_question(compare, first, options, jobs=jobs, progress=progress)
     except InputError as error:

@@ -215,7 +215,7 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     one: Any = SimpleNamespace(
         directory=Path("its results"), point="", later_changes=(), case=SimpleNamespace(study=study, has_runs=True)
     )
-    python, option, script = shlex.split(commands_to_reproduce([one], ["questions"])[0][1])
+    python, option, script = shlex.split(commands_to_reproduce([one], ["questions"], {})[0][1])
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
     monkeypatch.setattr(safevar_sumo, "load", lambda place: SimpleNamespace(study=(place, study)))
@@ -223,6 +223,9 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     exec(script, {})
     assert asked["study"] == ("its results", study)
     assert asked["out"] == "its results-again"
+    _, *others, _ = commands_to_reproduce([one], ["tolerance", "repair"], report_input.page_options(0.5))
+    questions = [f"python -m safevar_sumo {name} 'its results' --margin 0.5" for name in ("tolerance", "repair")]
+    assert [command for _, command in others] == questions
 
 
 @pytest.mark.slow

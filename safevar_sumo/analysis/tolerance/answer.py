@@ -44,8 +44,6 @@ class Tolerance:
 
     Attributes
     ----------
-    contact
-        The safety degree at which bodies touch [m], as in `Unsafe`.
     original
         The evaluation of the original vehicle.
     alone
@@ -63,7 +61,6 @@ class Tolerance:
 
     study: Study
     unsafe: Unsafe
-    contact: float
     original: Evaluations
     alone: list[OneAtATimeScan]
     together: JointLimits | None
@@ -156,7 +153,7 @@ class Tolerance:
         yield from self.sheet.parts()
         if not is_rated(self.study):
             yield self._box_in_words()
-        yield _scan_table(self.alone, self.contact)
+        yield _scan_table(self.alone, self.unsafe.contact)
         yield "* the end of the domain: values beyond it were not simulated."
         yield meanings(scan.characteristic for scan in self.alone)
         yield from _across_fits_in_words(self.alone)

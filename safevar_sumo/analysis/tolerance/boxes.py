@@ -41,12 +41,14 @@ def sobol_and_corners(
 
 
 def corners_of(evaluator: Evaluator, columns: Sequence[int], ends: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Settings at all corners of a box; at `MAX_CORNERS` of them if it has more."""
-    size = len(columns)
-    points = np.indices((2,) * size, dtype=float).reshape(size, -1).T if 2**size <= MAX_CORNERS else None
-    if points is None:
-        points = np.round(sobol_points(MAX_CORNERS, size, evaluator.study.search.seed))
-    return settings_in_box(evaluator, columns, *ends, points)
+    """Settings at all corners of a box; at `MAX_CORNERS` random ones if it has more."""
+    size, rng = len(columns), np.random.default_rng(evaluator.study.search.seed)
+    numbers = np.arange(2**size) if 2**size <= MAX_CORNERS else rng.integers(2**size, size=MAX_CORNERS)
+    lower, upper = ends
+    settings = np.tile(evaluator.characteristics.original, (len(numbers), 1))
+    bits = numbers[:, np.newaxis] >> np.arange(size) & 1
+    settings[:, columns] = np.where(bits, upper[columns], lower[columns])
+    return settings
 
 
 def random_settings(

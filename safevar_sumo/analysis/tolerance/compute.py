@@ -40,8 +40,8 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
     study, system = evaluator.study, assemble(evaluator.study)
     columns = _columns_of(study, options.characteristics)
     limits = _limits_of(study, options, columns)
-    original, contact = evaluator.evaluate_original(), contact_degree(system)
-    unsafe = _criterion_of(source, options, evaluator, original, contact)
+    original = evaluator.evaluate_original()
+    unsafe = replace(_criterion_of(source, options, evaluator, original), contact=contact_degree(system))
     # A box of a rated study would take thousands of whole test matrices.
     needs_box = not unsafe.of(original)[0] and not is_rated(study)
     if needs_box:  # drawing a setting raises the error if hardly any is feasible, before the long scans
@@ -60,7 +60,6 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
     return Tolerance(
         study=study,
         unsafe=unsafe,
-        contact=contact,
         original=original,
         alone=scans,
         together=together,
@@ -72,13 +71,13 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, evaluator: 
 
 
 def _criterion_of(
-    source: Study | Case, options: ToleranceOptions, evaluator: Evaluator, original: Evaluations, contact: float
+    source: Study | Case, options: ToleranceOptions, evaluator: Evaluator, original: Evaluations
 ) -> Unsafe:
     """The criterion; a collision includes what keeps less than the margin, unless a collision itself is asked for."""
     unsafe = evaluator.choose_criterion(options.unsafe, source, original)
     if unsafe != Unsafe() or (options.unsafe is not None and options.margin is None):
         return unsafe
-    return replace(unsafe, keep=margin_of(evaluator.study, options.margin), contact=contact)
+    return replace(unsafe, keep=margin_of(evaluator.study, options.margin))
 
 
 def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int]:
