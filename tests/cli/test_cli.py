@@ -160,12 +160,12 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
         in result.stderr
     )
     assert "changed vehicle" not in simulate("rain").stdout
-    lead = simulate("native", "--set", "decel=4.7").stdout
-    assert "7.08 m from centre to centre (gap 2.38 m)." in lead
-    assert "SD 4.75 against 7.08, gap 0.05 against 2.38 m" in lead
-    hit, stop = json.loads(simulate("native", "--set", "decel=4.6..4.7:2", "--json").stdout)
+    hit, stop = json.loads(simulate("native", "--set", "decel=4.5..8:2", "--json").stdout)
     assert (hit["outcome"], hit["gap"]) == ("collision", 0), "the vehicle is 4.7 m long"
     assert (stop["outcome"], stop["gap"]) == ("stopped", pytest.approx(stop["safety_degree"] - 4.7))
+    lead, gap = simulate("native", "--set", "decel=8").stdout, stop["gap"]
+    assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): less safe" in lead
+    assert f"gap {gap:.2f} against " in lead
 
 
 def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
