@@ -6,7 +6,6 @@ from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.base import (
     REACTION_PARAMETERS as REACTION_PARAMETERS,
     Ads as Ads,
-    GuardedAds as GuardedAds,
     PerVehicleAds as PerVehicleAds,
     ScalarAds as ScalarAds,
 )

@@ -1,19 +1,19 @@
 """The contract of an automated driving system (ADS), and functions that driving systems share.
 
-An ADS may drive N vehicles at once, or one vehicle (`ScalarAds`). Checks guard an ADS that is user code.
+An ADS may drive N vehicles at once, or one vehicle (`ScalarAds`).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import repeat
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.plugins import SHARE, TRUTH, Guard, open_rows, read_only_copy
+from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
@@ -24,7 +24,7 @@ REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
 Memory = Any
-"""What an ADS remembers of N vehicles, of its own type."""
+"""What an ADS remembers of N vehicles: an object of its own class with named attributes."""
 
 
 class Ads:
@@ -42,16 +42,22 @@ class Ads:
         Largest number of vehicles at once; None if any number will do.
     tau_parameter
         The parameter in whose place an ADS that is SUMO's driver takes the headway `tau` of the setting; "" for others.
+    RETURNS
+        What the methods of a user's class must return.
     """
 
     __slots__ = ()
     recognition_delay = hesitation = 0.0
     tau_parameter = ""
     max_vehicles: int | None = None
+    RETURNS: ClassVar[Mapping[str, Returned]] = {
+        "drive": Returned(({"throttle": SHARE, "brake": SHARE}, {}), like=0),
+        "warns": Returned(({"": TRUTH},)),
+    }
 
     @abstractmethod
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        """Memory at the start of a run of `n` vehicles with `step` seconds between two calls of `drive`."""
+        """Create the memory of a run of `n` vehicles with `step` seconds between two calls of `drive`."""
 
     @abstractmethod
     def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
@@ -82,47 +88,22 @@ class ScalarAds(ABC):
         """Command throttle and brake, each in [0, 1], from an observation whose fields are numbers."""
 
 
-class GuardedAds(Ads):
-    """Guards an ADS that is user code: passes read-only copies to it, and checks its commands."""
-
-    def __init__(self, ads: Ads, guard: Guard) -> None:
-        self._ads, self._guard = ads, guard
-
-    def warns(self, memory: Memory) -> BoolArray | None:
-        warned = self._guard.call("warns", self._ads.warns, memory)
-        return (
-            None if warned is None else self._guard.numbers("warns", "warnings", warned, (self._vehicle_count,), TRUTH)
-        )
-
-    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        self._vehicle_count = n
-        return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
-
-    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
-        result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
-        command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
-        pedals = Command(*self._guard.elements("drive", command, "(Command(throttle, brake), memory)"))._asdict()
-        shape = seen.speed.shape
-        checked = (self._guard.numbers("drive", name, pedal, shape, SHARE) for name, pedal in pedals.items())
-        return Command(*checked), memory
-
-
 class PerVehicleAds(Ads):
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
-    def __init__(self, create: Callable[[], ScalarAds], guard: Guard) -> None:
-        self._create, self._guard = create, guard
+    def __init__(self, create: Callable[[], ScalarAds], code: UserCode) -> None:
+        self._create, self._code = create, code
 
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
-        drivers = [self._guard.call("__init__", self._create) for _ in range(n)]
+        drivers = [self._create() for _ in range(n)]
         for driver in drivers:
-            self._guard.call("start", driver.start, read_only_copy(nominal), step)
+            driver.start(nominal, step)
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
         observations, pedals = list(_scalar_observations(seen)), [(0.0, 0.0)] * len(memory)
         for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():  # vehicles whose run has not ended
-            pedals[i] = self._checked_pedals(self._guard.call("drive", memory[i].drive, observations[i]))
+            pedals[i] = self._checked_pedals(memory[i].drive(observations[i]))
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:
@@ -133,11 +114,11 @@ class PerVehicleAds(Ads):
             throttle, brake = command
             if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
                 return throttle, brake  # the fast path: this runs for every vehicle in every step
-        throttle, brake = self._guard.elements("drive", command, "(throttle, brake), each in [0, 1]")
-        return (
-            float(self._guard.numbers("drive", "throttle", throttle, (), SHARE)),
-            float(self._guard.numbers("drive", "brake", brake, (), SHARE)),
-        )
+        if not isinstance(command, tuple | list) or len(command) != 2:
+            raise self._code.wrong("drive", quoted(command), "(throttle, brake), each in [0, 1]")
+        pedals = zip(Command._fields, command, strict=True)
+        throttle, brake = (self._code.check_numbers("drive", name, value, (), SHARE) for name, value in pedals)
+        return float(throttle), float(brake)
 
 
 def _scalar_observations(seen: Observation) -> Iterator[Observation]:

@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.ads.base import Ads, Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError
 from safevar_sumo.fmu import Description, Fleet, History, Instances
-from safevar_sumo.plugins import SHARE, Guard
+from safevar_sumo.plugins import SHARE, UserCode
 from safevar_sumo.records import BoolArray, Command, Nominal, Observation
 from safevar_sumo.study.schema import Parameters
 
@@ -78,7 +78,7 @@ class FmuAds(Ads):
         The FMU.
     inputs, outputs, parameters, step
         Values of these keys in the study.
-    guard
+    code
         Calls the FMU and checks its results.
 
     Raises
@@ -94,10 +94,10 @@ class FmuAds(Ads):
         outputs: Mapping[str, str],
         parameters: Parameters,
         step: float | None,
-        guard: Guard,
+        code: UserCode,
     ) -> None:
-        source = guard.source
-        self._guard, self._communication_step = guard, description.communication_step(step, source, "ads")
+        source = code.source
+        self._code, self._communication_step = code, description.communication_step(step, source, "ads")
         quantities = {**OBSERVATION_UNITS, **CONSTANT_UNITS}
         input_ports = description.ports(inputs, quantities, ("input",), source, "ads.inputs", CONSTANT_UNITS)
         output_ports = description.ports(outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
@@ -118,19 +118,20 @@ class FmuAds(Ads):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **memory.constants}
-        history = memory.history or self._guard.call("initialisation", memory.fleet.start, values)[1]
-        outputs, _, history = self._guard.call("doStep", memory.fleet.advance, history, values)
+        history = memory.history or self._code.call("initialisation", memory.fleet.start, values)[1]
+        outputs, _, history = self._code.call("doStep", memory.fleet.advance, history, values)
         warns = None if "warns" not in outputs else outputs["warns"] > WARNING
         memory = memory._replace(history=history, warns=warns)
         shape = seen.speed.shape
         if "acceleration" in outputs:
-            acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], shape)
+            acceleration = self._code.check_numbers("doStep", "acceleration", outputs["acceleration"], shape)
             initial_trim = memory.trim or trim_at(memory.nominal, seen)
             command = pedals_for(memory.nominal, seen.speed, acceleration, initial_trim)
             return command, memory._replace(trim=initial_trim)
         released = np.zeros(shape)
         pedals = (
-            self._guard.numbers("doStep", name, outputs.get(name, released), shape, SHARE) for name in Command._fields
+            self._code.check_numbers("doStep", name, outputs.get(name, released), shape, SHARE)
+            for name in Command._fields
         )
         return Command(*pedals), memory
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import force_setattr
 
-from safevar_sumo.ads.base import Ads, GuardedAds, Memory, PerVehicleAds
+from safevar_sumo.ads.base import Ads, Memory, PerVehicleAds
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 from safevar_sumo.study.schema import FreeParameter
 
@@ -48,12 +48,9 @@ class VariedAds(Ads):
                 for driver, value in zip(drivers, column.tolist(), strict=True):
                     setattr(driver, name, value)
             return varied, drivers
-        model = varied
-        if isinstance(varied, GuardedAds):
-            model = varied._ads = copy.copy(varied._ads)
-        set_field = force_setattr if isinstance(model, msgspec.Struct) else object.__setattr__  # frozen ones, too
+        set_field = force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__  # frozen ones, too
         for name, column in zip(self._names, columns, strict=True):
-            set_field(model, name, column)
+            set_field(varied, name, column)
         return varied, varied.start(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:

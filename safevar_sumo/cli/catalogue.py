@@ -9,6 +9,7 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.cli.arguments import json_option
 from safevar_sumo.cli.program import commands, print_json
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
@@ -137,32 +138,26 @@ def _catalogue(
 
 @commands.command(name="check")
 @click.argument("subject", metavar="SUBJECT")
-@click.option(
-    "--study",
-    metavar="STUDY",
-    help="Study to try SUBJECT in.  [default: a study beside it that names it, else a shipped study]",
-)
 @json_option
-def check_command(subject: str, study: str | None, as_json: bool) -> int:
-    """Check whether your driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works with
-    this package.
+def check_command(subject: str, as_json: bool) -> int:
+    """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep the promises that
+    results rest on.
 
-    SUBJECT is package.module:Name, the name of a shipped model, or the name or path of a study to check everything that
-    it names. The exit code is 0 if SUBJECT passes, 1 with findings, 2 if it cannot be loaded.
+    SUBJECT is the name or path of a study, all of whose code is checked, or a driving system, by its name or
+    package.module:Name, which then drives in the study smoke. The exit code is 0 if SUBJECT passes, 1 with findings, 2
+    if it cannot be loaded.
     """
-    from safevar_sumo.plugins.check import check
+    from safevar_sumo.plugins.check import CHECKS, check
 
-    report = check(subject, study)
+    findings = check(subject)
     if as_json:
-        print_json(report.to_dict())
-        return 0 if report.passed else 1
+        rows = [finding._asdict() for finding in findings]
+        print_json({"subject": subject, "passed": not findings, "findings": rows})
+        return 1 if findings else 0
     console = Console()
-    for finding in report.findings:
+    for finding in findings:
         print_text(console, str(finding))
         print_text(console, f"  expected: {finding.expected}")
-        print_text(console, f"  advice: {finding.advice}")
-    if report.remark:
-        print_text(console, f"note: {report.remark}")
-    verdict = "passed" if report.passed else f"{len(report.findings)} finding{'s' * (len(report.findings) > 1)}"
-    print_text(console, f"{subject} ({report.kind}): {verdict}, {report.seconds:.1f} s")
-    return 0 if report.passed else 1
+        print_text(console, f"  advice: {CHECKS[finding.check]}")
+    print_text(console, f"{subject}: {number_of(len(findings), 'finding') if findings else 'passed'}")
+    return 1 if findings else 0

@@ -8,7 +8,7 @@ from safevar_sumo.metrics.base import (
     MetricFacts as MetricFacts,
     Objective as Objective,
     Scoring as Scoring,
-    guard_metric as guard_metric,
+    checked_metric as checked_metric,
 )
 from safevar_sumo.metrics.measures import (
     AVE_DECE,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.plugins import Guard, Legal, read_only_copy
+from safevar_sumo.plugins import Legal, UserCode, quoted
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable, unit_text
 
@@ -109,35 +109,25 @@ def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
 
-def guard_metric(metric: Any, guard: Guard) -> Metric:
-    """Guard a user's metric: its function gets read-only copies, and its values are checked.
+def checked_metric(code: UserCode) -> Metric:
+    """A user's metric, whose values are checked.
 
     Raises
     ------
     InputError
-        If `metric` is not a valid record of a metric.
+        If it is not a valid record of a metric.
     """
     expected = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
-    if not isinstance(metric, Metric):
-        raise UserCodeError(
-            guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", expected, guard.definition("")
-        )
-    if not callable(metric.function):
-        raise InputError(
-            guard.source,
-            f"{guard.name}: function = {metric.function!r}",
-            "a function of simulation runs and thresholds",
-        )
+    metric = code.target
+    if not (isinstance(metric, Metric) and callable(metric.function)):
+        raise UserCodeError(code.source, f"{code.name} is {quoted(metric)}", expected, code.definition())
     try:
         facts = msgspec.convert(msgspec.to_builtins(metric.facts), MetricFacts)
     except (msgspec.ValidationError, TypeError) as error:
-        raise InputError(guard.source, f"{guard.name}: {error}", expected) from None
-
-    def guarded_function(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-        values = guard.call(facts.name, metric.function, read_only_copy(runs), thresholds)
-        return guard.numbers(facts.name, "values", values, (len(runs.outcome),), Legal(undefined=True))
-
-    return Metric(**msgspec.structs.asdict(facts), function=guarded_function)
+        raise InputError(code.source, f"{code.name}: {error}", expected) from None
+    legal = Legal(undefined=True)
+    function = code.checked_function(metric.function, facts.name, legal, lambda runs: len(runs.outcome))
+    return Metric(**msgspec.structs.asdict(facts), function=function)
 
 
 class Objective(Struct, frozen=True, kw_only=True):

@@ -1,9 +1,24 @@
-"""User code: looked up by name, checked against a contract, called through a guard; `plugins.check` tries it.
+"""User code: looked up by its name, checked against a contract; `plugins.check` tries it.
 
 `plugins.check` stands above `sumo` and `search`, which it uses; the rest of this room stands below the models, which
 use it.
 """
 
+from safevar_sumo.plugins.contract import (
+    FINITE as FINITE,
+    POSITIVE as POSITIVE,
+    SHARE as SHARE,
+    TRUTH as TRUTH,
+    Legal as Legal,
+    Returned as Returned,
+    UserCode as UserCode,
+    check_open_runs as check_open_runs,
+    open_rows as open_rows,
+    quoted as quoted,
+    read_only as read_only,
+    user_error_of as user_error_of,
+    user_errors as user_errors,
+)
 from safevar_sumo.plugins.files import (
     Files as Files,
     changed_files as changed_files,
@@ -14,25 +29,11 @@ from safevar_sumo.plugins.files import (
     files_in as files_in,
     is_shipped as is_shipped,
 )
-from safevar_sumo.plugins.guard import (
-    FINITE as FINITE,
-    POSITIVE as POSITIVE,
-    SHARE as SHARE,
-    TRUTH as TRUTH,
-    Guard as Guard,
-    Legal as Legal,
-    abstract_methods as abstract_methods,
-    accepts as accepts,
-    check_open_runs as check_open_runs,
-    open_rows as open_rows,
-    read_only_copy as read_only_copy,
-)
 from safevar_sumo.plugins.lookup import (
     Lookup as Lookup,
     Member as Member,
     add_import_folders as add_import_folders,
     added_import_folders as added_import_folders,
-    check_parameters as check_parameters,
     inherit_import_folders as inherit_import_folders,
     instance_of as instance_of,
     unload_user_modules as unload_user_modules,

@@ -10,31 +10,29 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
 import msgspec
 
-from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
+from safevar_sumo.errors import InputError, UserCodeError, describe_error, did_you_mean, one_of
 from safevar_sumo.output import file_beside
+from safevar_sumo.plugins.contract import UserCode, checked_class, contract_of, user_error_of, user_errors, violation
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.guard import Guard, completed, contract_of, violation
 from safevar_sumo.study import Study, convert_table, data_files
 from safevar_sumo.study.schema import Parameters
 
 
 class Member(NamedTuple):
-    """The class or record that a name in a study stands for.
-
-    For user code, `guard` calls the member; for a member of this package it is None.
+    """The class or record that a name in a study stands for; `code` is how errors name it if it is user code, else
+    None.
     """
 
     target: Any
-    guard: Guard | None = None
+    code: UserCode | None = None
 
 
-_NO_ATTRIBUTE = object()
 _added_folders: list[str] = []
 _user_modules: set[str] = set()
 """Names of all modules that the import of user code has loaded."""
@@ -74,17 +72,14 @@ class Lookup(NamedTuple):
         module_name, colon, attribute = name.partition(":")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
             raise InputError(self.source, f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
-        guard = Guard(self.source, f"{key} = {name!r}")
-        module = self._import(module_name, guard)
-        guard = guard._replace(folder=os.path.dirname(file_of_module(module_name.partition(".")[0])))
-        target = guard.call("import", getattr, module, attribute, _NO_ATTRIBUTE)
-        if target is _NO_ATTRIBUTE:
-            problem = (
-                f"{guard.name} cannot be imported: AttributeError: {file_of_module(module_name) or module_name} "
-                f"has no {attribute!r}"
-            )
-            raise InputError(self.source, problem, expected)
-        return Member(target, guard._replace(target=target))
+        code = UserCode(self.source, f"{key} = {name!r}")
+        module = self._import(module_name, code.name)
+        try:
+            target = getattr(module, attribute)
+        except AttributeError:
+            problem = f"{code.name} cannot be imported: {file_of_module(module_name)} has no {attribute!r}"
+            raise InputError(self.source, problem, expected) from None
+        return Member(target, code._replace(target=target))
 
     def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
         """A class by name; a user's class must meet the contract of the first base that it derives from, else of the
@@ -93,15 +88,15 @@ class Lookup(NamedTuple):
         `otherwise` is what the study may give in place of a class, for the error.
         """
         member = self.find(shipped, name, key)
-        if member.guard is None:
+        if member.code is None:
             return member
         base = next(
             (base for base in bases if inspect.isclass(member.target) and issubclass(member.target, base)), bases[-1]
         )
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
-            raise UserCodeError(self.source, f"{member.guard.name} {reason}", expected, member.guard.definition(""))
-        return member._replace(target=completed(member.target, base))
+            raise UserCodeError(self.source, f"{member.code.name} {reason}", expected, member.code.definition())
+        return member._replace(target=checked_class(member.code, base))
 
     def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
         """Parameters of a member; for user code, the names of the study's data files become absolute paths.
@@ -111,7 +106,7 @@ class Lookup(NamedTuple):
         InputError
             If a text names a file that is none of the data files: results would depend on it unnoticed.
         """
-        return dict(parameters) if member.guard is None else self._with_paths(parameters, key)
+        return dict(parameters) if member.code is None else self._with_paths(parameters, key)
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):
@@ -125,24 +120,22 @@ class Lookup(NamedTuple):
             raise InputError(self.source, problem, f"files = [{value!r}] in its table [{table}]")
         return self.files.get(value, value) if is_name else value
 
-    def _import(self, name: str, guard: Guard) -> ModuleType:
+    def _import(self, name: str, key: str) -> ModuleType:
         if name.partition(".")[0] == "__main__":
-            raise InputError(
-                self.source,
-                f"{guard.name}: other processes cannot import from __main__",
-                "a module in a file of its own",
-            )
+            problem = f"{key}: other processes cannot import from __main__"
+            raise InputError(self.source, problem, "a module in a file of its own")
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
         modules_before, dont_write_bytecode = set(sys.modules), sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         try:
-            return guard._replace(folder=folders[0]).call("import", importlib.import_module, name)
-        except UserCodeError as error:
-            problem = error.problem.replace("raised in import", "cannot be imported", 1)
-            expected = error.legal or f"a module in {' or '.join(folders)}, or an installed one"
-            raise UserCodeError(self.source, problem, expected, error.place) from error
+            with user_errors(self.source):
+                return importlib.import_module(name)
+        except (ModuleNotFoundError, UserCodeError) as error:
+            problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
+            expected = getattr(error, "legal", "") or f"a module in {' or '.join(folders)}, or an installed one"
+            raise UserCodeError(self.source, f"{key} cannot be imported: {problem}", expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             _user_modules.update(sys.modules.keys() - modules_before)
@@ -200,25 +193,12 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str, sou
     InputError
         If the class does not take the parameters.
     """
-    cls = member.target
-    if issubclass(cls, msgspec.Struct):
-        return convert_table(source, parameters, cls, key)
-    check_parameters(cls, (), parameters, name, key, source)
-    return (member.guard or Guard(source, name)).call("__init__", cls, **parameters)
-
-
-def check_parameters(
-    function: Callable[..., object],
-    arguments: tuple[object, ...],
-    parameters: Parameters,
-    name: str,
-    key: str,
-    source: str,
-) -> None:
-    """Raise an `InputError` if a class or function does not take these parameters besides the arguments."""
-    try:
-        inspect.signature(function).bind(*arguments, **parameters)
-    except TypeError as error:
-        raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None
-    except ValueError:  # compiled code, without a signature: the call itself checks them
-        pass
+    with user_errors(source):
+        if issubclass(member.target, msgspec.Struct):
+            return convert_table(source, parameters, member.target, key)
+        try:
+            return member.target(**parameters)
+        except TypeError as error:
+            if user_error_of(source, error):
+                raise
+            raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None

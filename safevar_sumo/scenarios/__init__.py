@@ -12,7 +12,6 @@ from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION as LOCATION_DIMENSION,
     SPEED_DIMENSION as SPEED_DIMENSION,
     VUT as VUT,
-    GuardedScenario as GuardedScenario,
     Lane as Lane,
     Point as Point,
     PreCrash as PreCrash,

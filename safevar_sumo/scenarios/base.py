@@ -1,18 +1,18 @@
-"""The contract of a scenario, its actors and the geometry of the encounter; and the guard of a user's scenario."""
+"""The contract of a scenario, its actors and the geometry of the encounter."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import FINITE, TRUTH, Guard, Legal, read_only_copy
+from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
@@ -177,8 +177,54 @@ class Scene(NamedTuple):
     visible: BoolArray = ALL_TRUE
 
 
+MAX_DURATION = 3600.0
+"""Longest run [s]."""
+MAX_TEST_SPEED = 100.0
+"""Highest speed of a test [m/s]."""
+LEGAL_SCENE = {
+    **dict.fromkeys(Scene._fields, Legal(scalar=True)),
+    "gap": Legal(infinite=True),
+    "over": TRUTH,
+    "visible": TRUTH._replace(scalar=True),
+}
+LEGAL_ENCOUNTER = {**dict.fromkeys(Encounter._fields, Legal(infinite=True, undefined=True)), "in_conflict": TRUTH}
+
+
+def check_encounter(code: UserCode, method: str, encounter: Encounter, trace: Trace) -> Encounter:
+    """Refuse an encounter that is undefined while it counts, or that never has a separation: its metrics would be
+    undefined or infinite.
+    """
+    is_counted = encounter.in_conflict & trace.active
+    for name, values in zip(Encounter._fields, encounter, strict=True):
+        if np.isnan(values[is_counted]).any():
+            raise code.wrong(method, f"{name} = nan", "numbers wherever in_conflict is true")
+    least_separation = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
+    if (is_counted.any(axis=0) & (least_separation == np.inf)).any():
+        raise code.wrong(method, "separation = inf", "a finite number at some time that in_conflict is true")
+    return encounter
+
+
+def check_changes(code: UserCode, method: str, changes: Any, roads: Roads) -> XmlChanges:
+    """Refuse changes to a network or its traffic that are no mapping; values become texts."""
+    if not isinstance(changes, Mapping):
+        raise code.wrong(method, quoted(changes), "a mapping from XPaths to attributes")
+    return {  # None, which removes an element, stays None
+        path: change and {name: str(value) for name, value in change.items()} for path, change in changes.items()
+    }
+
+
+def check_fields(code: UserCode, scenario: Any) -> None:
+    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed."""
+    if not isinstance(getattr(scenario, "network", None), str):
+        raise code.wrong("__init__", quoted(scenario), "an object with the attribute network, a folder's name or path")
+    legal = {"duration": Legal(0.0, MAX_DURATION, above=True), "grade": Legal(-MAX_GRADE, MAX_GRADE)}
+    if scenario.test_speed is not None:
+        legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
+    Returned((legal,)).check(code, "__init__", scenario, ())
+
+
 ScenarioMemory = Any
-"""What a scenario remembers of a run, of its own type."""
+"""What a scenario remembers of a run: an object of its own class with named attributes."""
 
 
 class Scenario:
@@ -202,9 +248,21 @@ class Scenario:
     test_speed
         Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the speed
         tolerance before the ADS brakes is an invalid test. Only contacts at the vehicle's front are collisions.
+    RETURNS
+        What the methods of a user's class must return.
+    is_user_code
+        Whether the class is a user's.
     """
 
     __slots__ = ()
+    RETURNS: ClassVar[Mapping[str, Returned]] = {
+        "lanes": Returned(then=check_changes),
+        "actors": Returned(then=check_changes),
+        "begin": Returned(like=0),
+        "observe": Returned((LEGAL_SCENE, {}), like=0),
+        "encounter": Returned((LEGAL_ENCOUNTER,), like=0, then=check_encounter),
+    }
+    is_user_code: ClassVar[bool] = False
     network: str
     reactive_actors: bool = True
     grade: float = 0.0
@@ -288,90 +346,3 @@ OBSTACLES: Mapping[str, str] = {
     PreCrash.LEAD_DECELERATING: "a braking vehicle ahead",
 }
 """What is in the way, by the pre-crash type."""
-
-
-MAX_DURATION = 3600.0
-"""Longest run [s]."""
-MAX_TEST_SPEED = 100.0
-"""Highest speed of a test [m/s]."""
-
-
-LEGAL_SCENE = {
-    **dict.fromkeys(Scene._fields, FINITE),
-    "gap": Legal(infinite=True),
-    **dict.fromkeys(("over", "visible"), TRUTH),
-}
-LEGAL_ENCOUNTER = {**dict.fromkeys(Encounter._fields, Legal(infinite=True, undefined=True)), "in_conflict": TRUTH}
-
-
-class GuardedScenario(Scenario):
-    """Guards a user's scenario: passes read-only copies to it, and checks its results."""
-
-    duration = 0.0
-    pre_crash = ""
-    test_speed: float | None = None
-
-    def __init__(self, scenario: Scenario, guard: Guard) -> None:
-        self._scenario, self._guard = scenario, guard
-        self.network = guard.field("__init__", scenario, "network")
-        if not isinstance(self.network, str):
-            expected = "the name or path of a folder with a network"
-            raise guard.wrong_value("__init__", "network", self.network, expected)
-        legal = {"duration": Legal(0.0, MAX_DURATION, above=True), "grade": Legal(-MAX_GRADE, MAX_GRADE)}
-        if scenario.test_speed is not None:
-            legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
-        vars(self).update(guard.columns("__init__", scenario, (), legal, scalars=legal))
-        self.reactive_actors, self.centre_to_centre = bool(scenario.reactive_actors), bool(scenario.centre_to_centre)
-        self.pre_crash = str(scenario.pre_crash)
-
-    def lanes(self, roads: Roads) -> XmlChanges:
-        return self._changes("lanes", self._scenario.lanes, roads)
-
-    def actors(self, roads: Roads) -> XmlChanges:
-        return self._changes("actors", self._scenario.actors, roads)
-
-    def _changes(self, method: str, function: Callable[[Roads], XmlChanges], roads: Roads) -> XmlChanges:
-        changes = self._guard.call(method, function, roads)
-        if not isinstance(changes, Mapping):
-            raise self._guard.wrong_value(method, "changes", changes, "a mapping from XPaths to attributes")
-        return {  # None, which removes an element, stays None
-            path: change and {name: str(value) for name, value in change.items()} for path, change in changes.items()
-        }
-
-    def remarks(self) -> list[str]:
-        return [str(remark) for remark in self._guard.call("remarks", self._scenario.remarks)]
-
-    def begin(self, world: World) -> ScenarioMemory:
-        return self._guard.call("begin", self._scenario.begin, _ReadOnlyWorld(world))
-
-    def observe(self, world: World, step: float, memory: ScenarioMemory) -> tuple[Scene, ScenarioMemory]:
-        result = self._guard.call("observe", self._scenario.observe, _ReadOnlyWorld(world), step, memory)
-        scene, memory = self._guard.elements("observe", result, "(Scene, memory)")
-        return Scene(**self._guard.columns("observe", scene, world.speeds().shape, LEGAL_SCENE)), memory
-
-    def encounter(self, trace: Trace) -> Encounter:
-        result = self._guard.call("encounter", self._scenario.encounter, read_only_copy(trace))
-        encounter = Encounter(**self._guard.columns("encounter", result, trace.speed.shape, LEGAL_ENCOUNTER))
-        is_counted = encounter.in_conflict & trace.active
-        for name, values in zip(Encounter._fields, encounter, strict=True):
-            if np.isnan(values[is_counted]).any():
-                raise self._guard.wrong_value("encounter", name, float("nan"), "numbers wherever in_conflict is true")
-        least_separation = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
-        if (is_counted.any(axis=0) & (least_separation == np.inf)).any():
-            raise self._guard.wrong_value(
-                "encounter", "separation", float("inf"), "a finite number at some time that in_conflict is true"
-            )
-        return encounter
-
-
-class _ReadOnlyWorld:
-    """A world with only the methods of the contract `World`, which return read-only copies."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or not hasattr(World, name):
-            raise AttributeError(f"a scenario's world has no {name!r}")
-        method = getattr(self._world, name)
-        return lambda *arguments: read_only_copy(method(*arguments))

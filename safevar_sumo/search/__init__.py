@@ -2,12 +2,7 @@
 
 from collections.abc import Mapping
 
-from safevar_sumo.search.base import (
-    Algorithm as Algorithm,
-    GuardedAlgorithm as GuardedAlgorithm,
-    Problem as Problem,
-    Search as Search,
-)
+from safevar_sumo.search.base import Algorithm as Algorithm, Problem as Problem, Search as Search
 from safevar_sumo.search.baselines import RandomSearch, SafeFuzzer
 from safevar_sumo.search.genetic import MoCell as MoCell, Nsga2, Spea2
 from safevar_sumo.search.map_elites import MapElites as MapElites

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
-from safevar_sumo.plugins import Guard, Legal, read_only_copy
+from safevar_sumo.plugins import Legal, Returned, UserCode, quoted, read_only, user_errors
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
@@ -56,14 +55,63 @@ class Problem:
         return self.region.repaired(settings) if self.region else settings
 
 
+def check_search(code: UserCode, method: str, search: Any, problem: Problem, rng: np.random.Generator) -> Search:
+    """A user's search, whose settings and result are checked."""
+    if not hasattr(search, "send"):
+        raise code.wrong(method, quoted(search), "a generator: a method that yields settings and returns its result")
+    yielded, budget, answer = set[bytes](), problem.evaluations, None
+    while True:
+        with user_errors(code.source):
+            try:
+                output = search.send(answer)
+            except StopIteration as end:
+                return _checked_result(code, end.value, yielded, problem)
+        settings = _checked_settings(code, output, problem, budget)
+        budget -= len(settings)
+        yielded.update(setting.tobytes() for setting in settings)
+        answer = read_only((yield settings))
+
+
+def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int) -> FloatArray:
+    characteristics = problem.characteristics
+    shape = f"shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+    is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
+    if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
+        raise code.wrong("search", f"settings = {quoted(output)}", f"an array of {shape}")
+    for characteristic, values in zip(characteristics, output.T, strict=True):
+        legal = Legal(characteristic.lower, characteristic.upper)
+        code.check_numbers("search", characteristic.name, values, (len(output),), legal)
+    settings: FloatArray = output.astype(float)
+    if (characteristics.filter(settings) != settings).any():
+        raise code.wrong("search", "unfiltered settings", "problem.characteristics.filter(settings)")
+    if problem.region:
+        advice = (
+            f", for every setting that {code.name} yields: problem.characteristics.filter(problem.repaired(settings))"
+        )
+        problem.region.check(settings, code.source, otherwise=advice)
+    return settings
+
+
+def _checked_result(code: UserCode, result: Any, yielded: set[bytes], problem: Problem) -> Evaluations:
+    """The valid evaluations of a result."""
+    if not yielded:
+        raise code.wrong("search", "no settings", f"a generator that yields from 1 to {problem.evaluations} settings")
+    if not isinstance(result, Evaluations) or any(setting.tobytes() not in yielded for setting in result.settings):
+        expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
+        raise code.wrong("search", quoted(result), expected)
+    return result.take(problem.scoring.valid(result))
+
+
 class Algorithm:
     """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2].
 
-    `title` is its name in tables and legends, by default its name in the study.
+    `title` is its name in tables and legends, by default its name in the study. `RETURNS` is what the method of a
+    user's class must return.
     """
 
     __slots__ = ()
     title: str = ""
+    RETURNS: ClassVar[Mapping[str, Returned]] = {"search": Returned(like=0, then=check_search)}
 
     @abstractmethod
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
@@ -73,91 +121,3 @@ class Algorithm:
         same settings again. Yielded settings are in the domains and filtered. The result consists of valid evaluations
         (`problem.scoring.valid`) that the run received.
         """
-
-
-class GuardedAlgorithm(Algorithm):
-    """A user's algorithm: it gets read-only copies, and this class checks its settings and its result."""
-
-    def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
-        self._algorithm, self._guard, self.title = algorithm, guard, getattr(algorithm, "title", "")
-
-    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
-        if not (hasattr(search, "send") and hasattr(search, "__next__")):
-            raise self._guard.wrong_value(
-                "search", "the search", search, "a generator: a method that yields settings and returns its result"
-            )
-        evaluations_by_setting: dict[bytes, Evaluations] = {}
-        last_answer: Evaluations | None = None
-        budget = problem.evaluations
-        while True:
-            output, has_finished = self._guard.call("search", _advance, search, last_answer)
-            if has_finished:
-                return self._check_result(output, evaluations_by_setting, problem)
-            settings = self._check_settings(output, problem, budget)
-            budget -= len(settings)
-            evaluations = yield settings
-            for i, setting in enumerate(settings):
-                evaluations_by_setting[setting.tobytes()] = evaluations.take([i])
-            last_answer = read_only_copy(evaluations)
-
-    def _check_settings(self, output: Any, problem: Problem, budget: int) -> FloatArray:
-        characteristics = problem.characteristics
-        expected = (
-            f"an array of shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
-        )
-        is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
-        if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
-            raise self._guard.wrong_value("search", "settings", output, expected)
-        settings = self._guard.numbers("search", "settings", output, output.shape)
-        for characteristic, values in zip(characteristics, settings.T, strict=True):
-            legal = Legal(characteristic.lower, characteristic.upper)
-            self._guard.numbers("search", characteristic.name, values, (len(settings),), legal)
-        unfiltered_values = np.argwhere(characteristics.filter(settings) != settings)
-        if len(unfiltered_values):
-            row, column = unfiltered_values[0]
-            raise self._guard.wrong_value(
-                "search",
-                characteristics.names[column],
-                float(settings[row, column]),
-                "filtered settings: problem.characteristics.filter(settings)",
-            )
-        if problem.region and not problem.region.feasible(settings).all():
-            problem.region.check(
-                settings,
-                self._guard.source,
-                otherwise=f", for every setting that {self._guard.name} yields: "
-                "problem.characteristics.filter(problem.repaired(settings))",
-            )
-        return settings
-
-    def _check_result(
-        self, result: Any, evaluations_by_setting: dict[bytes, Evaluations], problem: Problem
-    ) -> Evaluations:
-        expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
-        if not isinstance(result, Evaluations):
-            raise self._guard.wrong_value("search", "its result", result, expected)
-        if not evaluations_by_setting:
-            raise UserCodeError(
-                self._guard.source,
-                f"{self._guard.name} ended in search without yielding any setting",
-                f"a generator that yields from 1 to {problem.evaluations} settings before it returns",
-            )
-        settings = self._guard.numbers(
-            "search", "its result's settings", result.settings, (len(result), len(problem.characteristics))
-        )
-        if any(setting.tobytes() not in evaluations_by_setting for setting in settings):
-            raise self._guard.wrong_value("search", "its result", "settings that it never yielded", expected)
-        empty = next(iter(evaluations_by_setting.values())).take([])
-        evaluations = Evaluations.concatenate(
-            [empty, *(evaluations_by_setting[setting.tobytes()] for setting in settings)]
-        )
-        return evaluations.take(problem.scoring.valid(evaluations))
-
-
-def _advance(search: Any, last_answer: Evaluations | None) -> tuple[Any, bool]:
-    """Advance a generator; returns what it yields or, at its end, its result; and whether it has finished."""
-    try:
-        return (next(search) if last_answer is None else search.send(last_answer)), False
-    except StopIteration as end:
-        return end.value, True

@@ -151,17 +151,14 @@ def _correlation_mistakes(
 
 
 class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The bounds `at_least` and `at_most` of a quantity that depends on several characteristics.
+    """The bounds `at_least` and `at_most` of a weighted sum of characteristics.
 
-    The quantity is either a weighted sum, where `sum` holds a weight for each characteristic in its unit, or the result
-    of `function`. A function is named `package.module:Name`; it takes {name: array of shape (N,)} for N settings and
-    returns an array of shape (N,). `unit`, the unit of the quantity and its bounds, is the unit of a characteristic or
-    "-"; it may be omitted if all characteristics of the sum have the same unit. `meaning` explains the constraint and
-    names its source.
+    `sum` holds a weight for each characteristic in its unit. `unit`, the unit of the sum and its bounds, is the unit of
+    a characteristic or "-"; it may be omitted if all characteristics of the sum have the same unit. `meaning` explains
+    the constraint and names its source.
     """
 
-    sum: dict[str, float] = {}
-    function: str = ""
+    sum: Annotated[dict[str, float], Meta(min_length=1)]
     at_least: float | None = None
     at_most: float | None = None
     unit: str | None = None
@@ -169,9 +166,7 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def quantity(self) -> str:
-        """The quantity in words, such as `mass - 2 radius`."""
-        if self.function:
-            return self.function
+        """The sum in words, such as `mass - 2 radius`."""
         terms = [
             f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
             for name, weight in self.sum.items()
@@ -179,7 +174,7 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))  # the first term has its sign without a space
 
     def unit_of(self, rows: Mapping[str, CharacteristicTable]) -> str:
-        """The unit of the quantity; `rows` are the characteristics of the vehicle."""
+        """The unit of the sum; `rows` are the characteristics of the vehicle."""
         units = {rows[name].unit for name in self.sum if name in rows}
         return self.unit if self.unit is not None else next(iter(units), "-")
 
@@ -198,12 +193,6 @@ def constraint_mistakes(
     """
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
-        if bool(constraint.sum) == bool(constraint.function):
-            yield InputError(
-                source,
-                f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}",
-                "one of them",
-            )
         for name, weight in constraint.sum.items():
             if name not in rows:
                 yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, rows)
@@ -224,7 +213,7 @@ def _unit_mistakes(
     legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
     if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
         terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum if name in rows)
-        problem = f"{key}: unit = {constraint.unit!r}" + (f" for the sum of {terms}" if terms else "")
+        problem = f"{key}: unit = {constraint.unit!r} for the sum of {terms}"
         yield InputError(source, problem, f"{one_of(legal_units)}; weights may convert units")
 
 

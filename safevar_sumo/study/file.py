@@ -267,7 +267,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
 
 def user_code_names(study: Study) -> list[str]:
     """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
-    return [f"{key} = {name!r}" for key, name in (*_keys_of_user_code(study), *fmus_of(study))]
+    return [f"{key} = {name!r}" for key, name in (*user_code(study), *fmus_of(study))]
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
@@ -281,10 +281,10 @@ def fmus_of(study: Study) -> list[tuple[str, str]]:
 
 def user_modules(study: Study) -> list[str]:
     """The modules of a study's user code."""
-    return sorted({name.partition(":")[0] for _, name in _keys_of_user_code(study)})
+    return sorted({name.partition(":")[0] for _, name in user_code(study)})
 
 
-def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
+def user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
     names_by_key = {
@@ -294,7 +294,6 @@ def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
         "search.algorithms": study.search.algorithms,
-        "constraints.function": [constraint.function for constraint in study.constraints],
     }
     fmus = fmus_of(study)
     return [

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
-from safevar_sumo.plugins import check_open_runs, open_rows
+from safevar_sumo.plugins import check_open_runs, open_rows, user_errors
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import (
     STANDSTILL,
@@ -36,7 +36,7 @@ from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.world import Contacts, SumoWorld
-from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, SumoType, slope_of
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, SumoType, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
 Watcher = Callable[[SumoWorld], None]
@@ -48,6 +48,11 @@ Listener = Callable[[Observation], None]
 @np.errstate(all="ignore")
 def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     """The metrics and objectives of settings that have been simulated in `runs`."""
+    with user_errors(system.source):
+        return _score(system, settings, runs)
+
+
+def _score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     try:
         metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
     except InputError as error:
@@ -98,6 +103,13 @@ def drive_all(
     InputError
         If a user's ADS fails.
     """
+    with user_errors(system.source):
+        return _drive_all(system, settings, engine, watch, listen)
+
+
+def _drive_all(
+    system: System, settings: FloatArray, engine: Engine, watch: Watcher | None, listen: Listener | None
+) -> SimulationRuns:
     scenarios, options = [point.scenario for point in system.points], step_options(system)
     if watch is None and is_recorded(system, engine):
         scenes = record_scenes(scenarios, options)
@@ -236,15 +248,17 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
         )
 
 
-def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, float, Slope, bool | BoolArray]:
+def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, ...]:
     """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres' friction (a number if
-    all points share it), time step, slope and wetness.
+    all points share it), time step and, unless all roads are level and dry, slope and wetness.
     """
     size = n // len(points)
     friction = per_vehicle([point.weather.road_friction for point in points], size)
     grades, wetness = [point.scenario.grade for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
-    return friction, step, slope, np.repeat(wetness, size) if any(wetness) else False
+    if any(wetness):
+        return friction, step, slope, np.repeat(wetness, size)
+    return (friction, step, slope) if any(grades) else (friction, step)
 
 
 def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError, did_you_mean
-from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
+from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
@@ -264,7 +264,7 @@ def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
     networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
 
     def stage(scenario: Scenario) -> Network:
-        may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
+        may_vary = scenario.is_user_code  # a user's scenario may return different changes in each call
         return (_stage.__wrapped__ if may_vary else _stage)(scenario, networks[scenario.network])
 
     return [stage(scenario) for scenario in scenarios]

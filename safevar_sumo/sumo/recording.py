@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import msgpack, to_builtins
 
 from safevar_sumo.records import FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, GuardedScenario, Lane, Scenario
+from safevar_sumo.scenarios import VUT, Lane, Scenario
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
@@ -160,7 +160,7 @@ def _reason_against_recording(scenario: Scenario) -> str:
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
     # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):
+    if not scenario.is_user_code and not is_shipped(scenario.network):
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 
@@ -177,7 +177,7 @@ def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
     def play() -> list[Recording | str]:
         return [_play(*key) for key in keys]
 
-    if any(isinstance(scenario, GuardedScenario) for scenario, _, _ in keys):
+    if any(scenario.is_user_code for scenario, _, _ in keys):
         return play()
     inputs = [
         (type(scenario).__name__, to_builtins(scenario), network.digests, options)

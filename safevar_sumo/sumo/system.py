@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, Ads, FmuAds, GuardedAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import ADS, Ads, FmuAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import description_of
 from safevar_sumo.metrics import (
@@ -25,12 +25,13 @@ from safevar_sumo.metrics import (
     Metric,
     Objective,
     Scoring,
-    guard_metric,
+    checked_metric,
 )
-from safevar_sumo.plugins import Guard, Lookup, Member, accepts, check_parameters, instance_of, unload_user_modules
+from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
+from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, equals_clear, weather_of
+from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
@@ -42,10 +43,9 @@ from safevar_sumo.vehicles import (
     CharacteristicSet,
     FeasibleRegion,
     FmuVehicle,
-    GuardedVehicle,
     Vehicle,
     calibration_drive,
-    guard_change,
+    checked_change,
     region_of,
 )
 from safevar_sumo.vehicles.base import Prepared
@@ -94,9 +94,9 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
             return user_records[name]
         member = lookup.find(known, name, key)
         record: Metric | Change = member.target
-        if member.guard is not None:
+        if member.code is not None:
             is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
-            record = (guard_change if is_change else guard_metric)(record, member.guard)
+            record = (checked_change if is_change else checked_metric)(member.code)
             if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
                 raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
             user_records[name] = user_records[record.name] = record
@@ -244,12 +244,23 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
+    with user_errors(source):
+        return _assemble(study, source)
+
+
+def _assemble(study: Study, source: str) -> System:
     unload_user_modules()  # so that each system has the code as it is now, and no state of another one
     vehicle, ads, scenario, weather = models_of(study, source)
     is_shipped_vehicle = study.vehicle.model in VEHICLES
     _check_units(study, vehicle, is_shipped_vehicle, source)
-    if isinstance(ads, TraciController) and isinstance(vehicle, GuardedVehicle):
-        vehicle.require_sensors()
+    if isinstance(ads, TraciController) and not is_shipped_vehicle and type(vehicle).sensors is Vehicle.sensors:
+        problem = (
+            f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of TraCI bypasses sense"
+        )
+        expected = (
+            "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None"
+        )
+        raise InputError(source, problem, expected)
     measuring = measuring_of(study, Lookup.of(study, source))
     tables_of_metrics = {
         "published": study.published,
@@ -298,17 +309,19 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
         member = lookup.find({}, table.model, "ads.model")
         controller, parameters = member.target, lookup.with_paths(member, table.parameters, "ads.parameters")
         is_class = inspect.isclass(controller)
-        step = getattr(controller, "step", None) if is_class else controller
-        if not callable(step) or not (is_class or parameters or accepts(step, 2)):
-            raise InputError(lookup.source, f"{name} cannot be called as step(traci, vehicle_id)", CONTROLLER_FORMS)
+        step: Any = getattr(controller, "step", None) if is_class else controller
+        try:
+            inspect.signature(step).bind(*[None] * (2 + is_class), **({} if is_class else parameters))
+        except (TypeError, ValueError) as error:
+            problem = f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
+            raise InputError(lookup.source, problem, CONTROLLER_FORMS) from None
         create: Callable[[], Controller]
         if is_class:
             create = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
+            create()  # so that wrong parameters raise errors here
         else:
-            check_parameters(controller, (None, None), parameters, name, "ads.parameters", lookup.source)
             create = partial(partial, controller, **parameters)  # the function with its parameters
-        create()  # so that wrong parameters raise errors here
-    return TraciController(create, member.guard or Guard(lookup.source, name))
+    return TraciController(create, lookup.source)
 
 
 def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
@@ -346,8 +359,7 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
     network = str((with_sources or paths)[0])
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=network)
-    assert isinstance(scenario, GuardedScenario)
-    scenario.network = network
+    vars(scenario)["network"] = network
     return scenario
 
 
@@ -391,32 +403,34 @@ def _class_and_creator(
 
 def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     if table.kind == "fmu":
-        guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
-        parameters = lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")
+        code = UserCode(lookup.source, f"vehicle.model = {table.model!r}")
+        parameters = lookup.with_paths(Member(FmuVehicle, code), table.parameters, "vehicle.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
         units = {name: row.unit for name, row in table.characteristics.items()}
-        return FmuVehicle(description, units, {**msgspec.structs.asdict(table), "parameters": parameters}, guard)
+        return FmuVehicle(description, units, {**msgspec.structs.asdict(table), "parameters": parameters}, code)
     member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
     vehicle: Vehicle = create()
-    return vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)
+    if member.code is not None and not isinstance(getattr(vehicle, "UNITS", None), Mapping):
+        raise member.code.wrong("__init__", "an object without UNITS", "units of the characteristics by name")
+    return vehicle
 
 
 def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, Scenario)
-    scenario: Scenario = create() if member.guard is None else GuardedScenario(create(), member.guard)
+    scenario: Scenario = create()
+    if member.code is not None:
+        check_fields(member.code, scenario)
     return _locate_network(scenario, lookup.folders)
 
 
 def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
-    guard = Guard(lookup.source, f"ads.model = {table.model!r}")
     if table.kind == "fmu":
-        parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
+        code = UserCode(lookup.source, f"ads.model = {table.model!r}")
+        parameters = lookup.with_paths(Member(FmuAds, code), table.parameters, "ads.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
-        return FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
+        return FmuAds(description, table.inputs, table.outputs, parameters, table.step, code)
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
     ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
-    if issubclass(member.target, ScalarAds):
-        return PerVehicleAds(create, member.guard or guard)
-    return ads if member.guard is None else GuardedAds(ads, member.guard)
+    return PerVehicleAds(create, member.code) if member.code and isinstance(ads, ScalarAds) else ads

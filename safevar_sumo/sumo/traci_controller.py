@@ -18,7 +18,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.ads.base import Trim, pedals_for, trim_at
-from safevar_sumo.plugins import Guard
+from safevar_sumo.plugins import user_error_of, user_errors
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.traci_view import OWN_LOOP, SensedTraffic, TraciView, Value, real_traci, refused
@@ -38,8 +38,8 @@ class TraciController(Ads):
         Creates a vehicle's controller.
     """
 
-    def __init__(self, create: Callable[[], Controller], guard: Guard) -> None:
-        self._create, self._guard = create, guard
+    def __init__(self, create: Callable[[], Controller], source: str) -> None:
+        self._create, self._source = create, source
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         world, drivers = current_world(), []
@@ -48,7 +48,7 @@ class TraciController(Ads):
             for copy in range(n):
                 view, controller = TraciView(world, copy, traffic), self._create()
                 if hasattr(controller, "start"):
-                    self._call(view, "start", controller.start)
+                    self._call(view, controller.start)
                 drivers.append((view, getattr(controller, "step", controller)))
         return _Memory(nominal, traffic, drivers, initial_trim=None)
 
@@ -68,20 +68,21 @@ class TraciController(Ads):
             for i, (view, step) in enumerate(memory.drivers):
                 if memory.traffic.is_on_road(i):
                     view.time, speed = seen.time, float(seen.speed[i])
-                    self._call(view, "step", step)
+                    self._call(view, step)
                     accelerations[i] = view.commanded_acceleration(speed)
         command = pedals_for(memory.nominal, seen.speed, accelerations, initial_trim)
         return command, memory._replace(initial_trim=initial_trim)
 
-    def _call(self, view: TraciView, method: str, function: Callable[..., None]) -> None:
+    def _call(self, view: TraciView, function: Callable[..., None]) -> None:
         global _active_view
         _active_view = view
         try:
-            self._guard.call(method, function, traci_module(), VUT)
+            with user_errors(self._source):
+                function(traci_module(), VUT)
         finally:
             _active_view = None
         if view.last_error is not None:  # the controller caught the error and continued
-            raise self._guard.failure(method, view.last_error)
+            raise user_error_of(self._source, view.last_error) or view.last_error
 
 
 class _Memory(NamedTuple):

@@ -9,7 +9,6 @@ import numpy as np
 from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
 from safevar_sumo.vehicles.base import (
     LEVEL as LEVEL,
-    GuardedVehicle as GuardedVehicle,
     Sensors as Sensors,
     Slope as Slope,
     SumoType as SumoType,
@@ -23,7 +22,7 @@ from safevar_sumo.vehicles.characteristics import (
     Change as Change,
     Characteristic as Characteristic,
     CharacteristicSet as CharacteristicSet,
-    guard_change as guard_change,
+    checked_change as checked_change,
 )
 from safevar_sumo.vehicles.fmu import FmuVehicle as FmuVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl

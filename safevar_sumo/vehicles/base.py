@@ -1,4 +1,4 @@
-"""The contract of a vehicle model; slopes, sensors and delayed signals; and the guard of a user's model."""
+"""The contract of a vehicle model; slopes, sensors and delayed signals."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Guard, Legal, open_rows, read_only_copy
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Legal, Returned
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, IntArray, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -150,6 +150,16 @@ State = Any
 """The state of N vehicles, of the model's own type; see `VehicleState`."""
 
 
+HIGHEST_SPEED = 1000.0
+"""Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
+LEGAL_STATE = {"speed": Legal(0.0, HIGHEST_SPEED), "throttle": SHARE, "brake": SHARE, "gear": FINITE}
+LEGAL_SENSORS = {"latency": Legal(0.0), "reach": Legal(0.0, infinite=True), "scale": POSITIVE}
+LEGAL_OBSERVATION = {
+    **dict.fromkeys(Observation._fields, Legal(scalar=True)),
+    **dict.fromkeys(("gap", "lateral"), Legal(infinite=True)),  # while no obstacle is detected
+}
+
+
 class VehicleState(Protocol):
     """The columns that every model's state has, each of shape (N,): speed [m/s]; throttle, brake and gear [-]."""
 
@@ -180,9 +190,21 @@ class Vehicle:
         Largest number of vehicles at once; None if any number will do.
     remarks
         Remarks for the user.
+    RETURNS
+        What the methods of a user's class must return.
     """
 
     __slots__ = ()
+    RETURNS: ClassVar[Mapping[str, Returned]] = {
+        "prepare": Returned(like=0),
+        "sumo_type": Returned((dict.fromkeys(SumoType._fields[:-1], POSITIVE),)),  # tau may be None
+        "at_rest": Returned(({**LEGAL_STATE, "speed": Legal(0.0, 0.0)},)),
+        "at_speed": Returned((LEGAL_STATE,), like=1),
+        "hold_gear": Returned((LEGAL_STATE,), like=2),
+        "sensors": Returned((LEGAL_SENSORS,)),
+        "sense": Returned((LEGAL_OBSERVATION, LEGAL_STATE), like=2),
+        "advance": Returned((LEGAL_STATE,), like=2),
+    }
     UNITS: Mapping[str, str]
     FITTED_UP_TO: ClassVar[float] = np.inf
     max_vehicles: int | None = None
@@ -200,7 +222,7 @@ class Vehicle:
         """Constants of a run with a time step of `step` seconds.
 
         `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further
-        effects. A user's model gets `slope` and `wet` only on roads that have a slope or are wet.
+        effects. `slope` and `wet` are passed only on roads that have a slope or are wet.
         """
 
     @abstractmethod
@@ -252,119 +274,3 @@ def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
         columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
         return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
     return steady if steady is None else np.where(is_rolling, steady, rest)
-
-
-HIGHEST_SPEED = 1000.0
-"""Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
-SPEED_ROUNDING = 1e-9  # relative tolerance of speeds
-LEGAL_STATE = {"speed": Legal(0.0, HIGHEST_SPEED), "throttle": SHARE, "brake": SHARE, "gear": FINITE}
-LEGAL_SENSORS = {"latency": Legal(0.0), "reach": Legal(0.0, infinite=True), "scale": POSITIVE}
-LEGAL_OBSERVATION = {
-    **dict.fromkeys(Observation._fields, FINITE),
-    **dict.fromkeys(("gap", "lateral"), Legal(infinite=True)),  # while no obstacle is detected
-}
-
-
-class _Prepared(NamedTuple):
-    """Number of vehicles, the constants that the user's model returned, and its SUMO types after the check."""
-
-    n: int
-    constants: Prepared
-    types: SumoType
-
-
-class _State(NamedTuple):
-    """The columns of a state after the check, and the state that the user's model returned."""
-
-    speed: FloatArray
-    throttle: FloatArray
-    brake: FloatArray
-    gear: FloatArray
-    model_state: State
-
-
-class GuardedVehicle(Vehicle):
-    """Guards a user's model: passes read-only copies to it, and checks its results."""
-
-    UNITS: Mapping[str, str]
-
-    def __init__(self, vehicle: Any, guard: Guard) -> None:
-        self.model, self._guard = vehicle, guard
-        self.UNITS = guard.field("__init__", vehicle, "UNITS")
-        if not isinstance(self.UNITS, Mapping):
-            raise guard.wrong_value("__init__", "UNITS", self.UNITS, "units of the characteristics by name")
-
-    def prepare(
-        self,
-        characteristics: Characteristics,
-        road_friction: float,
-        step: float,
-        slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
-    ) -> _Prepared:
-        n = len(next(iter(characteristics.values())))
-        road: tuple[Slope | bool | BoolArray, ...] = () if slope is LEVEL else (slope,)
-        if np.any(wet):
-            road = slope, wet
-        arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)
-        constants = self._guard.call("prepare", self.model.prepare, *arguments)
-        types = self._guard.call("sumo_type", self.model.sumo_type, constants)
-        names = [name for name in SumoType._fields if name != "tau" or getattr(types, name, None) is not None]
-        columns = self._guard.columns("sumo_type", types, (n,), dict.fromkeys(names, POSITIVE))
-        return _Prepared(n, constants, SumoType(**columns))
-
-    def sumo_type(self, prepared: _Prepared) -> SumoType:
-        return prepared.types
-
-    def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._next_state("at_rest", prepared)
-        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), Legal(0.0, 0.0))
-        return state
-
-    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
-        return self._next_state("at_speed", prepared, speed)
-
-    def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
-        return self._next_state("hold_gear", prepared, state, holds)
-
-    def sensors(self, prepared: _Prepared) -> Sensors | None:
-        sensors = self._result("sensors", prepared)
-        if sensors is None:
-            return None
-        return Sensors(**self._guard.columns("sensors", sensors, (prepared.n,), LEGAL_SENSORS))
-
-    def require_sensors(self) -> None:
-        """Refuse a model without a method `sensors`: a controller that reads through TraCI bypasses `sense`."""
-        if type(self.model).sensors is Vehicle.sensors:
-            raise UserCodeError(
-                self._guard.source,
-                f"{self._guard.name} has no method sensors, and a controller that reads through TraCI bypasses sense",
-                "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None",
-            )
-
-    def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        result = self._result("sense", prepared, state, seen)
-        sensed, next_state = self._guard.elements("sense", result, "(Observation, state)")
-        scalars = [name for name, value in seen._asdict().items() if not hasattr(value, "shape")]
-        columns = self._guard.columns("sense", sensed, (prepared.n,), LEGAL_OBSERVATION, scalars)
-        return Observation(**columns), self._checked("sense", prepared, next_state)
-
-    def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        state, max_speed = self._next_state("advance", prepared, state, command), prepared.types.max_speed
-        for i in open_rows(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
-            expected = f"up to max_speed = {max_speed[i]:g} of its sumo_type"
-            raise self._guard.wrong_value("advance", "speed", float(state.speed[i]), expected)
-        return state
-
-    def _next_state(self, method: str, prepared: _Prepared, *arguments: object) -> _State:
-        return self._checked(method, prepared, self._result(method, prepared, *arguments))
-
-    def _result(self, method: str, prepared: _Prepared, *arguments: object) -> Any:
-        """What a method of the user's model returns; it gets its own constants and state as it returned them."""
-        passed = [
-            argument.model_state if isinstance(argument, _State) else read_only_copy(argument) for argument in arguments
-        ]
-        return self._guard.call(method, getattr(self.model, method), prepared.constants, *passed)
-
-    def _checked(self, method: str, prepared: _Prepared, state: State) -> _State:
-        return _State(**self._guard.columns(method, state, (prepared.n,), LEGAL_STATE), model_state=state)

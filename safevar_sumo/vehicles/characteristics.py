@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.plugins import Guard, read_only_copy
+from safevar_sumo.plugins import FINITE, UserCode, quoted
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, unit_text
 
@@ -255,26 +255,12 @@ CHANGES = {
 }
 
 
-def guard_change(change: Any, guard: Guard) -> Change:
-    """Guard a user's measure of change: its function gets read-only copies, and its result is checked.
-
-    Raises
-    ------
-    InputError
-        If the record is wrong.
-    """
-    texts = (change.name, change.title, change.unit)
-    if not (all(isinstance(text, str) and text.isprintable() for text in texts) and change.name.isidentifier()):
-        raise InputError(
-            guard.source, f"{guard.name}: name, title, unit = {texts!r}", "printable texts, the name an identifier"
-        )
-    if not callable(change.function):
-        raise InputError(
-            guard.source, f"{guard.name}: function = {change.function!r}", "a function of settings and characteristics"
-        )
-
-    def guarded_function(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-        values = guard.call(change.name, change.function, read_only_copy(settings), characteristics)
-        return guard.numbers(change.name, "values", values, (len(settings),))
-
-    return Change(name=change.name, title=change.title, unit=change.unit, function=guarded_function)
+def checked_change(code: UserCode) -> Change:
+    """A user's measure of change, whose values are checked; raises an `InputError` if the record is wrong."""
+    change: Change = code.target
+    texts = [change.name, change.title, change.unit]
+    is_text = all(isinstance(text, str) and text.isprintable() for text in texts)
+    if not (is_text and change.name.isidentifier() and callable(change.function)):
+        expected = "printable texts, the name an identifier, and a function"
+        raise InputError(code.source, f"{code.name} is {quoted(change)}", expected)
+    return msgspec.structs.replace(change, function=code.checked_function(change.function, change.name, FINITE, len))

@@ -10,13 +10,12 @@ import numpy as np
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.fmu import REAL_TYPES, Description, Fleet, History, Instances
 from safevar_sumo.fmu.description import COMMON_UNITS, Unit
-from safevar_sumo.plugins import POSITIVE, Guard, open_rows
+from safevar_sumo.plugins import POSITIVE, UserCode, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study.schema import Parameters
 from safevar_sumo.vehicles.base import (
     LEGAL_STATE,
     LEVEL,
-    SPEED_ROUNDING,
     Characteristics,
     DelayedSignal,
     Sensors,
@@ -39,6 +38,8 @@ TYPE_UNITS: Mapping[str, str] = {
     "max_speed": "m/s",
     "actuator_lag": "s",
 }
+SPEED_ROUNDING = 1e-9
+"""Relative tolerance of speeds."""
 SPEED_TOLERANCE = 1e-6
 """Largest difference between an FMU's speed at the start and the initial speed [m/s]."""
 DEFAULT_LAG = 0.1
@@ -87,7 +88,7 @@ class FmuVehicle(Vehicle):
         The characteristics of the study and their units.
     table
         The study's table `vehicle`.
-    guard
+    code
         Calls the FMU and checks its results.
 
     Raises
@@ -98,8 +99,8 @@ class FmuVehicle(Vehicle):
 
     UNITS: Mapping[str, str]
 
-    def __init__(self, description: Description, units: Mapping[str, str], table: Parameters, guard: Guard) -> None:
-        source, self._guard, self.UNITS = guard.source, guard, dict(units)
+    def __init__(self, description: Description, units: Mapping[str, str], table: Parameters, code: UserCode) -> None:
+        source, self._code, self.UNITS = code.source, code, dict(units)
         self._communication_step = description.communication_step(table["step"], source, "vehicle")
         self._sensor_entries, self._type_entries = table["sensors"], {"actuator_lag": DEFAULT_LAG, **table["sumo_type"]}
         for key, entries in {**table, "sumo_type": self._type_entries}.items():
@@ -125,7 +126,7 @@ class FmuVehicle(Vehicle):
         self.max_vehicles = self._instances.max_vehicles
         if "road_friction" not in inputs:
             self.remarks = [
-                f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it "
+                f"{code.name} has no vehicle.inputs.road_friction: weather has no effect on how it "
                 "accelerates and brakes"
             ]
 
@@ -141,7 +142,7 @@ class FmuVehicle(Vehicle):
 
         Entries are numbers, characteristics or, in `sumo_type`, variables of the FMU, which are returned.
         """
-        source, variables = self._guard.source, {}
+        source, variables = self._code.source, {}
         for name, entry in entries.items():
             entry_key, characteristic = f"vehicle.{key}.{name}", table["characteristics"].get(entry)
             if name not in quantities:
@@ -190,7 +191,7 @@ class FmuVehicle(Vehicle):
         }
         fleet, outputs = Fleet(self._instances, n, step, self._communication_step), dict[str, FloatArray]()
         if self._reads_type:
-            outputs, _ = self._guard.call("initialisation", fleet.start, inputs)
+            outputs, _ = self._code.call("initialisation", fleet.start, inputs)
 
         def quantity(name: str, entry: str | float) -> FloatArray:
             """Values of a quantity, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
@@ -202,13 +203,15 @@ class FmuVehicle(Vehicle):
             return unit.to(si_unit, characteristics[entry])
 
         types = {name: quantity(name, self._type_entries[name]) for name in TYPE_UNITS}
-        checked = [self._guard.numbers("sumo_type", name, values, (n,), POSITIVE) for name, values in types.items()]
+        checked = [
+            self._code.check_numbers("sumo_type", name, values, (n,), POSITIVE) for name, values in types.items()
+        ]
         sensors = {SENSOR_FIELDS[name]: quantity(name, entry) for name, entry in self._sensor_entries.items()}
         return _Prepared(fleet, inputs, SumoType(*checked), Sensors.perfect(n)._replace(**sensors), step)
 
     def _refuse_start(self, name: str, reason: str, otherwise: str) -> None:
-        problem = f"{self._guard.name} has no vehicle.inputs.{name}, and {reason}"
-        raise UserCodeError(self._guard.source, problem, f"a variable for it, or scenarios with {otherwise}")
+        problem = f"{self._code.name} has no vehicle.inputs.{name}, and {reason}"
+        raise UserCodeError(self._code.source, problem, f"a variable for it, or scenarios with {otherwise}")
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types
@@ -224,13 +227,12 @@ class FmuVehicle(Vehicle):
         if np.any(speed > 0) and not self._has_initial_speed:
             self._refuse_start("initial_speed", "the traffic puts it onto the road in motion", "departSpeed 0")
         inputs = {**prepared.inputs, "initial_speed": speed}
-        outputs, history = self._guard.call("initialisation", prepared.fleet.start, inputs)
+        outputs, history = self._code.call("initialisation", prepared.fleet.start, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(outputs, released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > SPEED_TOLERANCE)[:1]:
-            raise self._guard.wrong_value(
-                "initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed"
-            )
+            expected = f"{speed[i]:g} m/s, the initial speed"
+            raise self._code.wrong("initialisation", f"speed = {float(state.speed[i])}", expected)
         return state._replace(speed=np.asarray(speed, dtype=float))
 
     def sensors(self, prepared: _Prepared) -> Sensors:
@@ -247,13 +249,12 @@ class FmuVehicle(Vehicle):
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         inputs = {**prepared.inputs, **command._asdict()}
-        outputs, at_end, history = self._guard.call("doStep", prepared.fleet.advance, state.history, inputs)
+        outputs, at_end, history = self._code.call("doStep", prepared.fleet.advance, state.history, inputs)
         next_state = self._state({**outputs, "speed": at_end["speed"]}, command, state.seen, history)
         max_speed = prepared.types.max_speed
         for i in open_rows(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
-            raise self._guard.wrong_value(
-                "doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}"
-            )
+            expected = f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}"
+            raise self._code.wrong("doStep", f"speed = {float(next_state.speed[i])}", expected)
         return next_state
 
     def _state(
@@ -263,6 +264,7 @@ class FmuVehicle(Vehicle):
         values = {"gear": np.ones(n), **command._asdict(), **outputs}
         values["speed"] = np.where(np.abs(speed) < SPEED_ROUNDING, 0.0, speed)
         columns = {
-            name: self._guard.numbers("doStep", name, values[name], n, legal) for name, legal in LEGAL_STATE.items()
+            name: self._code.check_numbers("doStep", name, values[name], n, legal)
+            for name, legal in LEGAL_STATE.items()
         }
         return _State(**columns, seen=seen, history=history)

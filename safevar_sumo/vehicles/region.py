@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Guard, Lookup, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
@@ -34,19 +33,39 @@ MEAN_CHANGES = 2
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation.
-
-    `quantity` maps settings, shape (N, n), to values, shape (N,), whose range in the domains has the size `width`;
-    `condition` and `suffix` are the bounds and the unit in words.
+    """A constraint as a computation: the `weights` of characteristics by their numbers, the size `width` of the sum's
+    range in the domains, its bounds, and the bounds and unit in words, `condition` and `suffix`.
     """
 
     constraint: Constraint
-    quantity: Callable[[FloatArray], FloatArray]
+    weights: tuple[tuple[int, float], ...]
     width: float
     minimum: float
     maximum: float
     condition: str
     suffix: str
+
+    @classmethod
+    def of(cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet) -> _Bounds:
+        """The computation of a study's constraint."""
+        table, widths = study.vehicle.characteristics, characteristics.upper - characteristics.lower
+        weights = tuple((characteristics.names.index(name), weight) for name, weight in constraint.sum.items())
+        return cls(
+            constraint,
+            weights,
+            float(sum(abs(weight) * widths[column] for column, weight in weights)),
+            -np.inf if constraint.at_least is None else constraint.at_least,
+            np.inf if constraint.at_most is None else constraint.at_most,
+            constraint.bounds_in_words(table),
+            unit_text(constraint.unit_of(table)),
+        )
+
+    def quantity(self, settings: FloatArray) -> FloatArray:
+        """The weighted sum, shape (N,), added term by term so that it does not depend on the number of settings."""
+        total = np.zeros(len(settings))
+        for column, weight in self.weights:
+            total = total + weight * settings[:, column]
+        return total
 
     def excess(self, settings: FloatArray) -> FloatArray:
         """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
@@ -102,10 +121,9 @@ class FeasibleRegion:
                 f"{characteristic.name} = {value:g}{characteristic.suffix}"
                 for characteristic, value in zip(self.characteristics, setting, strict=True)
                 if characteristic.name in bound.constraint.sum
-                or (bound.constraint.function and value != characteristic.original)
             )
             quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
-            problem = f"violates a constraint: {quantity} ({values or 'the original'})"
+            problem = f"violates a constraint: {quantity} ({values})"
             raise InputError(source, problem, bound.condition + otherwise)
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
@@ -158,24 +176,19 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     Raises
     ------
     InputError
-        If a function cannot be loaded, or if the original vehicle or every change is infeasible.
+        If the original vehicle or every change is infeasible.
     """
     source = source or study.source
     characteristics = CharacteristicSet.of(study)
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
-    lookup = Lookup.of(study, source)
-    bounds = tuple(
-        _bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]")
-        for number, constraint in enumerate(study.constraints)
-    )
+    bounds = tuple(_Bounds.of(constraint, study, characteristics) for constraint in study.constraints)
     linear = [
         (tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
         for bound in bounds
-        if bound.constraint.sum
     ]
     domain_ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
-    vertices = _vertices(tuple(linear), *domain_ends) if linear else np.zeros((0, len(characteristics)))
+    vertices = _vertices(tuple(linear), *domain_ends)
     if vertices is None:
         raise InputError(
             source,
@@ -196,43 +209,6 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
             "constraints that leave a region around the original",
         )
     return region
-
-
-def _bounds_of(
-    constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str
-) -> _Bounds:
-    table = study.vehicle.characteristics
-    bounds_and_words = (
-        -np.inf if constraint.at_least is None else constraint.at_least,
-        np.inf if constraint.at_most is None else constraint.at_most,
-        constraint.bounds_in_words(table),
-        unit_text(constraint.unit_of(table)),
-    )
-    if constraint.sum:
-        weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
-        width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
-        return _Bounds(constraint, lambda settings: _weighted_sum(settings, weights), float(width), *bounds_and_words)
-    member = lookup.find({}, constraint.function, f"{key}.function")
-    guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
-    if not callable(member.target):
-        problem = f"{guard.name} is of type {type(member.target).__name__}"
-        raise InputError(lookup.source, problem, "a function of a mapping of arrays")
-
-    def quantity(settings: FloatArray) -> FloatArray:
-        columns = read_only_copy(dict(zip(characteristics.names, settings.T, strict=True)))
-        return guard.numbers("its call", "values", guard.call("its call", member.target, columns), (len(settings),))
-
-    samples = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
-    width = float(np.ptp(samples)) or max(1.0, abs(float(samples[0])))
-    return _Bounds(constraint, quantity, width, *bounds_and_words)
-
-
-def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
-    """A weighted sum, added term by term so that it does not depend on the number of settings."""
-    total = np.zeros(len(settings))
-    for column, weight in weights:
-        total = total + weight * settings[:, column]
-    return total
 
 
 @lru_cache(maxsize=16)

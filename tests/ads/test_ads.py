@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safevar_sumo.ads import ADS, Ads, GuardedAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import ADS, Ads, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.plugins import Guard
+from safevar_sumo.plugins import UserCode
+from safevar_sumo.plugins.contract import checked_class
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.study import ModelTable, load_study, study_names
@@ -21,7 +22,6 @@ from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
 
 STEP = 0.05
-GUARD = Guard("study 'mine'", "ads.model = 'my_module:Wrong'", __file__)
 STUDIES = {load_study(name).ads.model: load_study(name) for name in study_names()}
 NATIVE = load_study("native")
 SYSTEMS = {
@@ -88,7 +88,7 @@ class Timid(ScalarAds):
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
-    ads = PerVehicleAds(Timid, GUARD)
+    ads = PerVehicleAds(Timid, UserCode("it.toml", "ads"))
     memory = ads.start(3, KNOWN, STEP)
     gap = np.array([5.0, 50.0, 50.0])
     for expected in ([0.0, 0.1, 0.1], [0.0, 0.2, 0.2]):
@@ -139,7 +139,8 @@ class NearForMany(Hold):
 
 
 def test_an_ads_of_ones_own_warns() -> None:
-    guard, original = Guard("it.toml", "ads"), CARLA.characteristics.original
-    for ads in (PerVehicleAds(Near, guard), GuardedAds(NearForMany(), guard)):
+    original = CARLA.characteristics.original
+    for_many = checked_class(UserCode("it.toml", "ads", NearForMany), Ads)()
+    for ads in (PerVehicleAds(Near, UserCode("it.toml", "ads")), for_many):
         run = driven(CarToCar(test="CCRs", speed=36), ads, np.stack([original, original]))
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)

@@ -103,7 +103,9 @@ def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Edit, tab
 @pytest.mark.slow
 def test_check_names_the_fmu_whose_driver_brakes_with_nobody_in_sight(small: Make) -> None:
     small("self.pedal = 1.0")
-    assert [(one.check, Path(one.file).name) for one in check("Small.fmu").findings] == [("reaction", "Small.fmu")]
+    assert [(finding.check, finding.where) for finding in check("small.toml")] == [
+        ("reaction", "ads.model = 'Small.fmu'")
+    ]
 
 
 def test_without_fmpy_the_extra_is_named(small: Make, monkeypatch: pytest.MonkeyPatch) -> None:

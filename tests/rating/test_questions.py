@@ -50,8 +50,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_what_is_shipped_passes_the_check() -> None:
-    report = check("euro_ncap_rating")
-    assert report.passed, report.findings
+    assert not check("euro_ncap_rating")
 
 
 @pytest.mark.slow

@@ -20,10 +20,6 @@ from safevar_sumo.vehicles import region_of
 from tests.in_process import json_of, run
 from tests.search.problems import SUN
 
-ROUND = """
-def spread(values):
-    return ((values["tireFric"] - 3.5) / 2.9) ** 2 + ((values["mass"] - 2404) / 660) ** 2
-"""
 BOUND = """
 extends = "smoke"
 [search]
@@ -41,8 +37,9 @@ sum = { tireFric = 1, radius = -0.5 }
 unit = "-"
 at_least = -16.4
 [[constraints]]
-function = "round_region:spread"
-at_most = 0.7
+sum = { tireFric = 1, mass = 0.002 }
+unit = "-"
+at_most = 9.2
 """
 
 
@@ -52,7 +49,7 @@ def is_feasible(values: Mapping[str, float]) -> bool:
     return (
         700 - 1e-6 <= by["mass"] - by["maxBrakeTorque"] <= 1100 + 1e-6
         and by["tireFric"] - 0.5 * by["radius"] >= -16.4 - 1e-6
-        and ((by["tireFric"] - 3.5) / 2.9) ** 2 + ((by["mass"] - 2404) / 660) ** 2 <= 0.7 + 1e-6
+        and by["tireFric"] + 0.002 * by["mass"] <= 9.2 + 1e-6
     )
 
 
@@ -70,7 +67,6 @@ def settings_in(answer: Any) -> Iterator[dict[str, float]]:
 
 @pytest.fixture
 def bound(in_tmp: Path) -> Path:
-    Path("round_region.py").write_text(ROUND)
     Path("bound.toml").write_text(BOUND)
     return in_tmp
 

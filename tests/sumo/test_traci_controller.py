@@ -226,9 +226,12 @@ def main(traci, v):
             "my_script:step",
             "raised in step: traci.simulationStep: is not for a controller of 'vut': safevar_sumo itself starts",
         ),
-        ("my_script:main", "raised in step: traci.start: is not for a controller of 'vut': safevar_sumo itself starts"),
+        ("my_script:main", "raised in main: traci.start: is not for a controller of 'vut': safevar_sumo itself starts"),
         ("my_script:run", "cannot be called as step(traci, vehicle_id)"),
-        ("my_loop:run", "cannot be imported: traci.start: is called while no vehicle is driven: safevar_sumo itself"),
+        (
+            "my_loop:run",
+            "user code raised in main: traci.start: is called while no vehicle is driven: safevar_sumo itself",
+        ),
     ],
 )
 def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str, problem: str, in_tmp: Path) -> None:

@@ -25,7 +25,7 @@ from safevar_sumo.analysis.opinion.multi_body import (
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, GuardedVehicle, Sensors, Slope, SumoType, Vehicle
+from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, Sensors, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.base import Characteristics, DelayedSignal
 from safevar_sumo.vehicles.carla import AIR_DENSITY, FRONTAL_AREA, WHEEL_MASS
 from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
@@ -195,13 +195,12 @@ class SecondVehicle(Vehicle):
 
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
         self._vehicle, self.UNITS, self.spinning = vehicle, vehicle.UNITS, set[bytes]()
-        model: Any = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
-        self.name = next((name for name, cls in VEHICLES.items() if isinstance(model, cls)), "")
+        self.name = next((name for name, cls in VEHICLES.items() if isinstance(vehicle, cls)), "")
         if not self.name:
             problem = f"vehicle.model = {study.vehicle.model!r} is no vehicle that the second model can represent"
             raise InputError(study.source, problem, f"one of {', '.join(MAPPINGS)}, or a class derived from one")
         cls, (shipped, self._represent) = VEHICLES[self.name], MAPPINGS[self.name]
-        self._engine = cls(**{key: getattr(model, key) for key in cls.__struct_fields__})
+        self._engine = cls(**{key: getattr(vehicle, key) for key in cls.__struct_fields__})
         rows = study.vehicle.characteristics.items()
         matching = {name: row.original for name, row in rows if cls.UNITS.get(name) == row.unit}
         originals = {name: row.original for name, row in load_study(shipped).vehicle.characteristics.items()}

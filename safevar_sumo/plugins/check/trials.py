@@ -1,26 +1,25 @@
-"""Trials of user code: simulations, constraints and searches, repeated, in another order and alone."""
+"""Trials of user code: simulations, repeated, in another order and alone, and searches, repeated."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
+from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, Results, differences
-from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
+from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, is_recorded
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
-SIMULATED, SIMULATED_BY_TRACI, COMPUTED = 100, 20, 200
-"""Numbers of settings: that are simulated; that are simulated with a TraCI controller, which is slower; and to which a
-constraint's function is applied.
-"""
+SIMULATED, SIMULATED_BY_TRACI = 100, 20
+"""Numbers of settings that are simulated; with a TraCI controller, which is slower, fewer."""
 SMALLER_BATCHES = 4
 """Number of batches into which the settings are divided for the check `alone`."""
 MATRIX_POINTS = 2
@@ -28,8 +27,15 @@ MATRIX_POINTS = 2
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 """Largest budget, and largest population, of an algorithm's runs."""
 Rows = npt.NDArray[np.intp]
-Failure = tuple[str, str, str]
-"""A failed check, the expected result, and the actual one with the input that shows it."""
+
+
+class Failure(NamedTuple):
+    """A failed check: the actual result, the expected one, and the input that shows it."""
+
+    check: str
+    got: str
+    expected: str
+    input: str = ""
 
 
 def try_simulations(study: Study) -> Iterator[Failure]:
@@ -50,24 +56,12 @@ def try_simulations(study: Study) -> Iterator[Failure]:
     if ":" in study.scenario.model and is_recorded(system):
         recorded, in_sumo = (evaluate(system, settings, engine).results for engine in (Engine.RECORDED, Engine.LIBSUMO))
         for row, difference in differences(recorded, in_sumo, ROUNDING):
-            yield (
+            yield Failure(
                 "contract",
+                f"{difference} in SUMO and in the recorded scene",
                 "reactive_actors = True where somebody reacts to the vehicle under test",
-                f"{difference} in SUMO and in the recorded scene{_inputs(region.characteristics, settings[row])}",
+                _changes(region.characteristics, settings[row]),
             )
-
-
-def try_constraint(study: Study, function: str) -> Iterator[Failure]:
-    """Apply a constraint's function to the original vehicle, the corners of the domains and random settings."""
-    characteristics = CharacteristicSet.of(study)
-    settings = _settings(characteristics, COMPUTED)
-
-    def load() -> Callable[[Rows], Results]:
-        unload_user_modules()
-        bounds = next(bounds for bounds in region_of(study).bounds if bounds.constraint.function == function)
-        return lambda rows: {"the value": bounds.quantity(settings[rows])}
-
-    yield from _try(load, characteristics, settings)
 
 
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
@@ -75,11 +69,11 @@ def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     outputs, repeated = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
-        yield "repetition", expected, f"{len(repeated)} settings instead of {len(outputs)} in another run"
+        yield Failure("repetition", f"{len(repeated)} settings instead of {len(outputs)} in another run", expected)
     elif (outputs != repeated).any():
         row = int(np.argmax((outputs != repeated).any(axis=1)))
         difference = f"setting {row} is {repeated[row].tolist()} instead of {outputs[row].tolist()}"
-        yield "repetition", expected, f"{difference} in another run"
+        yield Failure("repetition", f"{difference} in another run", expected)
 
 
 def _try(
@@ -98,20 +92,17 @@ def _try(
     for other_run, check, circumstance, rows in other_runs:
         other_outputs = other_run(rows)
         for row, difference in differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
-            yield (
-                check,
-                "the same, to the bit",
-                f"{difference} {circumstance}{_inputs(characteristics, settings[rows[row]])}",
-            )
+            changes = _changes(characteristics, settings[rows[row]])
+            yield Failure(check, f"{difference} {circumstance}", "the same, to the bit", changes)
 
 
-def _inputs(characteristics: CharacteristicSet, setting: FloatArray) -> str:
+def _changes(characteristics: CharacteristicSet, setting: FloatArray) -> str:
     changes = [
         f"{characteristic.name} = {value:g}"
         for characteristic, value in zip(characteristics, setting, strict=True)
         if value != characteristic.original
     ]
-    return f", with {', '.join(changes) or 'the original vehicle'}"
+    return ", ".join(changes) or "the original vehicle"
 
 
 def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
@@ -132,7 +123,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     shape (k, n).
     """
     system, lookup, label = assemble(study), Lookup.of(study), name.rpartition(":")[2]
-    member = lookup.find(ALGORITHMS, name, "search.algorithms")
+    member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
     parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
     original = _smooth_evaluations(system, system.characteristics.original[np.newaxis])
     problem = Problem(
@@ -145,8 +136,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     )
     for seed in seeds:
         algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)
-        guarded = GuardedAlgorithm(algorithm, member.guard) if member.guard else algorithm
-        search, settings = guarded.search(problem, np.random.default_rng(seed)), list[FloatArray]()
+        search, settings = algorithm.search(problem, np.random.default_rng(seed)), list[FloatArray]()
         try:
             settings.append(next(search))
             while True:

@@ -58,7 +58,7 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
     (folder / "scipy.py").write_text("raise RuntimeError('not scipy')")
     mine("import numpy, scipy\n" + CONSTANT.format(0.1))
     (folder / "numpy.py").write_text(CONSTANT.format(0.1))
-    with pytest.raises(InputError, match=r"cannot be imported: AttributeError: .*numpy/__init__.py has no 'Mine'"):
+    with pytest.raises(InputError, match=r"cannot be imported: .*numpy/__init__.py has no 'Mine'"):
         mine("", '[ads]\nmodel = "numpy:Mine"\n')
 
 
@@ -144,7 +144,8 @@ def failing(system: object) -> str:
 )
 def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder: Path) -> None:
     message = failing(mine(SCALAR + f"    def drive(self, seen):\n        {body}\n"))
-    assert f"ads.model = 'mine:Mine' {expected}" in message
+    subject = "user code" if "raised" in expected else "ads.model = 'mine:Mine'"
+    assert f"{subject} {expected}" in message
     assert f"({folder / 'mine.py'}:{6 if 'raised' in expected else 5})" in message, (
         "the line that raises, or the method's own"
     )
@@ -165,7 +166,10 @@ def test_ctrl_c_passes(mine: Mine) -> None:
         signal.signal(signal.SIGINT, handler)
 
 
-ARRAYS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
+ARRAYS = "from safevar_sumo.records import Command\n\n\n"
+ARRAYS += (
+    "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
+)
 
 
 @pytest.mark.parametrize(
@@ -174,8 +178,10 @@ ARRAYS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\
         ("seen.speed[:] = 0", "ValueError: assignment destination is read-only"),
         ("return seen.speed", "from drive"),
         ("return (seen.speed * 0, 0)", "from drive"),
-        ("return (seen.speed * 0, seen.speed[:2]), memory", "brake of shape (2,)"),
-        ("return (0, 10**400), memory", "returned brake"),
+        ("return (seen.speed * 0, seen.speed), memory", "an object with the attributes throttle, brake"),
+        ("return Command(seen.speed * 0, seen.speed[:2]), memory", "brake of shape (2,)"),
+        ("return Command(seen.speed * 0, 0.5), memory", "brake of shape ()"),
+        ("return Command(0, 10**400), memory", "returned throttle"),
     ],
 )
 def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) -> None:
@@ -229,11 +235,6 @@ def vehicle(method: str, body: str) -> str:
             "returned speed = inf from sense",
         ),
         ("sumo_type", "result = result._replace(decel=0 * result.decel)", "returned decel = 0.0 from sumo_type"),
-        (
-            "sumo_type",
-            "result = result._replace(max_speed=0 * result.max_speed + 2)",
-            "expected: up to max_speed = 2 of its sumo_type",
-        ),
     ],
 )
 def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
@@ -259,8 +260,7 @@ def scenario(method: str, body: str) -> str:
 @pytest.mark.parametrize(
     ("method", "body", "expected"),
     [
-        ("begin", "world.person_positions('nobody')", "raised in begin"),
-        ("begin", "world.advance([1.0])", "has no 'advance'"),
+        ("begin", "1 / 0", "raised in begin"),
         ("begin", "world.vehicle_positions('vut')[:] = 0", "read-only"),
         ("observe", "result = None", "returned None from observe"),
         (
@@ -288,4 +288,4 @@ def scenario(method: str, body: str) -> str:
 def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
     message = failing(mine(scenario(method, body), SCENARIO))
     assert expected in message
-    assert "scenario.model = 'mine:Mine'" in message
+    assert ("mine.py" if "raised" in message else "scenario.model = 'mine:Mine'") in message

@@ -1,0 +1,343 @@
+"""The contracts of users' classes: the methods that they must have, and what these may return; and errors of user code.
+
+A user's class is completed with the defaults of its base class, and its methods are replaced by ones that get read-only
+arguments and check what they return. An exception of user code becomes an error with its file and line.
+"""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import fields, is_dataclass, replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError, describe_error
+from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.records import BoolArray, FloatArray, IntArray
+
+UserValue = Any
+"""What user code returns, before it is checked."""
+INFINITY = float("inf")
+ABSTRACT = "__isabstractmethod__"
+"""Attribute of an abstract method."""
+MAX_QUOTED_ELEMENTS, MAX_QUOTE = 4, 80
+"""Largest size of an array, and of any other value's text [characters], that an error quotes."""
+_open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
+"""Which of N runs have not ended yet, shape (N,); None outside a simulation."""
+
+
+@contextmanager
+def user_errors(source: str) -> Iterator[None]:
+    """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError` about the study `source`."""
+    try:
+        yield
+    except (UserCodeError, SimulationError, EnvironmentFault, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        if user_error := user_error_of(source, error):
+            raise user_error from error
+        raise
+
+
+def user_error_of(source: str, error: BaseException) -> UserCodeError | None:
+    """The error with the innermost line of user code that raised an exception; None if there is no such line."""
+    frames = [(frame.filename, frame.lineno, frame.name) for frame in traceback.extract_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename:
+        frames.append((error.filename, error.lineno, "import"))
+    for file, line, name in reversed(frames):
+        if is_user_file(file):
+            method, place = name.replace("<module>", "import"), f"{file}:{line}"
+            reason, legal = _reason_of(error)
+            return UserCodeError(source, f"user code raised in {method}: {reason} ({place})", legal, place)
+    return None
+
+
+def _reason_of(error: BaseException) -> tuple[str, str]:
+    """An exception in words, and what is expected."""
+    if isinstance(error, InputError):
+        return f"{error.source}: {error.problem}", error.legal
+    return describe_error(error), ""
+
+
+@contextmanager
+def check_open_runs(are_open: BoolArray) -> Iterator[None]:
+    """Within the block, wrong values are ignored unless their run is open, `are_open`, shape (N,).
+
+    A vehicle whose run has ended still moves while others in its batch drive. `are_open` may change during the block.
+    """
+    token = _open_runs.set(are_open)
+    try:
+        yield
+    finally:
+        _open_runs.reset(token)
+
+
+def open_rows(holds: BoolArray) -> IntArray:
+    """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
+    are_open = _open_runs.get()
+    return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
+
+
+class Legal(NamedTuple):
+    """Legal numbers: from `lowest`, or above it, to `highest`; `infinite` and `undefined` allow infinities and NaN, and
+    `scalar` a number for all vehicles.
+    """
+
+    lowest: float = -INFINITY
+    highest: float = INFINITY
+    above: bool = False
+    infinite: bool = False
+    undefined: bool = False
+    scalar: bool = False
+    kinds: str = "biuf"  # numpy's letters of the legal types
+
+    def __str__(self) -> str:
+        if self.kinds == "b":
+            return "truth values"
+        bounds = f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
+        return f"numbers {bounds}{'' if self.infinite else ', finite'}"
+
+    def holds(self, numbers: FloatArray) -> BoolArray:
+        """Which numbers are legal."""
+        is_legal = (numbers > self.lowest) if self.above else (numbers >= self.lowest)
+        is_legal &= (numbers <= self.highest) & (self.infinite | np.isfinite(numbers))
+        return np.asarray(is_legal | (self.undefined & np.isnan(numbers)))
+
+
+FINITE, POSITIVE, SHARE, TRUTH = Legal(), Legal(0.0, above=True), Legal(0.0, 1.0), Legal(kinds="b")
+
+
+class UserCode(NamedTuple):
+    """User code as errors name it: the study, `source`; its key and name there, such as `ads.model = 'my_ads:Careful'`;
+    and the class, function or record itself.
+    """
+
+    source: str
+    name: str
+    target: Any = None
+
+    def definition(self, method: str = "") -> str:
+        """File and line at which a method begins, else the class or function; "" for FMUs and compiled code."""
+        target = getattr(self.target, "function", self.target)
+        function = inspect.unwrap(getattr(target, method, target))
+        try:
+            return f"{inspect.getfile(function)}:{inspect.getsourcelines(function)[1]}"
+        except (OSError, TypeError):
+            return ""
+
+    def wrong(self, method: str, result: str, expected: str) -> UserCodeError:
+        """The error for a wrong result of a method."""
+        place = self.definition(method)
+        problem = f"{self.name} returned {result} from {method}{f' ({place})' if place else ''}"
+        return UserCodeError(self.source, problem, expected, place)
+
+    def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call an FMU, whose exceptions show no line of user code."""
+        try:
+            return function(*arguments)
+        except (UserCodeError, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            reason, legal = _reason_of(error)
+            raise UserCodeError(self.source, f"{self.name} raised in {method}: {reason}", legal) from error
+
+    def check_numbers(
+        self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...] | None, legal: Legal = FINITE
+    ) -> np.ndarray:
+        """A result as an array, after a check of its type, shape and numbers.
+
+        Parameters
+        ----------
+        shape
+            The shape; None accepts any.
+        """
+        expected = f"{legal}, shape {shape}" if shape is not None else str(legal)
+        try:
+            array = np.asarray(value)
+        except ValueError:
+            raise self.wrong(method, f"{quantity} = {quoted(value)}", expected) from None
+        if array.dtype.kind not in legal.kinds:
+            raise self.wrong(method, f"{quantity} = {quoted(value)}", expected)
+        if shape is not None and array.shape != shape and not (legal.scalar and not array.ndim):
+            raise self.wrong(method, f"{quantity} of shape {array.shape}", expected)
+        wrong_rows = open_rows(~legal.holds(array))
+        if len(wrong_rows):
+            raise self.wrong(method, f"{quantity} = {float(array.flat[wrong_rows[0]])}", expected)
+        return array
+
+    def checked_function(
+        self, function: Callable[..., UserValue], method: str, legal: Legal, count: Callable[[Any], int]
+    ) -> Callable[..., FloatArray]:
+        """A function that gets read-only arguments, and whose result of shape (N,) is checked; `count` returns N of the
+        first argument.
+        """
+
+        def checked(*arguments: Any) -> FloatArray:
+            values = function(*map(read_only, arguments))
+            shape = (count(arguments[0]),)
+            return self.check_numbers(method, "values", values, shape, legal).astype(float)
+
+        return checked
+
+
+class Returned(NamedTuple):
+    """What a method returns: an object, or a tuple of several, with these attributes.
+
+    Attributes
+    ----------
+    parts
+        The legal numbers of the attributes of each object.
+    like
+        Number of the argument whose speeds or pedals have the shape of the attributes, which is passed read-only; None
+        without such an argument: all others are the user's own.
+    then
+        A further check with the arguments of this one; its result takes the result's place.
+    """
+
+    parts: tuple[Mapping[str, Legal], ...] = ()
+    like: int | None = None
+    then: Callable[..., UserValue] | None = None
+
+    def check(self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]) -> UserValue:
+        """The result after the check."""
+        values = (result,) if len(self.parts) == 1 else result
+        if len(self.parts) > 1 and not (isinstance(result, tuple | list) and len(result) == len(self.parts)):
+            names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
+            raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")
+        shape = None if self.like is None or not self.parts else _shape_of(arguments[self.like])
+        for columns, value in zip(self.parts, values, strict=False):
+            for name, legal in columns.items():
+                if name and not hasattr(value, name):
+                    raise code.wrong(method, quoted(result), f"an object with the attributes {', '.join(columns)}")
+                code.check_numbers(method, name or "values", getattr(value, name) if name else value, shape, legal)
+        return result if self.then is None else self.then(code, method, result, *arguments)
+
+
+def _shape_of(argument: Any) -> tuple[int, ...]:
+    """The shape of an array, of the speeds or pedals of a record, or of the speeds in a world."""
+    if hasattr(argument, "speeds"):
+        return np.shape(argument.speeds())
+    return np.shape(getattr(argument, "speed", getattr(argument, "throttle", argument)))
+
+
+def checked_class(code: UserCode, base: type) -> type:
+    """The user's class with the defaults of a base class for members that it lacks, and with checks of what those
+    methods return that the base has in its `RETURNS`.
+    """
+    candidate = code.target
+
+    def checked_method(name: str, returned: Returned) -> Callable[..., UserValue]:
+        def method(self: Any, *arguments: Any) -> UserValue:
+            passed = [read_only(value) if i == returned.like else value for i, value in enumerate(arguments)]
+            result = getattr(super(cls, self), name)(*passed)
+            if result is None and not hasattr(getattr(base, name), ABSTRACT):
+                return None
+            return returned.check(code, name, result, arguments)
+
+        return method
+
+    methods: dict[str, Any] = {
+        name: checked_method(name, returned)
+        for name, returned in getattr(base, "RETURNS", {}).items()
+        if getattr(candidate, name, getattr(base, name)) is not getattr(base, name)
+    }
+    bases = (candidate,) if issubclass(candidate, base) else (candidate, base)
+    cls = types.new_class(
+        candidate.__name__, bases, exec_body=lambda namespace: namespace.update(methods, is_user_code=True)
+    )
+    return cls
+
+
+def violation(candidate: Any, base: type) -> str:
+    """The reason why a class does not meet the contract of a base class, found by inspection only; "" if it does.
+
+    The abstract methods of the base must exist, and every method of the base must take the parameters that it takes
+    there. The class need not derive from the base.
+    """
+    if not inspect.isclass(candidate):
+        return f"is a {type(candidate).__name__}, not a class"
+    for name, parameters in _methods(base).items():
+        attribute, method = getattr(candidate, name, getattr(base, name)), f"{name}({', '.join(parameters)})"
+        if hasattr(attribute, ABSTRACT) or not callable(attribute):
+            return f"has no method {method}"
+        # A static or class method takes no `self`.
+        takes_self = inspect.isfunction(inspect.getattr_static(candidate, name, getattr(base, name)))
+        if not accepts(attribute, takes_self + len(parameters)):
+            return f"has a method {name} that does not take ({', '.join(parameters)})"
+    return ""
+
+
+def contract_of(base: type) -> str:
+    """What a class of this base must have, in words."""
+    methods = [
+        f"{name}({', '.join(parameters)})"
+        for name, parameters in _methods(base).items()
+        if hasattr(getattr(base, name), ABSTRACT)
+    ]
+    return f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with {', '.join(methods)}"
+
+
+def _methods(base: type) -> dict[str, list[str]]:
+    """The public methods of a class, and the names of their parameters without default and without `self`."""
+    return {
+        name: [
+            parameter.name
+            for parameter in list(inspect.signature(method).parameters.values())[1:]
+            if parameter.default is parameter.empty
+        ]
+        for name, method in vars(base).items()
+        if inspect.isfunction(method) and not name.startswith("_")
+    }
+
+
+def accepts(function: Any, count: int) -> bool:
+    """Whether a function can be called with `count` positional arguments; True if the function has no signature."""
+    try:
+        inspect.signature(function).bind(*[None] * count)
+    except TypeError:
+        return False
+    except ValueError:  # compiled code, without a signature
+        return True
+    return True
+
+
+def read_only(value: UserValue) -> Any:
+    """A record in which every array is a read-only view, or a world whose arrays are."""
+    if isinstance(value, np.ndarray):
+        view = value.view()
+        view.flags.writeable = False
+        return view
+    if isinstance(value, tuple):
+        views = map(read_only, value)
+        return type(value)(*views) if hasattr(value, "_fields") else tuple(views)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{field.name: read_only(getattr(value, field.name)) for field in fields(value)})
+    if isinstance(value, Mapping):
+        return MappingProxyType({key: read_only(inner) for key, inner in value.items()})
+    return _ReadOnlyWorld(value) if hasattr(value, "speeds") else value
+
+
+class _ReadOnlyWorld:
+    """A world for scenarios whose methods return read-only arrays."""
+
+    def __init__(self, world: Any) -> None:
+        self._world = world
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self._world, name)
+        return lambda *arguments: read_only(method(*arguments))
+
+
+def quoted(value: object) -> str:
+    """A returned value in a few words on one line."""
+    if isinstance(value, np.ndarray) and value.size > MAX_QUOTED_ELEMENTS:
+        return f"an array of {value.dtype}, shape {value.shape}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= MAX_QUOTE else f"a {type(value).__name__}"
