@@ -92,6 +92,10 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     assert "unfinished, rs 1 of 2 runs" in output
     records = json.loads(run("tables", "part", "--rq", "rq2", "--format", "json").stdout)
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
+    against = json.loads(run("tables", "part", "--rq", "rq2", "--algorithm", "rs", "--format", "json").stdout)
+    assert {(one["algorithm"], one["baseline"]) for one in against} == {("rs", "nsga2")}
+    sizes = zip([one["effect_size"] for one in records], [1 - one["effect_size"] for one in against], strict=True)
+    assert all(one == pytest.approx(other) for one, other in sizes), "the same pair from the other side"
     Path("part/runs/rs-00.jsonl").unlink()
     refused("tables", "part", "--rq", "rq2", message=("only nsga2",))
     for path in Path("part/runs").glob("nsga2-*"):
