@@ -19,7 +19,12 @@ from .analysis.tolerance import tolerance as tolerance
 from .analysis.tolerance.answer import Tolerance as Tolerance
 from .api import Figures as Figures, Tables as Tables, figures as figures, tables as tables
 from .api.running import run as run
-from .api.simulation import Simulation as Simulation, evaluate as evaluate, simulate as simulate
+from .api.simulation import (
+    Simulation as Simulation,
+    evaluate as evaluate,
+    load_study as load_study,
+    simulate as simulate,
+)
 from .campaign import Observer as Observer
 from .campaign.pool import Pool as Pool
 from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
@@ -31,15 +36,9 @@ from .replay.animation import animate as animate
 from .replay.comparison import Comparison as Comparison, compare_with_original as compare_with_original
 from .replay.figure import draw_comparison as draw_comparison
 from .replay.gui import show_in_gui as show_in_gui
-from .report import make_report as make_report, report as report
+from .report import report as report
 from .results import Status as Status, status as status
-from .study import (
-    Study as Study,
-    StudyLike as StudyLike,
-    Weather as Weather,
-    load_study as load_study,
-    study_names as study_names,
-)
+from .study import Study as Study, StudyLike as StudyLike, Weather as Weather, study_names as study_names
 from .terminal import Progress as Progress
 
 __version__: str

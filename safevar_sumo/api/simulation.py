@@ -28,12 +28,12 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.scenarios import Scenario, distance_in_words
-from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study as read_study, plain_values
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import system_at_worst_point
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System, assemble, create_shipped_models
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -245,11 +245,32 @@ def simulate(
     )
 
 
+def load_study(study: StudyLike, **changes: Any) -> Study:
+    """Read a study strictly, and check the parameters of its shipped models.
+
+    Parameters
+    ----------
+    study
+        The study's name, the path of its file, its tables as in a file, or a study to change.
+    changes
+        Keys that override keys of the study, table by table, as in a file that extends the study:
+        `weather="fog"`, `search={"runs": 2}`.
+
+    Raises
+    ------
+    InputError
+        If the study cannot be used; the error names file, key, value and expected values.
+    """
+    loaded_study = read_study(study, **changes)
+    create_shipped_models(loaded_study)
+    return loaded_study
+
+
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
     """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, after the filter if
     `filtered`, infeasible.
     """
-    setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
+    setting = system.characteristics.setting({} if changes is None else changes, "changes", beyond=beyond)
     if not beyond:
         system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
     return setting
@@ -273,7 +294,7 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:
     """Load a study and assemble its system; errors name the study `source`, by default as the caller named it."""
-    loaded_study = load_study(study)
+    loaded_study = read_study(study)
     return loaded_study, assemble(loaded_study, source or (str(study) if isinstance(study, str | Path) else ""))
 
 
@@ -387,6 +408,8 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
     import pandas as pd
 
     names = list(characteristics.names)
+    if isinstance(settings, Sequence):
+        settings = plain_values(settings)
     if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:

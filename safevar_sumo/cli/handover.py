@@ -5,10 +5,8 @@ to a reader, who runs `verify`.
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from hashlib import file_digest
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 import numpy as np
@@ -37,9 +35,6 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.sumo.matrix import system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
-
-if TYPE_CHECKING:
-    from safevar_sumo.report.verification import Verification
 
 FORMATS_WITHOUT_NOTES = ("csv", "json")
 """Formats of tables without notes; notes go to standard error."""
@@ -185,81 +180,48 @@ def export(directory: str, solution: str, point: str | None, to: str, out: Path)
 @click.option(
     "--repair", "questions", flag_value="repair", multiple=True, help="With repairs, by [repair] of the study."
 )
-@click.option(
-    "--reference",
-    "references",
-    multiple=True,
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE.csv",
-    help="Validate each study with these published rows; may be repeated.",
-)
-@click.option("--digests-only", is_flag=True, help="Leave your code and files out; the pack then has their digests.")
 @jobs_option
-def evidence(
-    directories: tuple[str, ...],
-    out: Path,
-    questions: tuple[str, ...],
-    references: tuple[Path, ...],
-    digests_only: bool,
-    jobs: int | None,
-) -> None:
-    """Pack results DIR... with their study, answers and dossier, so that anybody can make every number again."""
+def evidence(directories: tuple[str, ...], out: Path, questions: tuple[str, ...], jobs: int | None) -> None:
+    """Pack results DIR... with their study, page and answers, so that anybody can compute every number again."""
     from safevar_sumo.report.evidence import make_pack
     from safevar_sumo.report.pack import write_pack
 
     check_output(out, "--out", (".zip",))
     with open_progress(True) as progress:
-        description, files = make_pack(directories, questions, references, jobs, progress, digests_only=digests_only)
-    write_pack(out, description, files)
+        studies, files = make_pack(directories, questions, jobs, progress)
+    write_pack(out, studies, files)
     click.echo(f"Evidence: {out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {file_digest_of(out)})")
 
 
 @commands.command()
 @click.argument("pack", type=click.Path(path_type=Path), metavar="PACK.zip")
-@click.option("--sample", type=click.IntRange(1), metavar="N", help="Only N claims, drawn at random.")
 @click.option("--search", is_flag=True, help="Repeat the whole search, too.")
 @click.option("--run-code", is_flag=True, help="Let user code of the pack run.")
 @jobs_option
 @json_option
-def verify(pack: Path, sample: int | None, search: bool, run_code: bool, jobs: int | None, as_json: bool) -> None:
-    """Make every claim of a pack of evidence again and compare: exit code 0 if all are the same, else 1."""
-    from safevar_sumo.report import verification
+def verify(pack: Path, search: bool, run_code: bool, jobs: int | None, as_json: bool) -> None:
+    """Compute what a pack of evidence claims again and compare: exit code 0 if all is the same, else 1."""
+    from safevar_sumo.report import evidence
 
     with open_progress(True) as progress:
-        result = verification.verify(pack, sample, search=search, run_code=run_code, jobs=jobs, progress=progress)
+        claims = evidence.verify(pack, search=search, run_code=run_code, jobs=jobs, progress=progress)
+    verdicts = {"same": evidence.SAME, "differs": evidence.DIFFERS, "cannot": evidence.CANNOT}
+    counts = {key: sum(claim.verdict == verdict for claim in claims) for key, verdict in verdicts.items()}
     if as_json:
-        print_json({"pack": str(pack), "sha256": file_digest_of(pack), **result.to_dict()})
+        described = {"pack": str(pack), "sha256": file_digest_of(pack), "claims": len(claims), **counts}
+        print_json({**described, "table": [claim._asdict() for claim in claims]})
     else:
-        print_verification(Console(), result)
-    if result.count_verdict(verification.SAME) < len(result.claims):
+        table = WholeTable("study", "claim", "verdict", "in the pack", "here")
+        for claim in claims:
+            table.add_row(*claim)
+        console = Console()
+        console.print(table)
+        numbers = ", ".join(f"{counts[key]} {verdict}" for key, verdict in verdicts.items())
+        print_text(console, f"{len(claims)} claims: {numbers}.")
+    if counts["same"] < len(claims):
         click.get_current_context().exit(1)
 
 
 def file_digest_of(path: Path) -> str:
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
-
-
-MAX_ROWS = 30
-"""Number of claims that differ, of each kind, that the terminal shows."""
-
-
-def print_verification(console: Console, result: Verification) -> None:
-    """Print a row for each answer; for solutions and settings, a row for each that is not the same, and one for all of
-    a verdict together.
-    """
-    table, counts = WholeTable("study", "claim", "verdict", "in the pack", "here"), Counter[tuple[str, ...]]()
-    for claim in result.claims:
-        kind = claim.claim.partition(" ")[0]
-        if kind not in ("solution", "setting"):
-            table.add_row(*claim)
-            continue
-        counts[claim.study, kind, claim.verdict] += 1
-        if claim.verdict != "same" and counts[claim.study, kind, claim.verdict] <= MAX_ROWS:
-            table.add_row(*claim)
-    for (study, kind, verdict), count in counts.items():
-        table.add_row(study, f"{count} {kind}s together", verdict, "", "")
-    console.print(table)
-    same, differ = result.count_verdict("same"), result.count_verdict("differs")
-    rest = len(result.claims) - same - differ
-    print_text(console, f"{len(result.claims)} claims: {same} same, {differ} differ, {rest} cannot be made here.")

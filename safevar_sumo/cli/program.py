@@ -42,8 +42,8 @@ COMMANDS_BY_GROUP = {
             "study",
             "Show the progress of a study running in another process: runs, front, collisions, time left.",
         ),
-        "evidence": ("handover", "Pack results, answers and a dossier, so that anybody can make every number again."),
-        "verify": ("handover", "Make every claim of a pack of evidence again, and compare."),
+        "evidence": ("handover", "Pack results, page and answers, so that anybody can compute every number again."),
+        "verify": ("handover", "Compute what a pack of evidence claims again, and compare."),
         "export": ("handover", "Write a solution for CARLA, or as OpenSCENARIO and OpenDRIVE."),
         "check": (
             "catalogue",

@@ -45,8 +45,6 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import print_answer, print_parts
 from safevar_sumo.vehicles import CharacteristicSet
 
-SPREADSHEET_ENDINGS = (".xlsx",)
-
 
 def add_question(
     options: type[Options], metavar: str, *further_decorators: Decorator
@@ -260,18 +258,21 @@ def compare(
     "--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells."
 )
 @file_option("--plot", "Draw the matrices to this file: png, pdf or svg.")
-@file_option(
-    "--xlsx",
-    "Write the official spreadsheet with the predictions of the variant, if any, else "
-    "of the original, to this file; needs --template or --preprocessed.",
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(["text", "json", "csv"]),
+    default="text",
+    show_default=True,
+    help="Format of the answer; csv prints one table, without notes.",
 )
-@file_option("--template", "Output of the official calculator's generate-template: ca_template.xlsx.")
-@file_option(
-    "--preprocessed",
-    "Output of the calculator's preprocess: its verification sheets are "
-    "filled with simulated results, in --xlsx, or with --force in this file.",
+@click.option(
+    "--table",
+    type=click.Choice(["tests", "cells"]),
+    default="tests",
+    show_default=True,
+    help="The table that csv prints.",
 )
-@click.option("--force", is_flag=True, help="Overwrite existing files.")
 @as_it_is_now_option
 @jobs_option
 @json_option
@@ -282,10 +283,8 @@ def rating(
     solution: str | None,
     matrix: bool,
     plot: Path | None,
-    xlsx: Path | None,
-    template: Path | None,
-    preprocessed: Path | None,
-    force: bool,
+    format_name: str,
+    table: str,
     jobs: int | None,
     as_json: bool,
 ) -> JsonAnswer:
@@ -297,43 +296,15 @@ def rating(
     characteristics = CharacteristicSet.of(study_in(subject))
     values = read_changes(changes, characteristics, beyond=False, single=True)
     options = RatingOptions(changes={name: value for name, (value,) in values.items()}, solution=solution)
-    if force and xlsx is None and preprocessed is None and plot is None:
-        raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
     check_output(plot, "--plot")
-    if plot is not None:
-        _refuse_existing(plot, "--plot", force)
-    spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
     result = answer_question(rate_variant, subject, options, jobs=jobs)
     for remark in result.remarks:
         print_note(remark)
-    answer = _show(result, as_json, plot)
-    if matrix and not as_json:
+    if format_name == "csv":
+        frame = result.cells if table == "cells" else result.to_frame()
+        click.echo(frame.to_csv(index=False, lineterminator="\n"), nl=False)
+        return _show(result, None, plot)
+    answer = _show(result, as_json or format_name == "json", plot)
+    if matrix and not as_json and format_name == "text":
         print_parts(Console(), matrix_tables(result.vehicles))
-    if spreadsheet is not None:
-        vehicle = result.variant or result.original
-        spreadsheet.fill(vehicle)
-        click.echo(f"Spreadsheet of {vehicle.name}: {spreadsheet.output}", err=True)
     return answer
-
-
-def _refuse_existing(path: Path, flag: str, force: bool) -> None:
-    if path.exists() and not force:
-        raise InputError(flag, f"{path} exists", "another file, or --force")
-
-
-def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
-    """The spreadsheet to fill, read and checked before any simulation; None without --xlsx and --preprocessed."""
-    if xlsx is None and template is None and preprocessed is None:
-        return None
-    source_file = preprocessed if template is None else template
-    if source_file is None or (template is not None and (xlsx is None or preprocessed is not None)):
-        problem = "a spreadsheet needs the official template, or the calculator's preprocessed file, but not both"
-        raise InputError("--xlsx", problem, "--xlsx with --template or --preprocessed, or --preprocessed alone")
-    output, flag = (source_file, "--preprocessed") if xlsx is None else (xlsx, "--xlsx")
-    _refuse_existing(output, flag, force)
-    check_output(output, flag, SPREADSHEET_ENDINGS)
-    try:
-        from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
-    except ModuleNotFoundError:
-        raise InputError(flag, "openpyxl is not installed", "in the checkout: pip install '.[rating]'") from None
-    return (PreprocessedFile if template is None else Template)(source_file, output)

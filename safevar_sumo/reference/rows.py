@@ -6,10 +6,8 @@ in most files, `Dece`. There is no run column.
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Mapping
-from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,13 +48,10 @@ class ReferenceData(NamedTuple):
         table.
     metrics
         Name -> values, shape (M,). TET and TIT of a collision are NaN, and so are metrics without a column.
-    fingerprint
-        SHA-256 of the file's bytes.
     """
 
     settings: FloatArray
     metrics: dict[str, FloatArray]
-    fingerprint: str = ""
 
     @property
     def collided(self) -> BoolArray:
@@ -79,10 +74,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         range.
     """
     try:
-        content = path.read_bytes()  # once: a pipe cannot be read again
-        lines = pd.read_csv(
-            io.BytesIO(content), dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
-        )
+        lines = pd.read_csv(path, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig")
         if not isinstance(lines.index, pd.RangeIndex):
             raise ValueError("rows have more values than the header has columns")
         table = lines.rename(columns=str.strip).dropna(how="all")
@@ -117,7 +109,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     metrics = {name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS}
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
     metrics |= {name: np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name]) for name in ("tet", "tit")}
-    return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics, sha256(content).hexdigest())
+    return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics)
 
 
 def _plain_name(name: str) -> str:

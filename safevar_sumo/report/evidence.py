@@ -1,167 +1,174 @@
-"""What a pack of evidence claims about results.
-
-`evidence` makes the files of a pack one after the other, each from those before it; `verify` makes them again.
+"""Evidence that anybody can compute again: `make_pack` packs results with their page and answers; `verify` computes
+everything anew from the pack alone, in a fresh folder, and compares.
 """
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
+from functools import cached_property, partial
+from itertools import chain, zip_longest
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import Case, are_collisions, build_case
-from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.analysis.rating.compute import rate_variant
-from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.repair.compute import find_repairs
-from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.risk.compute import estimate_risk
-from safevar_sumo.analysis.subject import answer_question, study_or_case
-from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.compute import find_tolerances
-from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.errors import InputError
+from safevar_sumo.analysis.case import Case, build_case
+from safevar_sumo.analysis.subject import changes_since, study_or_case
+from safevar_sumo.api.running import run
+from safevar_sumo.api.simulation import evaluate_settings
+from safevar_sumo.errors import InputError, SafevarError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import file_by_name, is_shipped
-from safevar_sumo.records import FloatArray, JsonObject
-from safevar_sumo.reference.rows import read_reference
-from safevar_sumo.report.dossier import dossier_page, make_dossier
-from safevar_sumo.report.measurements import check_study, settings_of, validate_with
-from safevar_sumo.report.pack import Description, PackedAnswer, PackedStudy, describe
-from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, read_manifest
-from safevar_sumo.study import Origin, Study, convert_table, write_study
+from safevar_sumo.records import JsonObject
+from safevar_sumo.report.input import ReportInput
+from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedStudy, Question, read_pack
+from safevar_sumo.report.page import make_page
+from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, read_manifest, record
+from safevar_sumo.study import Origin, Study, convert_table, user_code_names, write_study
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_of
-from safevar_sumo.terminal import Progress
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import Progress, show_no_progress
 
-QUESTIONS: Mapping[str, tuple[type[Options], Callable[..., Any]]] = {
-    "explain": (ExplainOptions, explain_failures),
-    "tolerance": (ToleranceOptions, find_tolerances),
-    "risk": (RiskOptions, estimate_risk),
-    "rating": (RatingOptions, rate_variant),
-    "repair": (RepairOptions, find_repairs),
+STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
+"""Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
+FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
+SECTIONS_WITHOUT_QUESTION = ("tested", "trust", "reproduce")
+SECTIONS_OF_QUESTION: Mapping[Question, tuple[str, ...]] = {
+    "explain": ("verdict", "causes"),
+    "tolerance": ("tolerance",),
+    "risk": ("risk",),
+    "repair": ("repair",),
+    "rating": (),
 }
-"""The questions whose answers a pack may hold: their options, and the functions that compute them."""
-STUDY, SETTINGS, CHECKS = "study.toml", "settings.csv", "checks.json"
-DOSSIER, DOSSIER_PAGE = "dossier.json", "dossier.html"
-ANSWERS, CODE, REFERENCES, VALIDATIONS = "answers", "code", "references", "validations"
-"""Files and folders of a study in a pack, beside manifest and solutions."""
-PLACE = "place"
-"""Column of `settings.csv`: the answer that names a setting, and where in its JSON."""
-TEXT_COLUMNS = ("algorithm", "outcome", PLACE)
-WHOLE_COLUMNS = ("run", "f_num_diff")
+"""The sections of the page that show an answer of the pack; the page of a rated study shows its rating alone."""
+SAME, DIFFERS, CANNOT = "same", "differs", "cannot be run"
+CONTEXT, SHOWN = 40, 200
+"""Characters of a long value that are shown before the first one that differs, and in all."""
 
 
-class PackedSubject(NamedTuple):
-    """A study of a pack, with the files of its folder; its case has the solutions that the pack's CSV file holds."""
+class Claim(NamedTuple):
+    """A claim of a pack: its study and name, whether it is the same here, and both values if it is not."""
 
-    packed: PackedStudy
-    files: dict[str, bytes]
-    manifest: JsonObject
-    case: Case
-
-    @property
-    def study(self) -> Study:
-        return self.case.study
-
-    def names_in(self, *folders: str) -> list[str]:
-        """The distinct names, without folder and ending, of the files in some folders."""
-        names = (PurePosixPath(name) for name in self.files)
-        return sorted({name.stem for name in names if str(name.parent) in folders})
-
-    @property
-    def made_files(self) -> list[str]:
-        """The files that `make` makes, in order."""
-        answers = [f"{ANSWERS}/{answer.question}.json" for answer in self.packed.answers]
-        validations = [f"{VALIDATIONS}/{name}.json" for name in self.names_in(REFERENCES, VALIDATIONS)]
-        return [*validations, *answers, CHECKS, STUDY, DOSSIER, DOSSIER_PAGE]
-
-    def make(self, name: str, pool: Pool, progress: Progress) -> bytes:
-        """A file of the pack, from the study and the files before it.
-
-        Raises
-        ------
-        InputError
-            If the published rows of a validation are missing.
-        """
-        folder, stem = name.partition("/")[0], PurePosixPath(name).stem
-        if name == STUDY:
-            return study_text(self.study)
-        if name == CHECKS:
-            return json_bytes(check_study(self.study, settings_of(self.case), pool, progress))
-        if folder == VALIDATIONS:
-            references = (file for file in self.files if file.startswith(f"{REFERENCES}/"))
-            reference = next((file for file in references if PurePosixPath(file).stem == stem), None)
-            if reference is None:
-                raise InputError(name, "the pack has only the digest of its published rows")
-            with tempfile.TemporaryDirectory() as unpacked:
-                path = Path(unpacked, PurePosixPath(reference).name)
-                path.write_bytes(self.files[reference])
-                return json_bytes(validate_with(self.study, path, pool, progress))
-        if folder == ANSWERS:
-            (answer,) = (answer for answer in self.packed.answers if answer.question == stem)
-            options, compute = QUESTIONS[stem]
-            result = answer_question(compute, self.case, options(**answer.options), pool=pool, progress=progress)
-            return json_bytes(result.to_dict())
-        dossier = self.dossier()
-        return json_bytes(dossier) if name == DOSSIER else dossier_page(dossier).encode()
-
-    def dossier(self) -> JsonObject:
-        answers = {
-            answer.question: (answer.command, json.loads(self.files[f"{ANSWERS}/{answer.question}.json"]))
-            for answer in self.packed.answers
-        }
-        validations = [json.loads(self.files[f"{VALIDATIONS}/{name}.json"]) for name in self.names_in(VALIDATIONS)]
-        checks = json.loads(self.files[CHECKS])
-        return make_dossier(self.manifest, self.study, self.packed.counts, answers, checks, validations)
-
-    def named_settings(self, question: str) -> Iterator[tuple[str, FloatArray]]:
-        """The settings that an answer names, with their places."""
-        answer = json.loads(self.files[f"{ANSWERS}/{question}.json"])
-        return _named_settings(answer, self.case.characteristics, question)
-
-    def evaluated(self, settings: FloatArray, pool: Pool, progress: Progress, stage: str) -> pd.DataFrame:
-        """Settings, shape (M, n), as rows of `solutions.csv` without algorithm and run."""
-        evaluations = Evaluator(self.study, pool, progress).evaluate(settings, stage, ignore_constraints=True)
-        frame = evaluations_frame(self.case.characteristics.names, [(("", 0), evaluations)])
-        return frame.drop(columns=["algorithm", "run"])
+    study: str
+    claim: str
+    verdict: str
+    packed: str = ""
+    here: str = ""
 
 
-def subject_of(packed: PackedStudy, files: dict[str, bytes], places: Sequence[str] = ()) -> PackedSubject:
-    """The subject that manifest and solutions among the files describe; user code is in the folders `places`.
+class Packed:
+    """A study of a pack: everything follows from its description, manifest, solutions and code.
 
-    Raises
-    ------
-    InputError, KeyError, TypeError, ValueError
-        If one of them is damaged.
+    The user's code is in the folders `places`, and runs from the first use of `data` on.
     """
-    manifest = json.loads(files[MANIFEST])
-    study = convert_table(MANIFEST, manifest["study"], Study, "study")
-    study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
-    scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
-    frame = read_table(files[SOLUTIONS])
-    case = build_case(study, manifest["original"], frame, frame.iloc[:0], packed.runs, scoring=scoring)
-    return PackedSubject(packed, files, manifest, case)
+
+    def __init__(self, packed: PackedStudy, files: dict[str, bytes], places: Iterable[str], jobs: int | None) -> None:
+        self.packed, self.files, self._jobs, self.progress = packed, files, jobs, show_no_progress
+        self.manifest: JsonObject = json.loads(files[MANIFEST])
+        study = convert_table(MANIFEST, self.manifest["study"], Study, "study")
+        study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
+        scoring = msgspec.convert(self.manifest["scoring"], Scoring) if "scoring" in self.manifest else None
+        solutions, outcomes = read_table(files[SOLUTIONS]), packed.outcomes
+        evaluations = pd.DataFrame({"outcome": np.repeat(list(outcomes), list(outcomes.values()))})
+        original, scoring = self.manifest["original"], scoring or PUBLISHED_SCORING
+        self.case = build_case(study, original, solutions, evaluations, packed.runs, scoring=scoring)
+        self._answers: dict[str, Any] = {}
+
+    @cached_property
+    def data(self) -> ReportInput:
+        study = self.case.study
+        return ReportInput(
+            study_number=1,
+            directory=Path("results", study.name),
+            case=self.case,
+            system=assemble(study, study.source),
+            versions=self.manifest["versions"],
+        )
+
+    def answer(self, question: str) -> bytes:
+        """The command of a question and its answer's JSON."""
+        if question not in self._answers:
+            self._answers[question] = self.data.ask(question, self._jobs, self.progress)
+        command = f"{self.data.command(question)} --json"
+        return json_bytes({"command": command, "answer": self._answers[question].to_dict()})
+
+    def answers(self) -> bytes:
+        return json_bytes({question: json.loads(self.answer(question)) for question in self.packed.questions})
+
+    def page(self) -> bytes:
+        """The page of the answers; that of a rated study has its rating."""
+        for question in [*self.packed.questions, *(["rating"] if self.data.is_rated else [])]:
+            self.answer(question)
+        shown = chain.from_iterable(SECTIONS_OF_QUESTION[question] for question in self.packed.questions)
+        sections = [*SECTIONS_WITHOUT_QUESTION, *shown]
+        return make_page([self.data], sections, [self._answers], {}, self.progress).encode()
+
+    def study_file(self) -> bytes:
+        """A study file with all that the study extends."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"{self.case.study.name}.toml")
+            write_study(path, self.case.study, "The study as it was run, with all that it extends.")
+            return path.read_bytes().partition(b"\n")[2]  # without the path of the schema on this machine
+
+    @cached_property
+    def simulated(self) -> tuple[bytes, bytes]:
+        """The original vehicle's evaluation, and the table of solutions, all simulated again."""
+        characteristics, solutions = self.case.characteristics, self.case.solutions
+        settings = np.vstack([characteristics.original, solutions[list(characteristics.names)].to_numpy(float)])
+        evaluations = evaluate_settings(self.case.study, settings, jobs=self._jobs, progress=self.progress)
+        frame = evaluations_frame(characteristics.names, [(("", 0), evaluations.take(range(1, len(settings))))])
+        frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
+        return json_bytes(record(evaluations, row=0)), rows_of(csv_of(frame))
+
+    @cached_property
+    def searched(self) -> tuple[bytes, bytes]:
+        """The outcomes of all evaluations, and the table of solutions, of the same runs again."""
+        with tempfile.TemporaryDirectory() as folder:
+            study, runs = self.case.study, self.packed.runs
+            results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self.progress, only=runs)
+            return json_bytes(count_outcomes(results.case)), rows_of(csv_of(results.solutions))
+
+    def checks(self, folder: Path, search: bool) -> dict[str, tuple[bytes, Callable[[], bytes]]]:
+        """What the pack claims, and the functions that compute it again, by name; the manifest is in `folder`."""
+        answers, solutions = json.loads(self.files[ANSWERS]), rows_of(self.files[SOLUTIONS])
+        checks: dict[str, tuple[bytes, Callable[[], bytes]]] = {
+            "inputs": (b"", lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode()),
+            "study": (self.files[STUDY], self.study_file),
+            "original vehicle": (json_bytes(self.manifest["original"]), lambda: self.simulated[0]),
+            "solutions": (solutions, lambda: self.simulated[1]),
+        }
+        for question in self.packed.questions:
+            checks[f"answer {question}"] = json_bytes(answers[question]), partial(self.answer, question)
+        checks["report"] = self.files[PAGE], self.page
+        if search:
+            checks["search: outcomes"] = json_bytes(self.packed.outcomes), lambda: self.searched[0]
+            checks["search: solutions"] = solutions, lambda: self.searched[1]
+        return checks
+
+    @property
+    def code(self) -> list[str]:
+        """The user code that simulations would run: files of the pack, and what the study names.
+
+        Networks count, since SUMO's options beside them may name files to write.
+        """
+        study, prefix = self.case.study, f"{CODE}/"
+        files = [name.removeprefix(prefix) for name in self.files if name.startswith(prefix)]
+        return [*files, *user_code_names(study), *(name for name in study.search.algorithms if ":" in name)]
 
 
 def read_table(content: bytes) -> pd.DataFrame:
-    """Read a CSV table of settings to the last bit; raises ValueError or KeyError if a cell is no number."""
+    """Read a table of solutions to the last bit; raises ValueError or KeyError if a cell is no number."""
     frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
-    numbers = [name for name in frame if name not in TEXT_COLUMNS]
+    numbers = [name for name in frame if name not in ("algorithm", "outcome")]
     frame = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
-    return frame.astype({name: int for name in WHOLE_COLUMNS if name in frame})
+    return frame.astype({"run": int, "f_num_diff": int})
 
 
 def json_bytes(value: Any) -> bytes:
@@ -172,127 +179,69 @@ def csv_of(frame: pd.DataFrame) -> bytes:
     return frame.to_csv(index=False, lineterminator="\n").encode()
 
 
-def count_found(
-    solutions: pd.DataFrame, runs: Collection[tuple[str, int]], evaluations: pd.DataFrame
-) -> dict[str, int]:
-    """What a search has found."""
-    return {
-        "solutions": len(solutions),
-        "runs": len(runs),
-        "evaluations": len(evaluations),
-        "collisions": int(are_collisions(evaluations).sum()),
-    }
+def rows_of(table: bytes) -> bytes:
+    """The rows of a CSV table as JSON."""
+    return json_bytes(list(csv.DictReader(io.StringIO(table.decode()))))
 
 
-def command_of(question: str, options: JsonObject, study_name: str) -> str:
-    """The command that prints an answer."""
-    return f"{QUESTIONS[question][0](**options).command_line(f'results/{study_name}')} --json"
-
-
-def _named_settings(answer: Any, characteristics: CharacteristicSet, path: str) -> Iterator[tuple[str, FloatArray]]:
-    """The settings that an answer's JSON names, whole or by their changes from the original, each after its path.
-
-    A setting stands beside its `outcome`; changes with an undefined value name no setting.
-    """
-    names = characteristics.names
-    if isinstance(answer, list):
-        for index, item in enumerate(answer):
-            yield from _named_settings(item, characteristics, f"{path}.{index}")
-    elif isinstance(answer, dict):
-        for key, value in answer.items():
-            is_setting = isinstance(value, dict) and value and value.keys() <= set(names) and "outcome" in answer
-            if is_setting and key in ("setting", "changes") and None not in value.values():
-                original = dict(zip(names, characteristics.original.tolist(), strict=True))
-                yield f"{path}.{key}", np.array([float({**original, **value}[name]) for name in names])
-            else:
-                yield from _named_settings(value, characteristics, f"{path}.{key}")
+def count_outcomes(case: Case) -> dict[str, int]:
+    """The number of evaluations of all finished runs, by outcome."""
+    runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
+    outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
+    return {str(outcome): int(count) for outcome, count in outcomes.value_counts(sort=False).sort_index().items()}
 
 
 def make_pack(
     directories: Iterable[str | Path],
     questions: Collection[str],
-    references: Sequence[Path],
-    jobs: int | None,
-    progress: Progress,
-    *,
-    digests_only: bool,
-) -> tuple[Description, dict[str, bytes]]:
-    """The description and the files of a pack about results.
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> tuple[list[PackedStudy], dict[str, bytes]]:
+    """The description of each study in a pack, and the pack's files.
 
     Parameters
     ----------
     questions
-        Names of `QUESTIONS` to be answered about each.
-    references
-        Files of published rows to validate each study with.
-    digests_only
-        Whether user code and files stay out of the pack.
+        Names of `SECTIONS_OF_QUESTION` to be answered about each study.
 
     Raises
     ------
     InputError
         If a directory holds no results of a study, or its inputs have changed since.
     """
-    if len({path.stem for path in references}) < len(references):
-        raise InputError("references", "two files have the same name", "files of different names")
     cases = []
     for directory in dict.fromkeys(map(Path, directories)):
         case = study_or_case(directory, results_only=True)
         assert isinstance(case, Case)
         if not case.has_runs:
             raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
-        for path in references:
-            read_reference(path, case.characteristics)  # raises errors with the user's path
         cases.append((directory, case))
-    studies, files = [], {}
+    studies, files = [], dict[str, bytes]()
     for number, (directory, case) in enumerate(cases, 1):
-        code = {} if digests_only else _files_of_user(case.study, directory)
-        subject = _subject_of_results(f"{number}-{case.study.name}", directory, case, questions, code)
-        subject.files.update({f"{REFERENCES}/{path.name}": path.read_bytes() for path in references})
-        with local_pool(jobs or available_cores(), case.study.search.time_limit) as pool:
-            for name in subject.made_files:
-                subject.files[name] = subject.make(name, pool, progress)
-            settings = dict[str, FloatArray]()
-            for answer in subject.packed.answers:
-                settings.update(subject.named_settings(answer.question))
-            if settings:
-                frame = subject.evaluated(np.array([*settings.values()]), pool, progress, "named settings")
-                subject.files[SETTINGS] = csv_of(frame.assign(**{PLACE: [*settings]})[[PLACE, *frame]])
-        for name, content in subject.files.items():
-            if not (digests_only and name.startswith(f"{REFERENCES}/")):
-                files[f"{subject.packed.folder}/{name}"] = content
-        studies.append(subject.packed)
-    return describe(studies, digests_only), files
+        study, manifest = case.study, read_manifest(directory)
+        manifest.pop("folders", None)  # of this machine
+        asked = [question for question in SECTIONS_OF_QUESTION if question in questions]
+        described = PackedStudy(f"{number}-{study.name}", asked, list(case.finished_runs), count_outcomes(case))
+        own_files = {
+            MANIFEST: json_bytes(manifest),
+            SOLUTIONS: csv_of(case.solutions),
+            **_files_of_user(study, directory),
+        }
+        packed = Packed(described, own_files, study.origin.places, jobs)
+        packed.progress = partial(_show_within, progress, study.name)
+        own_files |= {STUDY: packed.study_file(), ANSWERS: packed.answers(), PAGE: packed.page()}
+        studies.append(described)
+        files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
+    return studies, files
 
 
-def _subject_of_results(
-    folder: str, directory: Path, case: Case, questions: Collection[str], code: Mapping[str, bytes]
-) -> PackedSubject:
-    """The subject of a results directory, with the files from which `make` makes all others."""
-    name, manifest, answers = case.study.name, read_manifest(directory), []
-    manifest.pop("folders", None)  # of this machine
-    for question, (options, _) in QUESTIONS.items():
-        if question in questions:
-            values = msgspec.to_builtins(options())
-            answers.append(PackedAnswer(question, values, command_of(question, values, name)))
-    counts = count_found(case.solutions, case.finished_runs, case.evaluations)
-    packed = PackedStudy(folder, name, counts, answers, list(case.finished_runs), sorted(code))
-    files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions)}
-    files |= {f"{CODE}/{file}": content for file, content in code.items()}
-    return subject_of(packed, files, case.study.origin.places)
-
-
-def study_text(study: Study) -> bytes:
-    """A study file with all that the study extends."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"{study.name}.toml")
-        write_study(path, study, "The study as it was run, with all that it extends.")
-        return path.read_bytes().partition(b"\n")[2]  # without the path of the schema on this machine
+def _show_within(progress: Progress, whole: str, stage: str, done: int, total: int) -> None:
+    progress(f"{whole}: {stage}", done, total)
 
 
 def _files_of_user(study: Study, directory: Path) -> dict[str, bytes]:
-    """The user's files that count in the identity of results, by the names that a pack gives them, and the views of
-    sumo-gui beside networks, without which SUMO does not start.
+    """The user's files that count in the identity of results, by their names in a pack, and the views of networks,
+    without which SUMO does not start.
     """
     places = study.origin.places
     names = [name for name in read_manifest(directory)["files"] if not (Path(name).is_absolute() or is_shipped(name))]
@@ -300,4 +249,113 @@ def _files_of_user(study: Study, directory: Path) -> dict[str, bytes]:
         view = options_of(Path(file_by_name(name, places))).get("gui-settings-file", "")
         names += [str(Path(name).with_name(view))] if view else []
     paths = {name: file_by_name(name, places) for name in names}
-    return {name: Path(path).read_bytes() for name, path in sorted(paths.items()) if path}
+    return {f"{CODE}/{name}": Path(path).read_bytes() for name, path in sorted(paths.items()) if path}
+
+
+def verify(
+    path: Path,
+    *,
+    search: bool = False,
+    run_code: bool = False,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> list[Claim]:
+    """Compute what a pack claims again, and compare.
+
+    Parameters
+    ----------
+    path
+        The pack.
+    search
+        Whether to repeat the whole search, too.
+    run_code
+        Whether user code in the pack, or named by its studies, may run.
+
+    Raises
+    ------
+    InputError
+        If the pack is damaged, of another version, or holds user code and `run_code` is false.
+    """
+    description, files = read_pack(path)
+    claims = []
+    with tempfile.TemporaryDirectory() as folder:
+        studies = {
+            Path(folder, str(number)): _unpack(path, described, files, Path(folder, str(number)), jobs)
+            for number, described in enumerate(description.studies)
+        }
+        known = {f"{packed.packed.folder}/{name}" for packed in studies.values() for name in packed.files}
+        if unknown := files.keys() - known:
+            raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
+        if not run_code and (code := [name for packed in studies.values() for name in packed.code]):
+            problem = f"`verify` would run code of the pack: {', '.join(code)}"
+            raise InputError(path, problem, "`run_code=True`, if you trust it")
+        for place, packed in studies.items():
+            checks = packed.checks(place, search)
+            for number, (name, (there, compute)) in enumerate(checks.items(), 1):
+                packed.progress = partial(_show_within, progress, f"{number} of {len(checks)}, {name}")
+                claims.append(_compare(packed.case.study.name, name, there, compute))
+    return claims
+
+
+def _unpack(path: Path, described: PackedStudy, files: Mapping[str, bytes], folder: Path, jobs: int | None) -> Packed:
+    """One study of a pack; its manifest and the user's files are written to a folder.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    prefix = f"{described.folder}/"
+    own_files = {name.removeprefix(prefix): content for name, content in files.items() if name.startswith(prefix)}
+    code = {name: content for name, content in own_files.items() if name.startswith(f"{CODE}/")}
+    try:
+        if wrong := FILES ^ (own_files.keys() - code.keys()):
+            raise ValueError(f"{min(wrong)} {'belongs to no claim' if min(wrong) in own_files else 'is missing'}")
+        for name in (MANIFEST, *code):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(own_files[name])
+        packed = Packed(described, own_files, [str(folder / CODE)] if code else [], jobs)
+        if json.loads(own_files[ANSWERS]).keys() != set(described.questions):
+            raise ValueError(f"{ANSWERS} answers other questions than {DESCRIPTION} names")
+    except (
+        AttributeError,
+        LookupError,
+        ValueError,
+        TypeError,
+        RecursionError,
+        msgspec.MsgspecError,
+        InputError,
+    ) as error:
+        raise InputError(path, f"{described.folder} is damaged: {describe_error(error)}", PACK) from None
+    return packed
+
+
+def _compare(study: str, claim: str, packed: bytes, compute: Callable[[], bytes]) -> Claim:
+    """A claim, computed again; the values shown are those at the first difference."""
+    try:
+        here = compute()
+    except SafevarError as error:
+        return Claim(study, claim, CANNOT, here=" ".join(str(error).split()))
+    if packed == here:
+        return Claim(study, claim, SAME)
+    pairs = zip_longest(_list_values(packed), _list_values(here), fillvalue="nothing")
+    first, second = next((first, second) for first, second in pairs if first != second)
+    same = next(index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1)
+    start = max(same - CONTEXT, 0) if max(len(first), len(second)) > SHOWN else 0
+    return Claim(study, claim, DIFFERS, first[start : start + SHOWN], second[start : start + SHOWN])
+
+
+def _list_values(content: bytes) -> Iterator[str]:
+    """Every value of a JSON file with its path, and every line of any text."""
+    text = content.decode(errors="replace")
+    with suppress(ValueError):
+        yield from _values_of(json.loads(text), "")
+    yield from text.splitlines(keepends=True)
+
+
+def _values_of(value: Any, path: str) -> Iterator[str]:
+    if not isinstance(value, dict | list):
+        yield f"{path} = {value}"
+        return
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        yield from _values_of(item, f"{path}.{key}" if path else str(key))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,45 +13,49 @@ import numpy as np
 from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
+from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair import RepairOptions
+from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.risk import RiskOptions
+from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.subject import at_point, changes_since
+from safevar_sumo.analysis.rules.compute import find_rules
+from safevar_sumo.analysis.subject import answer_question, at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
+from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import change_texts
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.scene import lay_out_scene
-from safevar_sumo.results import choose_handle, handles_of
+from safevar_sumo.results import choose_handle, handles_of, read_manifest
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import Progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from safevar_sumo.analysis.explain.failure import Explanation
 
+QUESTIONS: Mapping[str, Callable[..., Any]] = {
+    "explain": explain_failures,
+    "tolerance": find_tolerances,
+    "risk": estimate_risk,
+    "rules": find_rules,
+    "repair": find_repairs,
+    "rating": rate_variant,
+}
+"""The functions that answer the questions of a page, by their commands."""
 SAMPLED_VEHICLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""
 EXPLAIN_SIMULATIONS = 30_000
 """Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
-
-
-def page_options(margin: float | None = None) -> Mapping[str, Options]:
-    """Each question's options on the page: smaller samples than the commands take; `margin` as in `tolerance`."""
-    all_options: tuple[Options, ...] = (
-        ExplainOptions(limit=EXPLAIN_SIMULATIONS),
-        OpinionOptions(),
-        ToleranceOptions(margin=margin),
-        RiskOptions(samples=SAMPLED_VEHICLES),
-        RulesOptions(samples=SAMPLED_VEHICLES),
-        CompareOptions(),
-        RepairOptions(margin=margin),
-    )
-    return {options.question: options for options in all_options}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,16 +63,50 @@ class ReportInput:
     """One study of a report.
 
     `study_number` counts from 1, `directory` holds the results. `point` names the only point of the matrix that the
-    page is about; it is empty for the whole study. `later_changes` names the files and versions that have changed since
-    the results were computed.
+    page is about; it is empty for the whole study. `margin` is that of `tolerance` and `repair`. `versions` are of
+    the packages that the results were computed with; `later_changes` names the files and versions that have changed
+    since.
     """
 
     study_number: int
     directory: Path
     case: Case
     system: System
+    versions: Mapping[str, str]
+    margin: float | None = None
     point: str = ""
     later_changes: Sequence[str] = ()
+
+    @property
+    def is_rated(self) -> bool:
+        """Whether the page is about the points of a rating."""
+        return is_rated(self.case.study) and not self.point
+
+    @cached_property
+    def options(self) -> Mapping[str, Options]:
+        """Each question's options on the page: smaller samples than the commands take; a rated study's variant is the
+        solution with the fewest changes that loses a point.
+        """
+        all_options: tuple[Options, ...] = (
+            ExplainOptions(limit=EXPLAIN_SIMULATIONS),
+            OpinionOptions(),
+            ToleranceOptions(margin=self.margin),
+            RiskOptions(samples=SAMPLED_VEHICLES),
+            RulesOptions(samples=SAMPLED_VEHICLES),
+            CompareOptions(),
+            RepairOptions(margin=self.margin),
+            RatingOptions(solution=self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None),
+        )
+        return {options.question: options for options in all_options}
+
+    def ask(self, question: str, jobs: int | None, progress: Progress) -> Any:
+        """The answer to a question of the page."""
+        options = self.options[question]
+        return answer_question(QUESTIONS[question], self.case, options, jobs=jobs, progress=progress)
+
+    def command(self, question: str) -> str:
+        """The command that prints this answer."""
+        return self.options[question].command_line(str(self.directory), self.point)
 
     @cached_property
     def solutions(self) -> dict[str, JsonObject]:
@@ -121,7 +159,11 @@ class ReportInput:
 
 
 def read_inputs(
-    directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False
+    directories: Iterable[str | Path],
+    point: str | None = None,
+    margin: float | None = None,
+    *,
+    as_it_is_now: bool = False,
 ) -> list[ReportInput]:
     """Read results directories; with `point`, simulate their solutions again at this point of the matrix.
 
@@ -142,6 +184,8 @@ def read_inputs(
                 directory=path,
                 case=subject,
                 system=assemble(subject.study, str(path)),
+                versions=read_manifest(path)["versions"],
+                margin=margin,
                 point=point or "",
                 later_changes=later_changes,
             )

@@ -1,4 +1,4 @@
-"""A pack of evidence: a zip archive of plain files, with a digest of each; reading one refuses what no pack holds."""
+"""A pack of evidence: a zip archive of plain files; reading one refuses what no pack holds."""
 
 from __future__ import annotations
 
@@ -7,78 +7,59 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
-from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
-from typing import NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
-from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS
 from safevar_sumo.results.manifest import PACKAGES, SIMULATORS
 
-FORMAT = 1
+FORMAT = 2
 DESCRIPTION = "pack.json"
 MAX_BYTES = 1_000_000_000
 """Largest size of a pack's files together, unpacked."""
 MAX_FILES = 10_000
+MAX_EVALUATIONS = 100_000_000
 UNIX_MODE_SHIFT = 16
 """Bits of a zip entry's attributes below the mode of its file."""
 PACK = "a file that the command `evidence` has written, unchanged"
 """What an error about a pack expects."""
 
-
-class PackedAnswer(Struct, frozen=True, forbid_unknown_fields=True):
-    """An answer's question, the options with which it was computed, and the command that prints the same bytes."""
-
-    question: str
-    options: JsonObject
-    command: str
+Question = Literal["explain", "tolerance", "risk", "repair", "rating"]
+"""The questions whose answers a pack may hold."""
 
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
-    """One results directory in a pack: its folder there, numbers of what its search found, its answers, the runs that
-    have ended, and the names of the user's files.
+    """One results directory in a pack: its folder there, the questions that its answers answer, its finished runs, and
+    the number of their evaluations by outcome.
     """
 
     folder: str
-    name: str
-    counts: dict[str, int]
-    answers: list[PackedAnswer]
+    questions: list[Question]
     runs: list[tuple[str, int]]
-    code: list[str]
+    outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_EVALUATIONS)]]
 
 
 class Description(Struct, frozen=True, forbid_unknown_fields=True):
-    """The file `pack.json`: versions, studies, and the digest of every other file; `digest` is that of this file's own
-    content.
-    """
+    """The file `pack.json`."""
 
     format: int
     results: int
     versions: dict[str, str]
-    digests_only: bool
-    studies: list[PackedStudy]
-    contents: dict[str, str] = {}
-    digest: str = ""
+    studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
 
-def describe(studies: list[PackedStudy], digests_only: bool) -> Description:
-    """The description of studies packed by this version."""
-    versions = {**{name: version(name) for name in PACKAGES}, "python": sys.version.split()[0]}
-    return Description(FORMAT, RESULTS, versions, digests_only, studies)
-
-
-def write_pack(path: Path, description: Description, files: Mapping[str, bytes]) -> None:
+def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes]) -> None:
     """Write a pack; equal contents give equal bytes."""
-    contents = {name: sha256(files[name]).hexdigest() for name in sorted(files)}
-    described = msgspec.structs.replace(description, contents=contents, digest="")
-    described = msgspec.structs.replace(described, digest=_digest(described))
-    texts = {DESCRIPTION: msgspec.json.format(msgspec.json.encode(described), indent=1) + b"\n", **files}
+    packages = (*PACKAGES, "matplotlib")  # which draws the pictures of the page
+    versions = {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
+    described = msgspec.json.encode(Description(FORMAT, RESULTS, versions, studies))
+    texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
             entry = zipfile.ZipInfo(name)  # with the same date on every day, in 1980
@@ -107,14 +88,15 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     try:
         described = msgspec.json.decode(files.pop(DESCRIPTION), type=Description)
     except (msgspec.MsgspecError, RecursionError) as error:
-        _refuse(path, f"{DESCRIPTION} is damaged: {error}")
-    _check_version(path, described)
-    if described.digest != _digest(described):
-        _refuse(path, f"{DESCRIPTION} was changed: its digest differs")
-    for name in sorted({*described.contents, *files}):
-        if name not in files or described.contents.get(name) != sha256(files[name]).hexdigest():
-            problem = "is missing" if name not in files else "was changed: its digest differs"
-            _refuse(path, f"{name} {problem if name in described.contents else 'does not belong to the pack'}")
+        _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
+    here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
+    other = [f"{name} {described.versions.get(name)}" for name in here if described.versions.get(name) != here[name]]
+    if other or (described.format, described.results) != (FORMAT, RESULTS):
+        raise InputError(
+            path,
+            f"was made with {', '.join(other) or f'format {described.format} and results {described.results}'}",
+            f"a pack of this version: {', '.join(f'{name} {number}' for name, number in here.items())}",
+        )
     return described, files
 
 
@@ -133,21 +115,6 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
         _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
     if (size := sum(entry.file_size for entry in entries)) > MAX_BYTES:
         _refuse(path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_BYTES / 1e9:g} are allowed")
-
-
-def _check_version(path: Path, described: Description) -> None:
-    here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
-    other = [f"{name} {described.versions.get(name)}" for name in here if described.versions.get(name) != here[name]]
-    if other or (described.format, described.results) != (FORMAT, RESULTS):
-        raise InputError(
-            path,
-            f"was made with {', '.join(other) or f'format {described.format} and results {described.results}'}",
-            f"a pack of this version: {', '.join(f'{name} {number}' for name, number in here.items())}",
-        )
-
-
-def _digest(described: Description) -> str:
-    return sha256(msgspec.json.encode(msgspec.structs.replace(described, digest=""))).hexdigest()
 
 
 def _refuse(path: Path, problem: str) -> NoReturn:

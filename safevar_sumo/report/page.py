@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -20,26 +20,18 @@ from markupsafe import Markup
 from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.analysis.rating.compute import rate_variant
-from safevar_sumo.analysis.repair.compute import find_repairs
+from safevar_sumo.analysis.rating.compute import Rating
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.figures import draw_figures
 from safevar_sumo.analysis.research_questions.tables import lay_out
-from safevar_sumo.analysis.risk.compute import estimate_risk
-from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.subject import Results, answer_question
 from safevar_sumo.analysis.tolerance.answer import Tolerance
-from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.replay.comparison import why_different
-from safevar_sumo.report.input import ReportInput, page_options, read_inputs
+from safevar_sumo.report.input import ReportInput, read_inputs
 from safevar_sumo.report.sections import (
     GENERAL_LIMITS,
     describe_agreement,
@@ -55,7 +47,7 @@ from safevar_sumo.report.sections import (
 from safevar_sumo.results import write_whole
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.terminal import Progress, answer_as_html, open_progress, show_no_progress
+from safevar_sumo.terminal import Progress, answer_as_html, open_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,13 +55,6 @@ if TYPE_CHECKING:
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
 """Numbers with more decimals than a screen can show."""
 SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
-DOMAIN_QUESTIONS: Mapping[str, Callable[..., Any]] = {
-    "tolerance": find_tolerances,
-    "risk": estimate_risk,
-    "rules": find_rules,
-    "repair": find_repairs,
-}
-"""Functions that answer the questions about the whole domain, by the name of the section and of the command."""
 HIDDEN_COLUMNS = ("lower", "upper", "not_simulated")
 """Columns of an answer's frame that the table beside its figure leaves out."""
 
@@ -122,9 +107,7 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
     }
 
 
-def commands_to_reproduce(
-    inputs: Sequence[ReportInput], sections: Collection[str], options: Mapping[str, Options]
-) -> list[tuple[str, str]]:
+def commands_to_reproduce(inputs: Sequence[ReportInput], sections: Collection[str]) -> list[tuple[str, str]]:
     """The commands that give the numbers of the page, each after what it reproduces."""
     commands = []
     for data in inputs:
@@ -136,10 +119,10 @@ def commands_to_reproduce(
             )
             what = f"The study {data.case.study.name}, as its manifest.json records it, into another directory"
             commands.append((what, f"python -c {shlex.quote(script)}"))
-        asked = [command for name, command in COMMAND_OF_SECTION.items() if name in sections]
-        if "explain" in asked and not reason_without_opinion(data):
+        asked = questions_of(sections)
+        if "causes" in sections and not reason_without_opinion(data):
             asked.append("opinion")
-        commands += [(f"The part {name}", options[name].command_line(directory, data.point) + flag) for name in asked]
+        commands += [(f"The part {name}", data.command(name) + flag) for name in asked]
         if not data.point:
             simulate = question_command("simulate", directory)
             what = "A replay, with figure and animation"
@@ -171,8 +154,14 @@ SECTIONS = {
 """Headings of the sections in order, by the names that `--only` accepts."""
 
 
-COMMAND_OF_SECTION = {"causes": "explain", **{name: name for name in DOMAIN_QUESTIONS}}
-"""The command that computes each section that needs simulations."""
+QUESTION_OF_SECTION = {"verdict": "explain", "causes": "explain"}
+QUESTION_OF_SECTION |= {name: name for name in ("tolerance", "risk", "rules", "repair")}
+"""The question that each section answers which needs simulations of its own."""
+
+
+def questions_of(sections: Collection[str]) -> list[str]:
+    """The questions that sections answer."""
+    return list(dict.fromkeys(question for name, question in QUESTION_OF_SECTION.items() if name in sections))
 
 
 def report(
@@ -227,14 +216,25 @@ def report(
     """
     _check_sections(only, paper, point)
     directories = [source.directory if isinstance(source, Results) else source for source in results]
-    inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
+    inputs = read_inputs(directories, point, margin, as_it_is_now=as_it_is_now)
+    if len({data.is_rated for data in inputs}) > 1:
+        problem = "some hold results of rated studies, others do not"
+        raise InputError("directories", problem, "a report for each kind")
     if len(inputs) != 2 and "compare" in only:
         raise InputError("only", f"compare needs two results, and there are {len(inputs)}", "two results directories")
     for data in inputs:
         for change in data.later_changes:
             warn(f"{data.directory}: {change}")
+    is_possible = {
+        "questions": paper,
+        "compare": len(inputs) == 2,
+        "repair": all(data.case.study.repair.promise or data.case.study.limits for data in inputs),
+    }
+    sections = only or [name for name in SECTIONS if is_possible.get(name, True)]
     with open_progress(progress) as show_progress:
-        page = _make_page(inputs, only, page_options(margin), jobs, show_progress, paper=paper)
+        answers = [answer_sections(data, sections, jobs, show_progress) for data in inputs]
+        comparison = _comparison_data(inputs, jobs, show_progress) if "compare" in sections else {}
+        page = make_page(inputs, sections, answers, comparison, show_progress)
     if out is not None:
         write_whole(Path(out), page)
     return page
@@ -250,58 +250,40 @@ def _check_sections(only: Sequence[str], paper: bool, point: str | None) -> None
         raise InputError("point", problem, "the page without them, or no `point`")
 
 
-def make_report(
-    directories: Iterable[str | Path],
-    only: Sequence[str] = (),
-    jobs: int | None = None,
-    progress: Progress = show_no_progress,
-    *,
-    point: str | None = None,
-    paper: bool = False,
-    as_it_is_now: bool = False,
-) -> str:
-    """The page of `report` about results in directories."""
-    return report(
-        *directories, only=only, jobs=jobs, progress=progress, point=point, paper=paper, as_it_is_now=as_it_is_now
-    )
+def answer_sections(
+    data: ReportInput, sections: Collection[str], jobs: int | None, progress: Progress
+) -> dict[str, Any]:
+    """The answers about one study that sections of a page need, by question; a rated study has only its rating."""
+    questions = ["rating"] if data.is_rated else questions_of(sections)
+    if data.case.solutions.empty and "explain" in questions:
+        questions.remove("explain")
+    return {question: data.ask(question, jobs, progress) for question in questions}
 
 
-def _make_page(
+def make_page(
     inputs: Sequence[ReportInput],
-    only: Sequence[str],
-    options: Mapping[str, Options],
-    jobs: int | None,
+    sections: Collection[str],
+    answers: Sequence[Mapping[str, Any]],
+    comparison: JsonObject,
     progress: Progress,
-    *,
-    paper: bool,
 ) -> str:
+    """The page with these sections, from the answers about each study."""
     names = ", ".join(data.case.name for data in inputs)
-    are_rated = [is_rated(data.case.study) and not data.point for data in inputs]
-    if any(are_rated) and not all(are_rated):
-        problem = "some hold results of rated studies, others do not"
-        raise InputError("directories", problem, "a report for each kind")
-    if any(are_rated):
-        rated_studies = [rated_study_data(data, jobs, progress) for data in inputs]
-        return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=rated_studies)
-    is_possible = {
-        "questions": paper,
-        "compare": len(inputs) == 2,
-        "repair": all(data.case.study.repair.promise or data.case.study.limits for data in inputs),
-    }
-    chosen = only or [name for name in SECTIONS if is_possible.get(name, True)]
-    sections = {name: heading for name, heading in SECTIONS.items() if name in chosen}
-    studies = [_study_data(data, sections, options, jobs, progress) for data in inputs]
+    if inputs[0].is_rated:
+        rated = [rated_study_data(data, given["rating"]) for data, given in zip(inputs, answers, strict=True)]
+        return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=rated)
+    studies = [_study_data(data, sections, given, progress) for data, given in zip(inputs, answers, strict=True)]
     progress("tables and figures", 0, 1)
     cases = [data.case for data in inputs] if "questions" in sections else []
     return _render(
         "report.html.j2",
         title=f"Safety report: {names}",
-        sections=sections,
+        sections={name: heading for name, heading in SECTIONS.items() if name in sections},
         studies=studies,
-        comparison=_comparison_data(inputs, options["compare"], jobs, progress) if "compare" in sections else {},
+        comparison=comparison,
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
-        commands=commands_to_reproduce(inputs, sections, options) if "reproduce" in sections else [],
+        commands=commands_to_reproduce(inputs, sections) if "reproduce" in sections else [],
         general_limits=GENERAL_LIMITS,
         player=player_files(),
         js=_web_file("report.js"),
@@ -309,25 +291,17 @@ def _make_page(
 
 
 def _study_data(
-    data: ReportInput, sections: Collection[str], options: Mapping[str, Options], jobs: int | None, progress: Progress
+    data: ReportInput, sections: Collection[str], answers: Mapping[str, Any], progress: Progress
 ) -> JsonObject:
-    """Make the data of one study that the templates of these sections need."""
-    explained: Explained | None = None
-    if ("verdict" in sections or "causes" in sections) and len(data.case.solutions):
-        explain = partial(explain_failures, statistics="causes" in sections)
-        explained = answer_question(explain, data.case, options["explain"], jobs=jobs, progress=progress)
-    choices = explained.choices if explained else []
+    """The data of one study that the templates of these sections need."""
+    explained: Explained | None = answers.get("explain")
+    choices, tolerance = explained.choices if explained else [], answers.get("tolerance")
+    about_domain = {name: answer for name, answer in answers.items() if name != "explain"}
     replays = replay_solutions(data, explained, progress) if "causes" in sections else []
-    answers = {
-        name: answer_question(compute, data.case, options[name], jobs=jobs, progress=progress)
-        for name, compute in DOMAIN_QUESTIONS.items()
-        if name in sections
-    }
     different = [solution["handle"] for solution in replays if solution["differences"]]
     why = why_different(is_imported=not data.case.has_runs)
     if different:
         warn(f"{data.directory}: simulated again with different results: {', '.join(different)}; {why}")
-    statistics = figure_data(explained.figure(), explained.necessity) if explained and explained.analysed else None
     makers: dict[str, Callable[[], Any]] = {
         "tested": lambda: describe_tested_system(data),
         "verdict": lambda: make_verdict(data, explained),
@@ -339,35 +313,36 @@ def _study_data(
         "title": data.case.study.title,
         "anchor": data.anchor(),
         "replays": replays,
-        "limits": limits_data(answers["tolerance"]) if "tolerance" in answers else None,
+        "limits": limits_data(tolerance) if tolerance else None,
         "failures": [describe_failure(data, failure) for failure in choices],
         "picture": _picture("failure", data.draw_failure(choices[0])) if choices and "verdict" in sections else None,
-        "sheet": _picture("limits", answers["tolerance"].sheet.figure()) if "tolerance" in answers else None,
+        "sheet": _picture("limits", tolerance.sheet.figure()) if tolerance else None,
         "different": different,
         "why_different": why,
         "agreement": describe_agreement(data.case.study),
         "no_verdict": why_no_verdict(data.system),
         "later_changes": data.later_changes,
         "opinion_problem": reason_without_opinion(data),
-        "statistics": statistics,
+        "statistics": figure_data(explained.figure(), explained.necessity)
+        if explained and explained.analysed
+        else None,
         "answers": {
-            name: [part for part in result.sentences() if isinstance(part, str)] for name, result in answers.items()
+            name: [part for part in answer.sentences() if isinstance(part, str)]
+            for name, answer in about_domain.items()
         },
         "figures": {
-            name: figure_data(result.figure(), result.to_frame())
-            for name, result in answers.items()
-            if name not in ("rules", "repair") and not result.to_frame().empty  # whose rows are no characteristics
+            name: figure_data(answer.figure(), answer.to_frame())
+            for name, answer in about_domain.items()
+            if name not in ("rules", "repair") and not answer.to_frame().empty  # whose rows are no characteristics
         },
         **{name: make() for name, make in makers.items() if name in sections},
     }
 
 
-def _comparison_data(
-    inputs: Sequence[ReportInput], options: Options, jobs: int | None, progress: Progress
-) -> JsonObject:
+def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: Progress) -> JsonObject:
     """The page's data about two studies side by side, or the reason why they cannot be compared."""
     first, second = (data.case for data in inputs)
-    compare = partial(compare_systems, other=second)
+    compare, options = partial(compare_systems, other=second), inputs[0].options["compare"]
     try:
         result = answer_question(compare, first, options, jobs=jobs, progress=progress)
     except InputError as error:
@@ -381,20 +356,16 @@ def _comparison_data(
     }
 
 
-def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) -> JsonObject:
-    """The page's data about one rated study: the points of the original vehicle and of the solution with the fewest
-    changes that loses a point.
-    """
+def rated_study_data(data: ReportInput, rating: Rating) -> JsonObject:
+    """The page's data about one rated study: the points of the original vehicle and of its variant."""
     directory = str(data.directory)
-    options = RatingOptions(solution=data.select_handles("fewest")[0] if data.any_unsafe else None)
-    rating = answer_question(rate_variant, data.case, options, jobs=jobs, progress=progress)
     return {
         "answer": Markup(answer_as_html(rating, "h2")),
         "notes": rating.remarks,
         "picture": _picture("matrices", rating.figure()),
         "names": [vehicle.name for vehicle in rating.vehicles],
         "commands": [
-            options.command_line(directory),
+            data.command("rating"),
             *(question_command(question, directory) for question in ("tolerance", "explain")),
         ],
     }

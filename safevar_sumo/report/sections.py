@@ -25,7 +25,6 @@ from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
 from safevar_sumo.replay.comparison import format_number, list_differences
 from safevar_sumo.report.input import ReportInput
-from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.matrix import vehicle_remarks
@@ -219,7 +218,7 @@ def describe_conditions(data: ReportInput) -> str:
 
 def _describe_search(data: ReportInput) -> str:
     case, search = data.case, data.case.study.search
-    versions = ", ".join(f"{name} {value}" for name, value in read_manifest(data.directory)["versions"].items())
+    versions = ", ".join(f"{name} {value}" for name, value in data.versions.items())
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)

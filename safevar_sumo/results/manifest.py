@@ -39,7 +39,6 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "correlations",
     "limits",
     "repair",
-    "evidence",
 )
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")

@@ -12,6 +12,7 @@ from safevar_sumo.study.file import (
     data_files as data_files,
     fmus_of as fmus_of,
     load_study as load_study,
+    plain_values as plain_values,
     user_code as user_code,
     user_code_names as user_code_names,
     user_modules as user_modules,

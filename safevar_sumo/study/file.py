@@ -81,14 +81,27 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
         If the study cannot be used; the error names file, key, value and expected values.
     """
     raw = _raw_study(study)
-    return _checked_study(_with_overrides(raw, changes, raw.source) if changes else raw)
+    return _checked_study(_with_overrides(raw, plain_values(changes), raw.source) if changes else raw)
+
+
+def plain_values(value: Any) -> Any:
+    """Values of numpy and pandas, at any depth of tables and lists, as Python's own: a scalar or an array of no
+    dimension as a number, a Series by names as a table, another Series or array as a list.
+    """
+    if isinstance(value, Mapping):
+        return {key: plain_values(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_values(item) for item in value]
+    if hasattr(value, "to_dict") and all(isinstance(name, str) for name in value.index):
+        return plain_values(value.to_dict())
+    return plain_values(value.tolist()) if hasattr(value, "tolist") else value
 
 
 def _raw_study(study: StudyLike) -> _RawStudy:
     if isinstance(study, Study):
         return _RawStudy(study.source, drop_nulls(tables_of(study)), study.origin)
     if isinstance(study, Mapping):
-        return _with_base(_RawStudy("study", dict(study)), Path("."), ())
+        return _with_base(_RawStudy("study", plain_values(study)), Path("."), ())
     return _read_file(study_path(str(study)), visited_paths=())
 
 

@@ -221,27 +221,6 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     remarks: tuple[str, ...] = ()
 
 
-class EvidenceTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Thresholds that the user declares for measures of validation, before they are computed; no verdict of ours."""
-
-    threshold: dict[
-        Literal[
-            "relative_error",
-            "rmse",
-            "largest_error",
-            "sprague_geers",
-            "pearson",
-            "t_test",
-            "anova",
-            "kolmogorov_smirnov",
-            "spearman",
-            "mean_absolute_error",
-            "coverage",
-        ],
-        float,
-    ] = {}
-
-
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
@@ -256,8 +235,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     model's further error, by metric, for a vehicle that differs from the original by the full width of a domain;
     `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
     `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits` are the values, by
-    name, up to which characteristics may wear in service; `repair` states what a repair of the ADS may change;
-    `evidence` holds thresholds that the user declares for a dossier.
+    name, up to which characteristics may wear in service; `repair` states what a repair of the ADS may change.
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
@@ -283,7 +261,6 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     constraints: list[Constraint] = []
     limits: dict[str, Limit] = {}
     repair: RepairTable = RepairTable()
-    evidence: EvidenceTable = EvidenceTable()
     origin: Origin = Origin()
 
     @property
@@ -296,7 +273,7 @@ def tables_of(study: Study) -> Parameters:
     """A study as plain tables, without its origin and without keys that it does not use."""
     tables: Parameters = msgspec.to_builtins(study)
     del tables["origin"]
-    for name in ("constraints", "limits", "repair", "evidence"):
+    for name in ("constraints", "limits", "repair"):
         if not tables[name]:
             del tables[name]  # so that results from before these tables existed stay the same bytes
     for name in ("vehicle", "ads", "scenario"):

@@ -32,7 +32,7 @@ from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import check_fields
-from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
+from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
@@ -300,6 +300,21 @@ def models_of(study: Study, source: str) -> tuple[Vehicle, Ads, Scenario, Weathe
     lookup = Lookup.of(study, source)
     vehicle, ads = _create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup)
     return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather, source)
+
+
+def create_shipped_models(study: Study) -> None:
+    """Create the shipped models of a study, which refuse parameters that they do not have; raises InputError."""
+    lookup = Lookup.of(study, study.source)
+    for kind, shipped, table in (
+        ("vehicle", VEHICLES, study.vehicle),
+        ("ads", ADS, study.ads),
+        ("scenario", SCENARIOS, study.scenario),
+    ):
+        if table.model in shipped and not table.kind:
+            _, create = _class_and_creator(kind, shipped, table, lookup)
+            create()
+    if not user_code_names(study):
+        _matrix_points(study, study.source)
 
 
 def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:

@@ -17,7 +17,7 @@ from msgspec import Struct
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import FINITE, UserCode, quoted
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import Study, unit_text
+from safevar_sumo.study import Study, plain_values, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
@@ -208,6 +208,7 @@ class CharacteristicSet:
         InputError
             If a name is unknown or a value is outside its domain.
         """
+        values = plain_values(values)
         if not isinstance(values, Mapping):
             raise InputError(
                 source, f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}"

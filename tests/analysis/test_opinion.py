@@ -32,7 +32,7 @@ from safevar_sumo.analysis.opinion.multi_body import (
 from safevar_sumo.analysis.opinion.second_vehicle import MAPPINGS, OUTSIDE
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import GRAVITY
-from safevar_sumo.report import make_report, page as report_page
+from safevar_sumo.report import input as report_input, report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
@@ -259,14 +259,14 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(
     slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(report_page, "explain_failures", lambda *_, **__: explained)
-    page = make_report([slippery], only=["causes", "reproduce"], jobs=1)
+    monkeypatch.setitem(report_input.QUESTIONS, "explain", lambda *_, **__: explained)
+    page = report(slippery, only=["causes", "reproduce"], jobs=1)
     verdicts = re.findall(r"second vehicle model: (\w+)", page)
     assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0
     assert set(verdicts) <= set(get_args(Verdict))
     assert f"opinion {slippery}" in page
     load_bmw_parameters.cache_clear()
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
-    without = make_report([slippery], only=["causes"], jobs=1)
+    without = report(slippery, only=["causes"], jobs=1)
     assert "second vehicle model:" not in without
     assert "pip install &#39;.[opinion]&#39;" in without

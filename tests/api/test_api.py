@@ -7,6 +7,7 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -45,6 +46,37 @@ def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) 
     same = sv.load_study("mine.toml")
     assert (changed.weather, changed.search, changed.ads) == (same.weather, same.search, same.ads)
     assert sv.load_study(changed, search={"seed": 7}).search.runs == 2
+
+
+def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
+    weather = {"name": "wet", "road_friction": 0.5, "visibility": 1.0, "recognition_delay": 0.0}
+    search, plain = {"runs": np.int64(2), "seed": np.array(7)}, {"runs": 2, "seed": 7}
+    theirs = {**weather, "road_friction": np.float64(0.5), "visibility": np.array(1.0)}
+    assert sv.load_study("smoke", weather=theirs, search=search) == sv.load_study(
+        "smoke", weather=weather, search=plain
+    )
+    assert sv.load_study("smoke", weather=pd.Series(theirs)) == sv.load_study("smoke", weather=weather)
+    plain_setting = {"tireFric": 1.1, "mass": 2600.0}
+    expected = sv.simulate("smoke", plain_setting).to_dict()
+    for changes in (pd.Series(plain_setting), {name: np.array(value) for name, value in plain_setting.items()}):
+        assert sv.simulate("smoke", changes).to_dict() == expected
+    settings = [pd.Series(plain_setting), {"tireFric": np.array(1.1)}]
+    frame = sv.evaluate("smoke", [plain_setting, {"tireFric": 1.1}], jobs=1)
+    pd.testing.assert_frame_equal(sv.evaluate("smoke", settings, jobs=1), frame)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "key"),
+    [
+        ("rain", {"ads": {"parameters": {"corridr": 1.0}}}, "ads.parameters.corridr"),
+        ("wear", {"vehicle": {"parameters": {"kerb_mas": 1.0}}}, "vehicle.parameters.kerb_mas"),
+        ("rain", {"scenario": {"parameters": {"sped": 1.0}}}, "scenario.parameters.sped"),
+        ("wear", {"matrix": {"tests": [{"name": "CPFA", "parameters": {"sped": 1.0}}]}}, "parameters.sped"),
+    ],
+)
+def test_a_misspelt_parameter_is_refused_when_a_study_is_loaded(name: str, changes: dict[str, Any], key: str) -> None:
+    with pytest.raises(sv.InputError, match=key):
+        sv.load_study(name, **changes)
 
 
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:

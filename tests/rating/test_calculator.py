@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from safevar_sumo.analysis.rating.vehicles import RatedVehicle
-from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Rater
 from safevar_sumo.records import CellResults
 from tests.rating.calculator import Calculator
+from tests.rating.spreadsheets import fill_drawn_cells, fill_template
 
 pytestmark = pytest.mark.slow
 PROTOCOL = protocol_of(EURO_NCAP_2026)
@@ -38,9 +35,9 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     this package's.
     """
     place.mkdir(exist_ok=True)
-    Template(template, place / "predicted.xlsx").fill(rated)
+    fill_template(template, place / "predicted.xlsx", rated)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")
-    PreprocessedFile(drawn, place / "measured.xlsx").fill(rated)
+    fill_drawn_cells(drawn, place / "measured.xlsx", rated)
     theirs = calculator.scores(place / "measured.xlsx", place / "scored")
     ours: dict[str, np.ndarray] = {}
     for test in rated.tests:
@@ -84,19 +81,3 @@ def test_vehicles_with_any_colours_score_alike(
     rated = RatedVehicle(name="any", setting={}, rater=Rater(protocol=PROTOCOL, claims=claims), cells=cells)
     assert rated.scores.fails[0] == (seed == 0)
     agrees(rated, calculator, template, tmp_path)
-
-
-def test_the_pages_commands_run_as_typed(
-    calculator: Calculator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All but the two that make the calculator's environment, which is there."""
-    page = (Path(__file__).parents[2] / "docs/rating.md").read_text(encoding="utf-8")
-    (block,) = (
-        block for block in page.split("```text\n") if block.startswith("python -m venv calculator\ncalculator/bin/pip")
-    )
-    (tmp_path / "calculator").symlink_to(calculator.python.parents[1])
-    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
-    for line in block.split("\n```")[0].splitlines()[2:]:
-        done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
-    assert list(tmp_path.glob("scored/*_report.xlsx"))

@@ -1,4 +1,4 @@
-"""Colours and points against the protocol's tables; a worse vehicle never earns more; refused spreadsheets."""
+"""Colours and points against the protocol's tables; a worse vehicle never earns more; equal losses."""
 
 from __future__ import annotations
 
@@ -137,6 +137,10 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
     result = Rating(study=STUDY, vehicles=[rated(results()), rated(results(impact), treadDepth=3.0)])
     assert result.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
     assert result.verdict.endswith(" of them in CPNCO by night.")
+    impact = np.full(N, np.nan)
+    impact[numbers("CBNA") + numbers("CBFA")] = 60.0
+    equal = Rating(study=STUDY, vehicles=[rated(results()), rated(results(impact), treadDepth=3.0)])
+    assert equal.verdict.endswith(" of them in each of CBNA and CBFA.")
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert set(record) == {"study", "variants", "not_simulated"}
     assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}

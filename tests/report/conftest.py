@@ -9,7 +9,7 @@ import pytest
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.campaign import local
-from safevar_sumo.report import input as report_input, make_report, page as report_page
+from safevar_sumo.report import input as report_input, report
 from tests.analysis.known_regions import Plant
 
 
@@ -18,11 +18,11 @@ def page(slippery: Path, case: Case, explained: Explained) -> str:
     """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1 to 3.9."""
     friction = list(case.study.vehicle.characteristics).index("tireFric")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_page, "explain_failures", lambda *_, **__: explained)
+        patch.setitem(report_input.QUESTIONS, "explain", lambda *_, **__: explained)
         patch.setattr(report_input, "SAMPLED_VEHICLES", 400)
         patch.setattr(local, "LocalPool", lambda *_: Plant(case.study, lambda rows: rows[:, friction] < 1.5))
         shows: list[tuple[str, int, int]] = []
-        page = make_report([slippery], paper=True, jobs=1, progress=lambda *values: shows.append(values))
+        page = report(slippery, paper=True, jobs=1, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
         assert shows[-1] == ("tables and figures", 0, 1)
         assert all(done <= total for _, done, total in shows)

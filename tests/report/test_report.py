@@ -27,7 +27,7 @@ from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
-from safevar_sumo.report import SECTIONS, input as report_input, make_report, page as report_page
+from safevar_sumo.report import SECTIONS, input as report_input, report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
 from safevar_sumo.report.sections import make_verdict
 from safevar_sumo.results.manifest import read_manifest, write_manifest
@@ -157,7 +157,7 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
     assert "differs from the results" not in page
     monkeypatch.setattr(report_input, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
     with pytest.warns(UserWarning, match="simulated again with different results: "):
-        other = make_report([slippery], only=["verdict", "causes"], jobs=1)
+        other = report(slippery, only=["verdict", "causes"], jobs=1)
     assert re.search(r"the outcome was collision and is \w+ now", other)
     assert Outline(other).open == []
 
@@ -170,17 +170,17 @@ def test_a_verdict_is_bad_from_the_first_failure_on() -> None:
 
 
 def test_only_some_sections(slippery: Path) -> None:
-    page = make_report([slippery], only=["reproduce", "tested"])
+    page = report(slippery, only=["reproduce", "tested"])
     assert re.findall(r'<h2 id="(.*?)">', page) == ["tested", "reproduce"]
     assert '<th class="span"' not in page, "its table has one level of headings"
     with pytest.raises(InputError, match="no section 'risks'"):
-        make_report([slippery], only=["risks"])
+        report(slippery, only=["risks"])
 
 
 def test_an_answer_without_rows_has_no_figure(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = SimpleNamespace(sentences=lambda: ["So rare."], to_frame=pd.DataFrame)
-    monkeypatch.setattr(report_page, "answer_question", lambda *_, **__: answer)
-    page = make_report([slippery], only=["risk", "rules"])
+    monkeypatch.setattr(report_input, "answer_question", lambda *_, **__: answer)
+    page = report(slippery, only=["risk", "rules"])
     assert page.count("So rare.") == 2
     assert "<figure" not in page
 
@@ -192,7 +192,7 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
     manifest = read_manifest(slippery)
     manifest["study"]["title"] = bad
     write_manifest(tmp_path / "copy", manifest)
-    page = make_report([tmp_path / "copy"], only=["tested", "trust", "reproduce"])
+    page = report(tmp_path / "copy", only=["tested", "trust", "reproduce"])
     assert Outline(page).open == []
     assert "alert(1)</script>" not in page
     assert "49" not in re.findall(r"<strong>(.*?)</strong>", page)[0]
@@ -203,19 +203,18 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
     shutil.copytree(
         slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv")
     )
-    page = make_report(
-        [tmp_path / "begun"], only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1
-    )
+    page = report(tmp_path / "begun", only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1)
     assert "No solution was found" in page
     assert Outline(page).open == []
 
 
 def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest.MonkeyPatch) -> None:
     study = load_study("smoke", name="pilot", step_length=0.02)
-    one: Any = SimpleNamespace(
-        directory=Path("its results"), point="", later_changes=(), case=SimpleNamespace(study=study, has_runs=True)
+    case: Any = SimpleNamespace(study=study, has_runs=True)
+    one = report_input.ReportInput(
+        study_number=1, directory=Path("its results"), case=case, system=assemble(study), versions={}, margin=0.5
     )
-    python, option, script = shlex.split(commands_to_reproduce([one], ["questions"], {})[0][1])
+    python, option, script = shlex.split(commands_to_reproduce([one], ["questions"])[0][1])
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
     monkeypatch.setattr(safevar_sumo, "load", lambda place: SimpleNamespace(study=(place, study)))
@@ -223,7 +222,7 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     exec(script, {})
     assert asked["study"] == ("its results", study)
     assert asked["out"] == "its results-again"
-    _, *others, _ = commands_to_reproduce([one], ["tolerance", "repair"], report_input.page_options(0.5))
+    _, *others, _ = commands_to_reproduce([one], ["tolerance", "repair"])
     questions = [f"python -m safevar_sumo {name} 'its results' --margin 0.5" for name in ("tolerance", "repair")]
     assert [command for _, command in others] == questions
 
@@ -236,7 +235,7 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
     monkeypatch.setattr(report_input, "SAMPLED_VEHICLES", 300)
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
-    page = make_report([place], paper=True, jobs=2)
+    page = report(place, paper=True, jobs=2)
     commands_of_page = [shlex.split(html.unescape(line)) for line in re.findall("<code>(python -m .*?)</code>", page)]
     printed = {typed[3]: typed[3:] for typed in commands_of_page}
     assert {"explain", "tolerance", "risk", "rules", "simulate", "tables", "figures"} <= set(printed)
@@ -278,7 +277,7 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
     assert [point.name for point in there.system.points] == [DAY]
     assert (there.case.solutions["f_safe"] >= whole.case.solutions["f_safe"]).all(), "elsewhere is the worst"
     assert (there.case.solutions["f_safe"] > whole.case.solutions["f_safe"]).any()
-    page = make_report([results], ["tested", "verdict", "reproduce"], jobs=1, point=DAY)
+    page = report(results, only=["tested", "verdict", "reproduce"], jobs=1, point=DAY)
     worst = there.case.solutions["f_safe"].min()
     assert (f"a collision at {-worst:.1f} m/s" if worst < 0 else f"; the worst stops {worst:.2f} m short") in page
     assert f"only at the point {DAY} of its matrix" in page

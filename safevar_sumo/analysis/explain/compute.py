@@ -47,14 +47,9 @@ SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
 """Number of settings drawn from the whole domain if there are no results, in an unrated and in a rated study."""
 
 
-def explain_failures(
-    source: Study | Case, options: ExplainOptions, evaluator: Evaluator, *, statistics: bool = True
-) -> Explained:
+def explain_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings drawn from a study's whole
     domain.
-
-    Without `statistics`, only the failures that matter by their size or severity are analysed: the answer has no
-    statistics of all failures, and leaves the other fitted vehicle models out.
 
     Raises
     ------
@@ -68,7 +63,7 @@ def explain_failures(
     reasons: Reasons = dict.fromkeys(population.rows, ("requested",))
     if not options.solutions:
         reasons = _choose_rows(population, limit)
-        affordable = select_affordable_rows(settings[population.rows], evaluator, limit) if statistics else []
+        affordable = select_affordable_rows(settings[population.rows], evaluator, limit)
         sample = [population.rows[index] for index in affordable]
     analysed = sorted({*sample, *reasons})
     causes = dict(zip(analysed, find_minimal_causes(evaluator, settings[analysed], population.unsafe), strict=True))
@@ -79,7 +74,7 @@ def explain_failures(
     left_out = 0  # collisions that the search simulated, but its objectives leave out of the solutions
     if isinstance(source, Case) and not study.origin.point and not population.evaluations.collided.any():
         left_out = int(are_collisions(source.evaluations).sum())
-    models = evaluator.for_sets(options.fits if statistics and len(population.evaluations) else 0)
+    models = evaluator.for_sets(options.fits if len(population.evaluations) else 0)
     preventability = assess_preventability(
         evaluator, population.evaluations.take(_is_assessed(study, population.evaluations))
     )

@@ -63,16 +63,16 @@ class Rating(Answer):
         return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
 
     @property
-    def losses(self) -> dict[str, float]:
-        """Points that the variant loses in each test, the largest loss first; only tests with a loss."""
-        if self.variant is None:
-            return {}
+    def largest_losses(self) -> tuple[list[str], float]:
+        """The tests in which the variant loses most points, and the points that it loses in each; no tests if it loses
+        none.
+        """
         losses = {}
-        for original, variant in zip(self.original.tests, self.variant.tests, strict=True):
-            loss = round(original.total - variant.total, DECIMALS)
-            if loss > 0:
-                losses[" by ".join(filter(None, (original.matrix.test_name, original.matrix.light)))] = loss
-        return dict(sorted(losses.items(), key=lambda item: -item[1]))
+        for original, variant in zip(self.original.tests, (self.variant or self.original).tests, strict=True):
+            name = " by ".join(filter(None, (original.matrix.test_name, original.matrix.light)))
+            losses[name] = round(original.total - variant.total, DECIMALS)
+        largest = max(losses.values())
+        return [name for name, loss in losses.items() if loss == largest > 0], largest
 
     @property
     def points(self) -> list[tuple[str, FloatArray, float]]:
@@ -88,14 +88,33 @@ class Rating(Answer):
     def to_frame(self) -> pd.DataFrame:
         """One row for each vehicle and test.
 
-        Columns: `vehicle`, `test`, `light`, `standard`, `extended`, `robustness`, `total`, `possible` [points].
+        Columns: `variant`, `test`, `light`, `points`, `possible`, and both for each range and for robustness [points].
         """
         rows = [
-            (vehicle.name, test.matrix.test_name, test.matrix.light, *test.points, test.total, sum(test.matrix.points))
+            (vehicle.name, test.matrix.test_name, test.matrix.light, test.total, sum(possible), *test.points, *possible)
             for vehicle in self.vehicles
             for test in vehicle.tests
+            for possible in [test.matrix.points]
         ]
-        return pd.DataFrame(rows, columns=["vehicle", "test", "light", *POINT_KINDS, "total", "possible"])
+        kinds = [*POINT_KINDS, *(f"possible_{kind}" for kind in POINT_KINDS)]
+        return pd.DataFrame(rows, columns=["variant", "test", "light", "points", "possible", *kinds])
+
+    @property
+    def cells(self) -> pd.DataFrame:
+        """One row for each vehicle and simulated cell.
+
+        Columns: `variant`, `test`, `light`, `range` (or the condition of a robustness layer), `vut_speed`,
+        `target_speed` [km/h], `impact_location` [% of the width], `colour` (none if the vehicle could not drive the
+        test), `relative_impact_speed` [km/h] (none without an impact), `warning_ttc` [s].
+        """
+        return pd.DataFrame(
+            [
+                {"variant": vehicle.name, "test": test["test"], "light": test["light"], **cell}
+                for vehicle in self.vehicles
+                for test in vehicle.to_dict()["tests"]
+                for cell in test["cells"]
+            ]
+        )
 
     def to_dict(self) -> JsonObject:
         """The JSON of `rating`."""
@@ -126,9 +145,10 @@ class Rating(Answer):
         result, largest_loss = f"loses {self.lost:.2f}", ""
         if self.lost < 0:
             result = f"earns {-self.lost:.2f} points more, {self.variant.points:.2f} instead"
-        elif self.losses:
-            test, loss = next(iter(self.losses.items()))
-            largest_loss = f", {loss:.2f} of them in {test}"
+        elif self.lost:
+            tests, loss = self.largest_losses
+            each = "each of " if len(tests) > 1 else ""
+            largest_loss = f", {loss:.2f} of them in {each}{join_phrases(tests)}"
         return (
             f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned} points that "
             f"the original earns (of {possible} that are simulated){largest_loss}."
