@@ -53,24 +53,6 @@ StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 """Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
 
 
-class Leader(NamedTuple):
-    """What a reference driver remembers of who is in the way of N vehicles; arrays have shape (N,).
-
-    Attributes
-    ----------
-    speed
-        Its speed at the last call [m/s]; 0 if nobody was in the way.
-    has_braked
-        Whether it has braked while it was in the way.
-    time_gap
-        The time gap to it at the last call before it braked [s].
-    """
-
-    speed: FloatArray
-    has_braked: BoolArray
-    time_gap: FloatArray
-
-
 class Reaction(NamedTuple):
     """What a reference driver remembers of N vehicles; arrays have shape (N,).
 
@@ -86,8 +68,8 @@ class Reaction(NamedTuple):
         Time since the driver first saw the danger [s]; negative without a danger.
     felt_deceleration, intended_deceleration
         The vehicle's deceleration while the driver did not brake yet, and the one that the driver aims at [m/s^2].
-    leader
-        Who is in the way.
+    leader_speed, leader_has_braked
+        Speed of who was in the way at the last call [m/s], 0 for nobody; whether he has braked there.
     """
 
     nominal: Nominal
@@ -97,7 +79,8 @@ class Reaction(NamedTuple):
     danger_time: FloatArray
     felt_deceleration: FloatArray
     intended_deceleration: FloatArray
-    leader: Leader
+    leader_speed: FloatArray
+    leader_has_braked: BoolArray
 
     def acceleration(self, seen: Observation) -> FloatArray:
         """Mean acceleration since the last call [m/s^2]; 0 at the first call."""
@@ -115,24 +98,19 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     corridor: PositiveParameter = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        leader = Leader(np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n))
-        return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n), leader)
+        nobody, never = np.zeros(n), np.zeros(n, dtype=bool)
+        return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n), nobody, never)
 
     def watch_leader(self, seen: Observation, memory: Reaction, is_in_way: BoolArray) -> tuple[FloatArray, Reaction]:
         """The mean deceleration of a leader since the last call [m/s^2], 0 without one; and the memory with the
         leader as it is now.
         """
-        last = memory.leader
-        is_led = is_in_way & (last.speed > 0)
-        deceleration = np.where(is_led, (last.speed - np.where(is_led, seen.obstacle_speed, 0.0)) / memory.step, 0.0)
-        has_braked = is_in_way & (last.has_braked | (deceleration > ANY_BRAKING + DECELERATION_ROUNDING))
-        time_gap = np.where(is_in_way, seen.gap, 0.0) / np.maximum(seen.speed, LEAST_DIVISOR)
-        leader = Leader(
-            speed=np.where(is_in_way, seen.obstacle_speed, 0.0),
-            has_braked=has_braked,
-            time_gap=np.where(has_braked, last.time_gap, time_gap),
-        )
-        return deceleration, memory._replace(leader=leader)
+        speed = np.where(is_in_way, seen.obstacle_speed, 0.0)
+        is_led = is_in_way & (memory.leader_speed > 0)
+        deceleration = np.where(is_led, (memory.leader_speed - speed) / memory.step, 0.0)
+        brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
+        has_braked = is_in_way & (memory.leader_has_braked | brakes)
+        return deceleration, memory._replace(leader_speed=speed, leader_has_braked=has_braked)
 
     def react(
         self,
@@ -183,7 +161,13 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             acceleration = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
             calm = pedals_for(nominal, seen.speed, acceleration, initial_trim)
         command = Command(np.where(is_reacting, 0.0, calm.throttle), np.where(is_reacting, brake, calm.brake))
-        return command, Reaction(nominal, step, cruise, seen.speed, danger_time, felt, intended, memory.leader)
+        return command, memory._replace(
+            cruise=cruise,
+            speed=seen.speed,
+            danger_time=danger_time,
+            felt_deceleration=felt,
+            intended_deceleration=intended,
+        )
 
 
 class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
@@ -235,10 +219,11 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         is_in_way = is_in_the_way(seen, self.corridor)
         _, memory = self.watch_leader(seen, memory, is_in_way)
-        leader, least_time_gap = memory.leader, 1 + seen.speed * KMH_PER_MS / 100
         critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
-        keeps_distance = leader.time_gap >= least_time_gap - TIME_ROUNDING
-        danger = is_in_way & np.where(leader.has_braked, keeps_distance, time_to_reach(seen) < critical_ttc)
+        # The gap was seen after a step, in which a leader who brakes has shortened it.
+        least_gap = seen.speed * (1 + seen.speed * KMH_PER_MS / 100 - memory.step)
+        is_near = np.where(memory.leader_has_braked, seen.gap >= least_gap, time_to_reach(seen) < critical_ttc)
+        danger = is_in_way & is_near
         jerk = self.deceleration / memory.step  # reaches the deceleration within a step
         return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk)
 
@@ -431,7 +416,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         braking_time = np.where(memory.braking_time >= 0, memory.braking_time + reaction.step, begun)
         brakes = braking_time >= self.perception_time - TIME_ROUNDING
         is_near = time_to_reach(seen) < self.critical_ttc
-        danger = is_in_way & np.where(reaction.leader.has_braked, brakes, is_near)
+        danger = is_in_way & np.where(reaction.leader_has_braked, brakes, is_near)
         following = self._following(seen, is_in_way)
         command, reaction = self.react(
             seen, reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following

@@ -109,32 +109,29 @@ class Preventability:
         """The simulated collisions and `drivers`, for JSON."""
         return {"looked_at": len(self.verdicts), "later_reaction": LATER["reaction_time"], "drivers": self.drivers}
 
-    def _avoided(self, driver: str) -> str:
-        """What a driver avoids, such as `a competent driver avoids 71 % (39 % if he needs 0.4 s longer)`."""
-        shares, later, number = self.shares, f"{driver}_later", int(self.verdicts[driver].count())
-        if not number:
-            return f"{TITLES[driver]} has no verdict"
-        of_number = f" of the {number} with a verdict" if number < len(self.verdicts) else ""
-        delayed = f" ({share_in_words(shares[later])} if he needs {DELAY:g} s longer)" if later in shares else ""
-        return f"{TITLES[driver]} avoids {share_in_words(shares[driver])}{of_number}{delayed}"
-
     def __str__(self) -> str:
         """What each driver avoids, and where he has no verdict; empty if no collision was simulated."""
-        verdicts = self.verdicts
-        if not len(verdicts):
-            return ""
-        drivers = [name for name in TITLES if name != ANY_LEADER or not verdicts[name].equals(verdicts[LETTER])]
+        verdicts, phrases, silences = self.verdicts, list[str](), list[str]()
+        for row in self.drivers:
+            driver, silent = row["driver"], row["no_verdict"]
+            if driver == ANY_LEADER and verdicts[driver].equals(verdicts[LETTER]):
+                continue
+            if silent:
+                points = points_named(row["no_verdict_points"])
+                silences.append(
+                    f" No verdict of {TITLES[driver]} on {silent}{points and f', at {points}'}: there the original "
+                    "vehicle collides with that driver, too."
+                )
+            if row["share"] is None:
+                phrases.append(f"{TITLES[driver]} has no verdict")
+                continue
+            later = row["later_share"]
+            delayed = "" if later is None else f" ({share_in_words(later)} if he needs {DELAY:g} s longer)"
+            of_number = f" of the {len(verdicts) - silent} with a verdict" if silent else ""
+            phrases.append(f"{TITLES[driver]} avoids {share_in_words(row['share'])}{of_number}{delayed}")
         sample = "" if len(verdicts) == self.collisions else f", drawn at random from {self.collisions}"
         collisions = f"{number_of(len(verdicts), 'collision')}{sample}"
-        sentences = [f"In the same vehicle, of {collisions}, {'; '.join(map(self._avoided, drivers))}."]
-        for row in self.drivers:
-            if row["no_verdict"] and row["driver"] in drivers:
-                points = points_named(row["no_verdict_points"])
-                sentences.append(
-                    f"No verdict of {TITLES[row['driver']]} on {row['no_verdict']}{points and f', at {points}'}: "
-                    "there the original vehicle collides with that driver, too."
-                )
-        return " ".join(sentences)
+        return f"In the same vehicle, of {collisions}, {'; '.join(phrases)}.{''.join(silences)}" if phrases else ""
 
 
 def avoided_by(verdicts: Mapping[Any, Any]) -> str:

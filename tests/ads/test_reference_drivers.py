@@ -247,7 +247,7 @@ def test_r157_avoids_a_braking_leader_from_its_least_time_gap_and_nearer_nothing
     for speed in (20.0, 50.0, 60.0):
         least = 1 + speed / 100
         assert behind_a_braking_leader(R157(), speed / 3.6, least, leader_braking) > 0
-        assert behind_a_braking_leader(R157(), speed / 3.6, least - 0.01, leader_braking) < 0
+        assert behind_a_braking_leader(R157(), speed / 3.6, least - 2 * STEP, leader_braking) < 0
 
 
 def test_rss_brakes_with_another_number_than_it_plans_with() -> None:

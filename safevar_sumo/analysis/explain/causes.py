@@ -92,26 +92,18 @@ def find_smallest_robust_failure(
 ) -> int | None:
     """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
 
-    Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no
-    tried failure is robust. Other time steps than the study's are left out where they could not make a failure robust.
+    Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated with each
+    time step; None if no tried failure is robust.
     """
-    order, evaluation_count = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff]), 0
-    study_step, other_steps = STEP_FACTORS[:1], STEP_FACTORS[1:]
-    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(other_steps)  # just robust if all other shares are 1
+    order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])[
+        : max_evaluations // NEIGHBOUR_COUNT + 1
+    ]
     for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start : start + FAILURES_PER_BATCH]
-        evaluation_count += NEIGHBOUR_COUNT * len(rows)
-        estimates = estimate_robustness(evaluator, failures.settings[rows], step, unsafe, study_step)
-        candidates = [pair for pair in zip(rows, estimates, strict=True) if pair[1].share >= least_share]
-        if candidates:
-            evaluation_count += NEIGHBOUR_COUNT * len(other_steps) * len(candidates)
-            settings = failures.settings[[row for row, _ in candidates]]
-            with_other_steps = estimate_robustness(evaluator, settings, step, unsafe, other_steps)
-            for (row, estimate), other in zip(candidates, with_other_steps, strict=True):
-                if not Robustness(estimate.shares_by_step | other.shares_by_step).borderline:
-                    return int(row)
-        if evaluation_count >= max_evaluations:
-            break
+        estimates = estimate_robustness(evaluator, failures.settings[rows], step, unsafe)
+        for row, robustness in zip(rows.tolist(), estimates, strict=True):
+            if not robustness.borderline:
+                return int(row)
     return None
 
 
@@ -273,17 +265,17 @@ def necessity_frame(
         because the sample is drawn without replacement from finitely many failures), the share itself if all failures
         were analysed. Ordered by necessary, involved, changed; no rows if there is no failure.
     """
-    number, names = max(len(changed), 1), characteristics.names
-    name_sets = [[set(cause.changes) for cause in of_failure] for of_failure in causes if of_failure]
-    necessary = Counter(name for of_failure in name_sets for name in set.intersection(*of_failure))
-    involved = Counter(name for of_failure in name_sets for name in set.union(*of_failure))
-    shares = [necessary[name] / number for name in names]
-    frame = pd.DataFrame({"characteristic": names, "changed": changed.sum(axis=0) / number, "necessary": shares})
-    frame["involved"] = [involved[name] / number for name in names]
+    names, number = characteristics.names, max(len(changed), 1)
+    in_causes = [np.array([[name in cause.changes for name in names] for cause in group]) for group in causes if group]
+    necessary, involved = (
+        sum((combine(rows, axis=0) for rows in in_causes), np.zeros(len(names))) for combine in (np.all, np.any)
+    )
+    frame = pd.DataFrame({"characteristic": names, "changed": changed.sum(axis=0) / number})
+    frame["necessary"], frame["involved"] = necessary / number, involved / number
     frame[["necessary_lower", "necessary_upper"]] = (
-        [clopper_pearson(necessary[name], number) for name in names]
+        [clopper_pearson(int(count), number) for count in necessary]
         if len(changed) < failures
-        else np.transpose([shares] * 2)
+        else frame[["necessary", "necessary"]].to_numpy()
     )
     frame = frame if len(changed) else frame.head(0)
     return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
