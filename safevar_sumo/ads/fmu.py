@@ -1,139 +1,162 @@
-"""A driving system that is an FMU: its inputs are observations, its outputs are pedals or an acceleration."""
+"""A driving system that is an FMU of FMI 2.0 or 3.0 for co-simulation: its inputs are observations, its outputs are
+pedals or an acceleration, all in SI units; each vehicle has an instance.
+"""
 
 from __future__ import annotations
 
+import sys
+import weakref
 from collections.abc import Mapping
-from typing import NamedTuple
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
-from safevar_sumo.ads.base import Ads, Trim, pedals_for, trim_at
-from safevar_sumo.errors import InputError
-from safevar_sumo.fmu import Description, Fleet, History, Instances
-from safevar_sumo.plugins import SHARE, UserCode
-from safevar_sumo.records import BoolArray, Command, Nominal, Observation
-from safevar_sumo.study.schema import Parameters
+from safevar_sumo.ads.base import ScalarAds, Trim, pedals_for, trim_at
+from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.plugins import UserCode
+from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.study.schema import ModelTable
 
-OBSERVATION_UNITS: Mapping[str, str] = {
-    "time": "s",
-    "speed": "m/s",
-    "gap": "m",
-    "closing_speed": "m/s",
-    "lateral": "m",
-    "lateral_speed": "m/s",
-    "visibility": "-",
-    "obstacle_speed": "m/s",
-    "throttle": "-",
-    "brake": "-",
-    "detected": "-",
+UNITS: Mapping[str, str] = {
+    **dict.fromkeys(("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"),
+    **dict.fromkeys(("gap", "lateral"), "m"),
+    **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
+    **{"time": "s", "acceleration": "m/s2"},
 }
-"""Quantities that an ADS observes, and their units; `detected` is 1 while an obstacle is detected."""
-CONSTANT_UNITS: Mapping[str, str] = {
-    "nominal_mass": "kg",
-    "nominal_accel": "m/s^2",
-    "nominal_decel": "m/s^2",
-    "nominal_max_speed": "m/s",
-    "nominal_actuator_lag": "s",
-    "step": "s",
-}
-"""Facts about the original vehicle, and the time between two calls: inputs, or parameters that are set at the start."""
-NOMINAL_PREFIX = "nominal_"
-OUTPUT_UNITS: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration": "m/s^2", "warns": "-"}
-"""Quantities that the FMU outputs, and their units."""
-WARNING = 0.5
-"""Value of the output `warns` above which it is a warning [-]."""
+"""Quantities that an FMU is given or returns, and their units. It is given observations; `detected` is 1 while an
+obstacle is detected. It returns throttle and brake or an acceleration; above 0.5, `warns` is a warning.
+"""
+COMMANDS = ("throttle", "brake", "acceleration", "warns")
+REAL_TYPES = ("Real", "Float64", "Float32")
 
 
-class _Memory(NamedTuple):
-    """What `FmuAds` remembers of N vehicles.
-
-    Attributes
-    ----------
-    fleet, history
-        Instances of the FMU, and what they were given so far; None before the first call.
-    constants
-        Constant inputs by name.
-    nominal
-        The original vehicle.
-    trim
-        The trim at the first call; None before that call, and for an FMU that outputs pedals.
-    warns
-        Which drivers are warned, shape (N,); None if the FMU never warns.
-    """
-
-    fleet: Fleet
-    constants: Mapping[str, float]
-    nominal: Nominal
-    history: History | None = None
-    trim: Trim | None = None
-    warns: BoolArray | None = None
-
-
-class FmuAds(Ads):
-    """Drives each of N vehicles with an instance of an FMU; see `Ads`.
-
-    Parameters
-    ----------
-    description
-        The FMU.
-    inputs, outputs, parameters, step
-        Values of these keys in the study.
-    code
-        Calls the FMU and checks its results.
+class Fmu:
+    """The FMU at `path`, with the variables that a study's table `ads` names.
 
     Raises
     ------
     InputError
-        If the study does not fit the FMU.
+        If the file is no such FMU, or the study does not fit it.
     """
 
-    def __init__(
-        self,
-        description: Description,
-        inputs: Mapping[str, str],
-        outputs: Mapping[str, str],
-        parameters: Parameters,
-        step: float | None,
-        code: UserCode,
-    ) -> None:
-        source = code.source
-        self._code, self._communication_step = code, description.communication_step(step, source, "ads")
-        quantities = {**OBSERVATION_UNITS, **CONSTANT_UNITS}
-        input_ports = description.ports(inputs, quantities, ("input",), source, "ads.inputs", CONSTANT_UNITS)
-        output_ports = description.ports(outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
-        if ("acceleration" in output_ports) == bool({"throttle", "brake"} & output_ports.keys()):
-            raise InputError(
-                source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; alternatively acceleration"
-            )
-        if not input_ports.keys() & OBSERVATION_UNITS.keys():
-            raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATION_UNITS)}")
-        constants = description.constants(parameters, input_ports.values(), source, "ads.parameters")
-        self._instances = Instances(description, input_ports, output_ports, constants)
-        self.max_vehicles = self._instances.max_vehicles
-
-    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        names = (name for name in CONSTANT_UNITS if name.startswith(NOMINAL_PREFIX))
-        constants = {"step": step, **{name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX)) for name in names}}
-        return _Memory(Fleet(self._instances, n, step, self._communication_step), constants, nominal)
-
-    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **memory.constants}
-        history = memory.history or self._code.call("initialisation", memory.fleet.start, values)[1]
-        outputs, _, history = self._code.call("doStep", memory.fleet.advance, history, values)
-        warns = None if "warns" not in outputs else outputs["warns"] > WARNING
-        memory = memory._replace(history=history, warns=warns)
-        shape = seen.speed.shape
-        if "acceleration" in outputs:
-            acceleration = self._code.check_numbers("doStep", "acceleration", outputs["acceleration"], shape)
-            initial_trim = memory.trim or trim_at(memory.nominal, seen)
-            command = pedals_for(memory.nominal, seen.speed, acceleration, initial_trim)
-            return command, memory._replace(trim=initial_trim)
-        released = np.zeros(shape)
-        pedals = (
-            self._code.check_numbers("doStep", name, outputs.get(name, released), shape, SHARE)
-            for name in Command._fields
+    def __init__(self, path: str, table: ModelTable, code: UserCode) -> None:
+        source, self.code, self._folder = (
+            code.source,
+            code,
+            TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True),
         )
-        return Command(*pedals), memory
+        expected = "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
+        try:
+            from fmpy import extract, read_model_description  # an extra
 
-    def warns(self, memory: _Memory) -> BoolArray | None:
-        return memory.warns
+            extract(path, self._folder.name)
+            self._model: Any = read_model_description(self._folder.name, validate=False)
+        except ImportError:
+            raise InputError(source, f"{path} needs FMPy", "in the checkout: pip install '.[fmu]'") from None
+        except Exception as error:  # any error of FMPy about a user's file
+            raise InputError(source, f"{table.model}: {type(error).__name__}: {error}", expected) from None
+        kind = self._model.coSimulation
+        if kind is None or self._model.fmiVersion < "2" or kind.canBeInstantiatedOnlyOncePerProcess:
+            raise InputError(source, f"{table.model} is another FMU", expected)
+        if ("acceleration" in table.outputs) == bool({"throttle", "brake"} & table.outputs.keys()):
+            expected = "throttle, brake or both; alternatively acceleration"
+            raise InputError(source, f"ads.outputs = {sorted(table.outputs)}", expected)
+        observed = [name for name in (*Observation._fields, "detected") if name in UNITS]
+        self.inputs = {key: self._variable("input", key, name, observed) for key, name in table.inputs.items()}
+        self.outputs = {key: self._variable("output", key, name, COMMANDS) for key, name in table.outputs.items()}
+        self._parameters = [
+            (self._variable("parameter", name, name, [name]), value) for name, value in table.parameters.items()
+        ]
+
+    def _variable(self, causality: str, quantity: str, name: str, quantities: Any) -> Any:
+        """The real variable of a causality that takes or holds a quantity, one of some quantities, in its SI unit."""
+        key = f"ads.{causality}s.{quantity}"
+        if quantity not in quantities:
+            raise unknown_name(self.code.source, f"{key}: there is no such quantity", quantity, quantities)
+        variables = {one.name: one for one in self._model.modelVariables if one.causality == causality}
+        if name not in variables or variables[name].type not in REAL_TYPES:
+            raise unknown_name(self.code.source, f"{key} = {name!r}: no real {causality} of the FMU", name, variables)
+        variable = variables[name]
+        unit = (variable.unit or getattr(variable.declaredType, "unit", None) or "").replace("^", "").replace("-", "1")
+        if unit and unit != UNITS.get(quantity, unit):
+            raise InputError(
+                self.code.source, f"{key} = {name!r}: its unit is {unit!r}", f"a variable in {UNITS[quantity]}"
+            )
+        return variable
+
+    def new_instance(self, step: float) -> Any:
+        """A new instance at the beginning of its time."""
+        from fmpy.simulation import instantiate_fmu
+
+        kind, experiment = self._model.coSimulation, self._model.defaultExperiment
+        own = getattr(kind, "fixedInternalStepSize", None)
+        if not kind.canHandleVariableCommunicationStepSize and experiment:
+            own = own or experiment.stepSize
+        if own and float(own) != step:
+            raise InputError(
+                self.code.source, f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s"
+            )
+        for file in Path(self._folder.name, "resources").glob("*.py"):
+            sys.modules.pop(file.stem, None)  # an FMU in Python imports its own modules, not namesakes
+        slave = instantiate_fmu(self._folder.name, self._model, "CoSimulation", logger=lambda *_: None)
+        for variable, value in self._parameters:
+            write(slave, variable, float(value))
+        if self._model.fmiVersion < "3":
+            slave.setupExperiment(startTime=0.0)
+        slave.enterInitializationMode()
+        slave.exitInitializationMode()
+        return slave
+
+
+class FmuAds(ScalarAds):
+    """Drives one vehicle with an instance of an FMU; see `ScalarAds`."""
+
+    def __init__(self, fmu: Fmu) -> None:
+        self._fmu, self._calls = fmu, 0
+        self._trim: Trim | None = None
+
+    def start(self, nominal: Nominal, step: float) -> None:
+        super().start(nominal, step)
+        self._slave = self._fmu.code.call("initialisation", self._fmu.new_instance, step)
+        self._end = weakref.finalize(self, _free, self._slave)
+        self._end.atexit = False
+
+    def drive(self, seen: Observation) -> tuple[float, float]:
+        outputs = self._fmu.code.call("doStep", self._step, {**seen._asdict(), "detected": np.isfinite(seen.gap)})
+        self._calls += 1
+        self.warns = outputs.get("warns", 0.0) > 0.5
+        if "acceleration" not in outputs:
+            return outputs.get("throttle", 0.0), outputs.get("brake", 0.0)
+        now = Observation._make(np.array([value]) for value in seen)
+        self._trim = self._trim or trim_at(self.nominal, now)
+        command = pedals_for(self.nominal, now.speed, np.array([outputs["acceleration"]]), self._trim)
+        return float(command.throttle[0]), float(command.brake[0])
+
+    def _step(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Advance the instance with observed values; returns its outputs."""
+        slave, time = self._slave, self._calls * self.step
+        try:
+            for name, variable in self._fmu.inputs.items():
+                write(slave, variable, float(values[name]))
+            result = slave.doStep(time, self.step)
+            if result and any(result[1:3]):  # FMI 3.0
+                raise RuntimeError("it ends the simulation or returns early")
+            return {
+                name: getattr(slave, f"get{variable.type}")([variable.valueReference])[0]
+                for name, variable in self._fmu.outputs.items()
+            }
+        except Exception as error:  # any error of FMPy about an FMU
+            self._end.detach()  # any further call of an instance that failed is undefined
+            raise RuntimeError(f"{str(error).splitlines()[0]} at {time:g} s") from None
+
+
+def write(slave: Any, variable: Any, value: float) -> None:
+    """Set a real variable of an instance."""
+    getattr(slave, f"set{variable.type}")([variable.valueReference], [value])
+
+
+def _free(slave: Any) -> None:
+    slave.terminate()
+    slave.freeInstance()

@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import tomli_w
@@ -53,15 +53,6 @@ class _RawStudy(NamedTuple):
     source: object
     tables: Parameters
     origin: Origin = Origin()
-
-
-class _FmuTable(msgspec.Struct):
-    """A vehicle that is an FMU, whose rows of characteristics may be incomplete."""
-
-    model: str
-    kind: Literal["fmu"]
-    characteristics: dict[str, Parameters] = {}
-    parameters: Parameters = {}
 
 
 def load_study(study: StudyLike, **changes: Any) -> Study:
@@ -109,30 +100,10 @@ def _checked_study(raw: _RawStudy) -> Study:
     raise_mistakes(infinite_numbers(raw.source, raw.tables))
     if "origin" in raw.tables:
         raise InputError(raw.source, "origin: there is no such key")
-    tables = _with_parameters(_with_parameters(_with_fmu(raw), "search", SearchTable), "repair", RepairTable)
+    tables = _with_parameters(_with_parameters(raw.tables, "search", SearchTable), "repair", RepairTable)
     study = convert_table(raw.source, tables, Study)
     raise_mistakes(contradictions(raw.source, study))
     return msgspec.structs.replace(study, origin=raw.origin)
-
-
-def _with_fmu(raw: _RawStudy) -> Parameters:
-    """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
-    try:
-        vehicle = msgspec.convert(raw.tables.get("vehicle"), _FmuTable)
-    except msgspec.ValidationError:
-        return raw.tables  # no FMU, or mistakes that the schema of the study finds
-    from safevar_sumo.fmu.description import description_of, file_of  # only a study with an FMU needs FMPy
-
-    stated = vehicle.characteristics
-    is_complete = stated and all({"unit", "original", "lower", "upper"} <= row.keys() for row in stated.values())
-    if is_complete and not file_of(vehicle.model, raw.origin.places):
-        return raw.tables  # so results can be read without their FMU
-    description = description_of(vehicle.model, raw.origin.places, str(raw.source), "vehicle.model")
-    rows = {
-        **description.table_rows(vehicle.parameters),
-        **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated.items()},
-    }
-    return {**raw.tables, "vehicle": {**raw.tables["vehicle"], "characteristics": rows}}
 
 
 def _with_parameters(tables: Parameters, name: str, record: type[SearchTable | RepairTable]) -> Parameters:
@@ -284,12 +255,8 @@ def user_code_names(study: Study) -> list[str]:
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
-    """Keys and paths of a study's FMUs."""
-    return [
-        (f"{key}.model", table.model)
-        for key, table in (("vehicle", study.vehicle), ("ads", study.ads))
-        if table.kind == "fmu"
-    ]
+    """Key and path of a study's FMU."""
+    return [("ads.model", study.ads.model)] if study.ads.kind == "fmu" else []
 
 
 def user_modules(study: Study) -> list[str]:

@@ -21,8 +21,6 @@ EXTENDS = {
     "description": "The study that this file extends, by its name or the path of its file; keys of this file "
     "override its keys, table by table.",
 }
-FMU = {"properties": {"kind": {"const": "fmu"}}, "required": ["kind"]}
-"""A vehicle whose rows of characteristics state only what its FMU does not declare."""
 
 
 def file_schema() -> Parameters:
@@ -32,10 +30,6 @@ def file_schema() -> Parameters:
     tables = _for_editors(tables)
     study = tables.pop("Study")
     requirements = _requirements(study, tables)  # of a file that extends no study
-    vehicle = requirements["properties"]["vehicle"]
-    vehicle["required"].remove("characteristics")
-    vehicle["if"] = FMU
-    vehicle["else"] = {"properties": vehicle.pop("properties"), "required": ["characteristics"]}
     # A file states these as a whole: elements of lists, and tables that no study refines.
     whole_parts = [
         part for name, part in study["properties"].items() if name in WHOLE_TABLES or part.get("type") == "array"

@@ -22,7 +22,6 @@ from safevar_sumo.study.characteristics import (
 )
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
-FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 Tables = Mapping[str, Any]
@@ -35,7 +34,7 @@ SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the safety degree."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
-FMU_KEYS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
+FMU_KEYS = ("kind", "inputs", "outputs")
 """Keys of a model's table that only FMUs use, except the first one: an ADS that is no FMU may have a `kind`."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
 """Keys that describe a characteristic to people; no result depends on them."""
@@ -45,9 +44,8 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A `model` by its name, or by `package.module:Name`, and its `parameters`.
 
     An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
-    its path: `inputs` and `outputs` are the FMU's variables by the quantity they receive or return; `step` [s] is the
-    FMU's time step, by default the declared step. `files` are data files, or folders of them, that a model of your
-    own reads, relative to the study's file.
+    its path: `inputs` and `outputs` are the FMU's variables by the quantity they receive or return. `files` are data
+    files, or folders of them, that a model of your own reads, relative to the study's file.
     """
 
     model: str
@@ -55,29 +53,18 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     kind: Literal["", "traci", "fmu"] = ""
     inputs: dict[str, str] = {}
     outputs: dict[str, str] = {}
-    step: FmuStep | None = None
     files: list[str] = []
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that vary.
 
-    A vehicle of the `kind` `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its
-    parameters are the characteristics, whose rows state only what the FMU does not declare. `sensors` and `sumo_type`
-    map properties of the sensors and of SUMO's vehicle type to a characteristic or a number; `sumo_type` may also name
-    variables of the FMU. `files` are data files, or folders of them, that a model of your
-    own reads, relative to the study's file.
+    `files` are data files, or folders of them, that a model of your own reads, relative to the study's file.
     """
 
     model: str
     characteristics: dict[str, CharacteristicTable]
     parameters: Parameters = {}
-    kind: Literal["", "fmu"] = ""
-    inputs: dict[str, str] = {}
-    outputs: dict[str, str] = {}
-    sensors: dict[str, str | float] = {}
-    sumo_type: dict[str, str | float] = {}
-    step: FmuStep | None = None
     files: list[str] = []
 
 
@@ -276,12 +263,9 @@ def tables_of(study: Study) -> Parameters:
     for name in ("constraints", "limits", "repair"):
         if not tables[name]:
             del tables[name]  # so that results from before these tables existed stay the same bytes
-    for name in ("vehicle", "ads", "scenario"):
-        if tables[name].get("kind") != "fmu":
-            kept_keys = () if name == "vehicle" else ("kind",)
-            tables[name] = {
-                key: value for key, value in tables[name].items() if key not in FMU_KEYS or key in kept_keys
-            }
+    for name in ("ads", "scenario"):
+        if tables[name]["kind"] != "fmu":
+            tables[name] = {key: value for key, value in tables[name].items() if key not in FMU_KEYS[1:]}
     return tables
 
 

@@ -176,8 +176,8 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
         yield InputError(source, "vehicle.characteristics: none", "at least one")
     for name, row in characteristics.items():
         yield from _characteristic_mistakes(source, f"vehicle.characteristics.{name}", row)
-    for name, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
-        if table.kind == "fmu" and name != "scenario":
+    for name, table in (("ads", study.ads), ("scenario", study.scenario)):
+        if table.kind == "fmu" and name == "ads":
             continue
         for key in FMU_KEYS if name == "scenario" else FMU_KEYS[1:]:  # an ADS may be of another kind, `traci`
             if getattr(table, key, None):

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, Ads, FmuAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import ADS, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
-from safevar_sumo.fmu import description_of
 from safevar_sumo.metrics import (
     METRIC_OF_OBJECTIVE,
     METRICS,
@@ -27,6 +26,7 @@ from safevar_sumo.metrics import (
     Scoring,
     checked_metric,
 )
+from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
@@ -42,7 +42,6 @@ from safevar_sumo.vehicles import (
     Change,
     CharacteristicSet,
     FeasibleRegion,
-    FmuVehicle,
     Vehicle,
     calibration_drive,
     checked_change,
@@ -310,7 +309,7 @@ def create_shipped_models(study: Study) -> None:
         ("ads", ADS, study.ads),
         ("scenario", SCENARIOS, study.scenario),
     ):
-        if table.model in shipped and not table.kind:
+        if table.model in shipped and not getattr(table, "kind", ""):
             _, create = _class_and_creator(kind, shipped, table, lookup)
             create()
     if not user_code_names(study):
@@ -417,12 +416,6 @@ def _class_and_creator(
 
 
 def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
-    if table.kind == "fmu":
-        code = UserCode(lookup.source, f"vehicle.model = {table.model!r}")
-        parameters = lookup.with_paths(Member(FmuVehicle, code), table.parameters, "vehicle.parameters")
-        description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
-        units = {name: row.unit for name, row in table.characteristics.items()}
-        return FmuVehicle(description, units, {**msgspec.structs.asdict(table), "parameters": parameters}, code)
     member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
     vehicle: Vehicle = create()
     if member.code is not None and not isinstance(getattr(vehicle, "UNITS", None), Mapping):
@@ -442,10 +435,11 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
     if table.kind == "fmu":
+        path = file_beside(table.model, lookup.folders)
+        if not path:
+            raise InputError(lookup.source, f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
         code = UserCode(lookup.source, f"ads.model = {table.model!r}")
-        parameters = lookup.with_paths(Member(FmuAds, code), table.parameters, "ads.parameters")
-        description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
-        return FmuAds(description, table.inputs, table.outputs, parameters, table.step, code)
+        return PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
     ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
     return PerVehicleAds(create, member.code) if member.code and isinstance(ads, ScalarAds) else ads

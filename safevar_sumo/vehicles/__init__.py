@@ -24,7 +24,6 @@ from safevar_sumo.vehicles.characteristics import (
     CharacteristicSet as CharacteristicSet,
     checked_change as checked_change,
 )
-from safevar_sumo.vehicles.fmu import FmuVehicle as FmuVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle

@@ -111,8 +111,6 @@ OTHERS = [
     ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
     ('[vehicle]\nmodel = "tesla"', "vehicle: 'characteristics' is a required property"),
     ('extends = "mine.toml"', "extends = 'mine.toml' leads back to "),
-    ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key"),
-    ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
     ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
     ('[spread]\n"ads.parameters.brake_gapp" = [1]', "spread.'ads.parameters.brake_gapp' is no parameter of the study"),
     ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
