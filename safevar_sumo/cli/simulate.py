@@ -76,7 +76,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 )
 @file_option("--trace", "Write the simulation step by step.", metavar="FILE.csv")
 @file_option("--plot", "Draw the simulation beside the original vehicle's to this file: png, pdf or svg.")
-@file_option("--animate", "Animate both simulations, seen from above, in this file: gif, mp4 or html.")
+@file_option("--animate", "Animate both simulations, seen from above, in this file: gif or html.")
 @click.option("--gui", is_flag=True, help="Show both simulations in sumo-gui, each on its own road.")
 @click.option(
     "--slower",
@@ -153,11 +153,9 @@ def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None
     check_output(trace, "--trace", (".csv",))
     check_output(plot, "--plot")
     if animation is not None:
-        from safevar_sumo.replay.animation import ENDINGS, find_ffmpeg
+        from safevar_sumo.replay.animation import ENDINGS
 
         check_output(animation, "--animate", ENDINGS)
-        if animation.suffix.lower() == ".mp4":
-            find_ffmpeg()
 
 
 def _show(

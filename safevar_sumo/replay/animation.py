@@ -1,9 +1,7 @@
-"""Animations of a comparison, seen from above: gif and mp4 by Matplotlib, and an HTML page."""
+"""Animations of a comparison, seen from above: a gif by Matplotlib, and an HTML page."""
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
@@ -19,7 +17,6 @@ from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, lane_outl
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-    from matplotlib.animation import AbstractMovieWriter
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
@@ -29,7 +26,7 @@ WIDTH, PANEL_HEIGHT, DPI = 880, 62, 100
 GROUND_COLOUR, ROAD_COLOUR, SEAM_COLOUR, PATH_COLOUR = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf"
 TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR = "#1d2329", "#5d666f", "#3f464d"
 PERSON_COLOUR, BRAKE_COLOUR = "#1d2329", "#e60000"
-ENDINGS = (".gif", ".mp4", ".html")
+ENDINGS = (".gif", ".html")
 """Endings of the files that `animate` writes."""
 SECONDS_PER_FRAME = 0.1
 """Duration of a gif's frame [s]; gifs resolve 0.01 s."""
@@ -37,10 +34,6 @@ LAST_FRAME_DURATION = 2.0
 """Duration of the last frame [s]."""
 MAX_GIF_SIZE = 1_000_000
 """Size above which a gif gets fewer frames [bytes]."""
-FFMPEG_OPTIONS = (
-    "-threads 1 -pix_fmt yuv420p -crf 26 -movflags +faststart -fflags +bitexact -flags:v +bitexact -map_metadata -1"
-)
-"""Options of ffmpeg for small files of the same bytes each time."""
 PLAYER_FOLDER = Path(__file__).parent / "web"
 WIDTH_IN_TEXT_HEIGHTS = 65
 """Width of a scene [heights of its text]."""
@@ -54,69 +47,31 @@ def animate(comparison: Comparison, path: Path) -> None:
     Raises
     ------
     InputError
-        If the ending is unknown, the file cannot be written, or an mp4 cannot be encoded because ffmpeg is missing.
+        If the ending is unknown, or the file cannot be written.
     """
     ending, scene = path.suffix.lower(), lay_out_scene(comparison)
     if ending not in ENDINGS:
         raise InputError("animate", str(path), f"a file that ends in {', '.join(ENDINGS)}")
-    try:
-        with whole_file(path, "animate") as file:
-            if ending == ".html":
-                file.write_text(animation_page(scene), encoding="utf-8", newline="\n")
-            elif ending == ".mp4":
-                _write_mp4(scene, file)
-            else:
-                _write_gif(scene, file)
-    except subprocess.CalledProcessError as error:
-        raise SafevarError(f"{path}: ffmpeg failed with exit code {error.returncode}") from None
-
-
-def find_ffmpeg() -> str:
-    """The path of ffmpeg: on the PATH, or else in the package imageio-ffmpeg; raises an InputError if there is none."""
-    if program := shutil.which("ffmpeg"):
-        return program
-    try:
-        import imageio_ffmpeg
-
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError):
-        raise InputError(
-            "animate",
-            "an mp4 needs ffmpeg, which is not installed",
-            "ffmpeg on the PATH, or in the checkout: pip install '.[film]'; a .gif or .html needs neither",
-        ) from None
+    with whole_file(path, "animate") as file:
+        if ending == ".html":
+            file.write_text(animation_page(scene), encoding="utf-8", newline="\n")
+        else:
+            _write_gif(scene, file)
 
 
 def _write_gif(scene: FlatScene, path: Path) -> None:
-    """Write a gif with as many frames as `MAX_GIF_SIZE` allows."""
-    from matplotlib.animation import PillowWriter
-
-    stride = max(1, round(SECONDS_PER_FRAME / scene.step))
-    while True:
-        _save(scene, stride, path, PillowWriter(fps=round(1 / (stride * scene.step))))
-        if path.stat().st_size <= MAX_GIF_SIZE or stride >= scene.sample_count:
-            return
-        stride *= 2
-
-
-def _write_mp4(scene: FlatScene, path: Path) -> None:
-    import matplotlib
-    from matplotlib.animation import FFMpegWriter
-
-    with matplotlib.rc_context({"animation.ffmpeg_path": find_ffmpeg()}):
-        _save(
-            scene, 1, path, FFMpegWriter(fps=round(1 / scene.step), codec="libx264", extra_args=FFMPEG_OPTIONS.split())
-        )
-
-
-def _save(scene: FlatScene, stride: int, path: Path, writer: AbstractMovieWriter) -> None:
-    """Write every `stride`-th sample of a scene, and the last one for a while."""
-    from matplotlib.animation import FuncAnimation
+    """Write a gif with as many frames as `MAX_GIF_SIZE` allows; the last one stays for a while."""
+    from matplotlib.animation import FuncAnimation, PillowWriter
 
     figure, show = draw_scene(scene)
-    last = scene.sample_count - 1
-    samples = [*range(0, last, stride), *[last] * (1 + round(LAST_FRAME_DURATION / (stride * scene.step)))]
-    FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False).save(path, writer)
+    stride, last = max(1, round(SECONDS_PER_FRAME / scene.step)), scene.sample_count - 1
+    while True:
+        samples = [*range(0, last, stride), *[last] * (1 + round(LAST_FRAME_DURATION / (stride * scene.step)))]
+        animation = FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False)
+        animation.save(path, PillowWriter(fps=round(1 / (stride * scene.step))))
+        if path.stat().st_size <= MAX_GIF_SIZE or stride > last:
+            return
+        stride *= 2
 
 
 def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
@@ -124,7 +79,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
-    height = round(WIDTH * scene.height / scene.width / 2) * 2  # an even number, which mp4 needs
+    height = round(WIDTH * scene.height / scene.width / 2) * 2
     figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
     axis = figure.add_axes(
         (0, 0, 1, height / (PANEL_HEIGHT + height)),

@@ -11,6 +11,7 @@ import pytest
 import scipy
 
 import safevar_sumo as sv
+from safevar_sumo.analysis.compare.compute import _needless_braking
 from safevar_sumo.analysis.evaluator import sobol_settings
 from safevar_sumo.analysis.research_questions.statistics import compare_samples
 from safevar_sumo.analysis.tolerance import scans
@@ -20,7 +21,19 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, json_of, refused, run, searched
 
-KEYS = ["a", "b", "criterion", "settings", "only_a_unsafe", "only_b_unsafe", "both", "p", "a12", "limits"]
+KEYS = [
+    "a",
+    "b",
+    "criterion",
+    "settings",
+    "only_a_unsafe",
+    "only_b_unsafe",
+    "both",
+    "p",
+    "a12",
+    "limits",
+    "needless_braking",
+]
 LONGER = {"ads": {"model": "aeb", "parameters": {"braking_share": 0.65, "response_time": 0.3}}, "name": "earlier"}
 ONE_TEST = {"matrix": {"tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}]}}
 POOL = InlinePool()
@@ -51,6 +64,14 @@ def test_the_collisions_that_another_version_avoids_are_those_of_simulations() -
     limits = [(one["characteristic"], one["a"]) for one in found["limits"]]
     assert limits == [(one["characteristic"], one["safe"]) for one in alone]
     assert "The original vehicles differ: passed, SD" in str([*answer.sentences()])
+
+
+def test_needless_braking_is_counted_in_both() -> None:
+    wear = sv.load_study("wear", **ONE_TEST)
+    early = sv.load_study("wear", **ONE_TEST, ads={"model": "aeb", "parameters": {"braking_share": 0.05}})
+    in_a, in_b, scenes = _needless_braking(wear, early)
+    assert 0 <= in_a < in_b <= scenes
+    assert _needless_braking(wear, wear) == (in_a, in_a, scenes)
 
 
 def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:

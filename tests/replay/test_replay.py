@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,15 +17,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from safevar_sumo.analysis.case import Case
-from safevar_sumo.errors import InputError
 from safevar_sumo.replay import animation
-from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene, find_ffmpeg
+from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene
 from safevar_sumo.replay.comparison import COLOURS, Comparison, compare_setting, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import refused
 
 
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
@@ -148,15 +145,12 @@ def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Compari
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["gif", "html", "mp4"])
+@pytest.mark.parametrize("kind", ["gif", "html"])
 def test_the_same_bytes_twice(
     kind: str, comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of few frames."""
-    save = animation._save
     monkeypatch.setattr(animation, "SECONDS_PER_FRAME", 0.25)
-    if kind == "mp4":
-        monkeypatch.setattr(animation, "_save", lambda scene, stride, *rest: save(scene, 20, *rest))
     for name in ("a", "b"):
         animate(comparison, tmp_path / f"{name}.{kind}")
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
@@ -175,11 +169,3 @@ def test_the_page_holds_every_place_to_the_centimetre(comparison: Comparison) ->
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
         assert np.allclose(shown["x"], body.x, atol=0.0051)
     assert [drive["end"] for drive in data["drives"]] == [moments.end for moments in comparison.moments]
-
-
-def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "/nowhere")
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(InputError, match="ffmpeg"):
-        find_ffmpeg()
-    refused("simulate", "sun", "--animate", str(tmp_path / "it.mp4"), message=("--animate", "ffmpeg"))

@@ -78,6 +78,8 @@ class SystemComparison:
         pairs.
     a12
         Probability that this quantity is greater in A than in B (Vargha and Delaney); None without pairs.
+    needless_braking
+        Number of benign scenes of A in which the original vehicle of A brakes, of those in which B's does, and of all.
     test_unit, test_size
         What the pairs of the test are, "run" or "setting", and their number.
     weather
@@ -93,6 +95,7 @@ class SystemComparison:
     test_unit: str
     test_size: int
     weather: pd.DataFrame | None
+    needless_braking: tuple[int, int, int]
     remarks: tuple[str, ...] = ()
 
     @property
@@ -146,6 +149,7 @@ class SystemComparison:
                 for a, b in self._scans
             ],
         }
+        answer["needless_braking"] = dict(zip(("a", "b", "benign_scenes"), self.needless_braking, strict=True))
         if self.original_differences:
             answer["originals"] = {"a": self.a.original_facts, "b": self.b.original_facts}
         if self.a.points is not None:
@@ -197,6 +201,9 @@ class SystemComparison:
         yield table
         yield self._test_in_words()
         yield _as_table(self.limits_frame(), "Limits of each alone, all others as in the original")
+        in_a, in_b, scenes = self.needless_braking
+        if scenes:
+            yield f"Needless braking of the original vehicles in {scenes} benign scenes: {in_a} in A, {in_b} in B."
         if self.a.points is not None and self.b.points is not None:
             yield f"Rating of the original vehicles: {self.a.points:.2f} points in A, {self.b.points:.2f} in B."
         if self.weather is not None:

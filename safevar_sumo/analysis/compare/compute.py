@@ -12,6 +12,7 @@ from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.compare.answer import Side, SystemComparison
 from safevar_sumo.analysis.evaluator import MAX_REJECTIONS, Evaluator, sobol_points
 from safevar_sumo.analysis.rating.compute import rate
+from safevar_sumo.analysis.repair.price import benign_scenes, needless_braking
 from safevar_sumo.analysis.research_questions.changes import compare_weathers
 from safevar_sumo.analysis.research_questions.statistics import FEWEST_RUNS, compare_samples, signed_rank_test
 from safevar_sumo.analysis.subject import study_in
@@ -23,6 +24,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.system import assemble
 
 SAMPLE = "sample"
 """Source of the settings of the common sample."""
@@ -88,6 +90,7 @@ def compare_systems(
         test_unit=unit,
         test_size=number,
         weather=_weather_table(list(cases.values())),
+        needless_braking=_needless_braking(*studies),
         remarks=tuple(f"{number_of(count, noun)} {remark}" for count, noun, remark in remarks if count),
     )
 
@@ -100,6 +103,14 @@ def _side(evaluator: Evaluator, original: Evaluations, unsafe: Unsafe, both_rate
         points=rate(evaluator, {}).original.points if both_rated else None,
         no_verdict=evaluator.no_verdict,
     )
+
+
+def _needless_braking(a: Study, b: Study) -> tuple[int, int, int]:
+    """In how many of A's benign scenes the original vehicles of A and B brake, and the number of these scenes."""
+    systems = [assemble(study, study.source) for study in (a, b)]
+    scenes = benign_scenes(a, systems[0])
+    brakes_in_a, brakes_in_b = (needless_braking(system, scenes) for system in systems)
+    return sum(brakes_in_a), sum(brakes_in_b), len(brakes_in_a)
 
 
 def _common_domain(evaluators: tuple[Evaluator, Evaluator], orders: list[list[int]]) -> tuple[FloatArray, FloatArray]:

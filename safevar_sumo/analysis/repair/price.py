@@ -42,17 +42,12 @@ class Price(NamedTuple):
 
 
 def price_of(study: Study, values: Mapping[str, float]) -> Price:
-    """The price of other values of parameters.
-
-    The benign scenes are those that the study names, else those like its shipped scenarios; there may be none.
-    """
+    """The price of other values of parameters."""
     today, changed = assemble(study), assemble(with_parameters(study, values))
     onsets_today, _ = _drive_new_car(today)
     onsets, deceleration = _drive_new_car(changed)
-    benign = benign_points(today.points)
-    if study.repair.benign:
-        benign = list(assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix)
-    before, after = (_brakes_in(system, benign) for system in (today, changed))
+    benign = benign_scenes(study, today)
+    before, after = (needless_braking(system, benign) for system in (today, changed))
     metres, seconds = onsets_today - onsets
     braked = np.flatnonzero(np.isfinite(metres))
     earlier: tuple[float | None, float | None, float | None, str] = (None, None, None, "")
@@ -77,7 +72,14 @@ def _drive_new_car(system: System) -> tuple[FloatArray, float]:
     return onsets, deceleration
 
 
-def _brakes_in(system: System, benign: list[Point]) -> list[bool]:
+def benign_scenes(study: Study, system: System) -> list[Point]:
+    """The benign scenes that a study names, else those like its shipped scenarios; there may be none."""
+    if study.repair.benign:
+        return list(assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix)
+    return benign_points(system.points)
+
+
+def needless_braking(system: System, benign: list[Point]) -> list[bool]:
     """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road without anybody."""
     one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
     return [
