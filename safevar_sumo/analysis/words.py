@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
 from safevar_sumo.records import Outcome
+from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -22,15 +23,17 @@ OUTCOME_VERBS = {
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
-def ending_in_words(outcome: str, safety_degree: float | None) -> str:
+def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 0.0) -> str:
     """How a run ended, such as `collides at 3.21 m/s` or `stops, safety degree 0.87 m`.
 
-    The safety degree is in m, or -m/s on a collision.
+    The safety degree is in m, or -m/s on a collision; bodies touch at a safety degree of `contact`.
     """
-    degree = "" if safety_degree is None or math.isnan(safety_degree) else f"{abs(safety_degree):.2f}"
+    verb = "collides" if outcome == Outcome.COLLISION else OUTCOME_VERBS.get(Outcome(outcome), outcome)
+    if safety_degree is None or math.isnan(safety_degree):
+        return verb
     if outcome == Outcome.COLLISION:
-        return f"collides at {degree} m/s" if degree else "collides"
-    return OUTCOME_VERBS.get(Outcome(outcome), outcome) + (f", safety degree {degree} m" if degree else "")
+        return f"{verb} at {abs(safety_degree):.2f} m/s"
+    return f"{verb}, safety degree {distance_in_words(safety_degree, contact)}"
 
 
 def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:

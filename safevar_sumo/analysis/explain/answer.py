@@ -292,7 +292,7 @@ def study_verdict(case: Case, original: Evaluations) -> list[str]:
     sentences = [f"{situation_in_words(system, original)} {counts}"]
     if len(failures):
         fewest = failures.iloc[0]
-        ending = ending_in_words(fewest["outcome"], fewest["f_safe"])
+        ending = ending_in_words(fewest["outcome"], fewest["f_safe"], contact_degree(system))
         if system.rater:
             ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
         changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})

@@ -38,7 +38,7 @@ from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, worst_points
+from safevar_sumo.sumo.matrix import contact_degree, evaluate, simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
 Reasons = dict[int, tuple[str, ...]]
@@ -223,7 +223,7 @@ def _explain_rows(
         replace(cause, neighbours=robustness, sets=len(models), holds=holds)
         for cause, robustness, holds in zip(described, robustness_of_causes, holding, strict=True)
     )
-    is_assessed = _is_assessed(study, failures)
+    is_assessed, contact = _is_assessed(study, failures), contact_degree(assemble(study))
     verdicts = iter(judge_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
     explanations = []
     for index, (row, (endings, points)) in enumerate(zip(reasons, comparisons, strict=True)):
@@ -235,6 +235,7 @@ def _explain_rows(
                 setting=dict(zip(characteristics.names, settings[index].tolist(), strict=True)),
                 outcome=str(failures.outcome[index]),
                 safety_degree=finite_or_none(failures.f_safe[index]),
+                contact=contact,
                 causes=tuple(islice(remaining_causes, len(causes[row]))),
                 robustness=robustnesses[index],
                 endings=endings,
@@ -258,9 +259,12 @@ original's), in the study's order.
 """
 
 
-def _endings_in_words(point: str, evaluations: Evaluations, row: int) -> str:
+def _endings_in_words(system: System, point: str, evaluations: Evaluations, row: int) -> str:
     """How the runs of the original vehicle, in row 0, and of another vehicle end at a point."""
-    original, changed = (ending_in_words(str(evaluations.outcome[k]), float(evaluations.f_safe[k])) for k in (0, row))
+    contact = contact_degree(system)
+    original, changed = (
+        ending_in_words(str(evaluations.outcome[k]), float(evaluations.f_safe[k]), contact) for k in (0, row)
+    )
     return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 
 
@@ -275,7 +279,7 @@ def compare_at_points(
     for vehicle in range(1, len(worst)):  # vehicle 0 is the original
         names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
         at_worst = results[worst[vehicle]]
-        sentence = _endings_in_words(at_worst.point.name, at_worst.evaluations, vehicle)
+        sentence = _endings_in_words(system, at_worst.point.name, at_worst.evaluations, vehicle)
         comparisons.append((sentence, tuple(filter(None, names))))  # without a matrix, the only point has no name
     return comparisons
 
@@ -297,5 +301,5 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
         point = system.matrix[int(np.argmax(loss))]
         evaluations = evaluate(system.at(point), np.stack([original[0], setting]))
         worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
-        comparisons.append((_endings_in_words(point.name, evaluations, 1), worse_cells))
+        comparisons.append((_endings_in_words(system, point.name, evaluations, 1), worse_cells))
     return comparisons

@@ -11,6 +11,7 @@ from safevar_sumo.analysis.explain.causes import Cause, Robustness
 from safevar_sumo.analysis.words import ending_in_words, join_phrases, list_of_changes, number_of, simulate_command
 from safevar_sumo.records import KMH_PER_MS, JsonObject, Outcome
 from safevar_sumo.results import SolutionId
+from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import unit_text
 from safevar_sumo.terminal import WholeTable, meanings
 from safevar_sumo.vehicles import CharacteristicSet
@@ -41,6 +42,8 @@ class Explanation:
         The value of each characteristic, in its unit.
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s].
+    contact
+        The safety degree at which bodies touch [m].
     causes
         All minimal causes; none if the setting is not unsafe.
     robustness
@@ -60,6 +63,7 @@ class Explanation:
     setting: dict[str, float]
     outcome: str
     safety_degree: float | None
+    contact: float
     causes: tuple[Cause, ...]
     robustness: Robustness
     endings: str
@@ -93,7 +97,7 @@ class Explanation:
             return self.outcome
         if self.outcome == Outcome.COLLISION:
             return f"a collision at {speed_in_words(self.safety_degree)}"
-        return f"a safety degree of only {self.safety_degree:.2f} m"
+        return f"a safety degree of only {distance_in_words(self.safety_degree, self.contact)}"
 
     def finding(self, verb: str) -> str:
         """The limits of its cause and what was found, such as `With sensor range below 21.4 m the vehicle collides
@@ -142,7 +146,7 @@ class Explanation:
                 texts = (item.text(values[item.name]) for values in (cause.changes, cause.boundary, cause.alone))
                 table.add_row(item.name + unit_text(item.unit, " [{}]"), f"{item.original:g}", *texts)
             yield from (table, meanings(changed))
-            ending = ending_in_words(cause.outcome, cause.safety_degree)
+            ending = ending_in_words(cause.outcome, cause.safety_degree, self.contact)
             yield f"Alone it {ending}{cause.notes}: {simulate_command(subject, cause.changes, point)}. {cause.limit}"
         if len(self.causes) > MAX_CAUSES:
             yield f"... and {len(self.causes) - MAX_CAUSES} more of the same number of changes (--json has all)."
