@@ -15,11 +15,11 @@ import multiprocessing
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -27,53 +27,46 @@ import psutil
 from evaluation import bare
 from measuring import Record, clock_seconds, print_records
 
-from safevar_sumo.campaign import all_runs, run_campaign
-from safevar_sumo.campaign.cluster import cluster_pool
-from safevar_sumo.campaign.evaluation import Task, evaluate_batch
-from safevar_sumo.campaign.identity import identity_of
-from safevar_sumo.campaign.local import local_pool
-from safevar_sumo.campaign.pool import Batch, Job, Pool, Report, evaluate_batches
-from safevar_sumo.campaign.worker import carry_out_job
+from safevar_sumo.campaign import all_runs, evaluation, run_campaign
+from safevar_sumo.campaign.evaluation import Task, evaluate_batch, evaluate_settings
+from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import MAX_VEHICLES, simulate
 from safevar_sumo.sumo.network import stage_network
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
-Computed = tuple[bytes, FloatArray]
-"""A packed study, which says where its vehicles drive, and the settings."""
-
-
-class Silent:
-    """Hears how a campaign goes on, and says nothing."""
-
-    def progressed(self, runs: object) -> None: ...
-    def finished(self, run: object) -> None: ...
-    def warned(self, message: str) -> None: ...
+Computed = tuple[Task, FloatArray]
+"""A task and its settings."""
 
 
 class ThisProcess:
-    """A pool that computes in this process, keeps the batches, and measures the processor time of simulations [s]."""
-
-    workers = 1
+    """A worker that computes in this process, keeps the batches, and measures the processor time of simulations [s]."""
 
     def __init__(self) -> None:
         self.batches: list[Computed] = []
         self.simulation = 0.0
+        evaluation.evaluate_batch = self._evaluate
 
-    def carry(self, job: Job, report: Report) -> Future[None]:
-        future: Future[None] = Future()
-        self.batches, self.simulation = [], 0.0  # without the batches that warmed this process up
-        future.set_result(carry_out_job(job, report, self._evaluate))
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if function is not evaluate_settings:
+            self.batches, self.simulation = [], 0.0  # without the batches that warmed this process up
+        future.set_result(function(*arguments))
         return future
 
-    def _evaluate(self, packed_task: bytes, settings: FloatArray) -> Evaluations:
-        self.batches.append((packed_task, settings))
+    def cause_of_death(self, error: BaseException) -> str:
+        return ""
+
+    def end(self) -> None:
+        evaluation.evaluate_batch = evaluate_batch
+
+    def _evaluate(self, task: Task, settings: FloatArray) -> Evaluations:
+        self.batches.append((task, settings))
         start = time.process_time()
-        evaluations = evaluate_batch(packed_task, settings)
+        evaluations = evaluate_batch(task, settings)
         self.simulation += time.process_time() - start
         return evaluations
 
@@ -100,18 +93,20 @@ def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
 def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     """Carry out a study in a pool that is at work already."""
     with tempfile.TemporaryDirectory() as folder, opened as pool:
-        evaluate_batches([Batch(Task(study=study).packed, drawn(study, MAX_VEHICLES))] * 4 * pool.workers, pool)
-        before = processors()
-        results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
-        clock = clock_seconds(
-            lambda: run_campaign(study, all_runs(study), results, pool, Silent(), MAX_VEHICLES, engine=Engine.RECORDED)
-        )
+        task = Task(study=study, batch_size=MAX_VEHICLES)
+        pool.map(evaluate_settings, [(task, drawn(study, MAX_VEHICLES))] * 4 * pool.workers)
+        before, system = processors(), assemble(study)
+
+        def carry_out() -> None:
+            run_campaign(study, system, all_runs(study), Path(folder), pool, show_no_progress, print, MAX_VEHICLES)
+
+        clock = clock_seconds(carry_out)
         return Cost(clock, processors() - before)
 
 
 def compute(batches: list[Computed]) -> None:
-    for packed_task, settings in batches:
-        evaluate_batch(packed_task, settings)
+    for task, settings in batches:
+        evaluate_batch(task, settings)
 
 
 def ceiling(batches: list[Computed]) -> float:
@@ -135,13 +130,13 @@ def floor(study: Study) -> float:
 
 
 @contextmanager
-def two_dask_workers(study: Study) -> Iterator[Pool]:
+def two_dask_workers() -> Iterator[Pool]:
     """A cluster on this machine."""
     from distributed import LocalCluster
 
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        cluster_pool(cluster.scheduler_address, study.search.time_limit) as pool,
+        open_pool(cluster=cluster.scheduler_address) as pool,
     ):
         yield pool
 
@@ -149,10 +144,11 @@ def two_dask_workers(study: Study) -> Iterator[Pool]:
 def turn(study: Study) -> dict[str, float]:
     """Every ratio once: what is compared is measured one right after the other."""
     alone = ThisProcess()
-    whole = campaign(study, nullcontext(alone))
+    whole = campaign(study, nullcontext(Pool(1, lambda place: alone)))
+    alone.end()
     simulated, bare_each = sum(len(settings) for _, settings in alone.batches), floor(study)
-    one, two = (campaign(study, local_pool(jobs, study.search.time_limit)) for jobs in (1, 2))
-    cluster = campaign(study, two_dask_workers(study))
+    one, two = (campaign(study, open_pool(jobs)) for jobs in (1, 2))
+    cluster = campaign(study, two_dask_workers())
     most = ceiling(alone.batches)
     return {
         "campaign": whole.processor / simulated / bare_each,

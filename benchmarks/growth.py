@@ -15,9 +15,8 @@ import psutil
 from campaign import drawn
 from measuring import Record, print_records
 
-from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.local import local_pool
-from safevar_sumo.campaign.pool import Batch, evaluate_batches
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings
+from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import MAX_VEHICLES
 
@@ -27,15 +26,15 @@ FIRST = 5000
 
 def records_of(study: Study, evaluations: int) -> Iterator[Record]:
     """Measure the first and the last `FIRST` evaluations of one worker, and its memory after both."""
-    packed_task, spans = Task(study=study).packed, []
-    with local_pool(1, study.search.time_limit) as pool:
-        evaluate_batches([Batch(packed_task, drawn(study, MAX_VEHICLES))], pool)
+    task, spans = Task(study=study, batch_size=MAX_VEHICLES), []
+    with open_pool(1) as pool:
+        pool.map(evaluate_settings, [(task, drawn(study, MAX_VEHICLES))])
         worker = next(child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
         first = 0
         for done in range(0, evaluations, FIRST):
             before = sum(worker.cpu_times()[:2])
             for batch in range(FIRST // MAX_VEHICLES):
-                evaluate_batches([Batch(packed_task, drawn(study, MAX_VEHICLES, seed=done + batch))], pool)
+                pool.map(evaluate_settings, [(task, drawn(study, MAX_VEHICLES, seed=done + batch))])
             spans.append(sum(worker.cpu_times()[:2]) - before)
             first = first or worker.memory_info().rss
         last = worker.memory_info().rss

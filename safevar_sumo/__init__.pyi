@@ -25,7 +25,6 @@ from .api.simulation import (
     load_study as load_study,
     simulate as simulate,
 )
-from .campaign import Observer as Observer
 from .campaign.pool import Pool as Pool
 from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
 from .metrics import Criterion as Criterion, Unsafe as Unsafe

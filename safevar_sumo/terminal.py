@@ -176,24 +176,27 @@ def show_no_progress(stage: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
-class _TimeLeft(ProgressColumn):
-    """The time left in the stage under way, at its mean speed so far."""
+class _Pace(ProgressColumn):
+    """The mean speed of the stage under way, and the time left at that speed."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._done, self._total, self._start, self._last = 0, 0, 0.0, 0.0
+        self._done, self._total, self._last = 0, 0, 0.0
+        self._begun: tuple[int, float] | None = None
+        """What was done when the stage began, such as by an earlier command, and the time [s]."""
 
     def update(self, done: int, total: int) -> None:
         self._done, self._total, self._last = done, total, time.monotonic()
-        if done == 0:
-            self._start = self._last
+        if done == 0 or self._begun is None:
+            self._begun = done, self._last
 
     def render(self, task: Task | None = None) -> Text:
-        worked = self._last - self._start
-        if not self._done or worked < SETTLING_TIME:
+        done_before, start = self._begun or (0, 0.0)
+        done, worked = self._done - done_before, self._last - start
+        if done <= 0 or worked < SETTLING_TIME:
             return Text("-:--:-- left")
-        seconds = (self._total - self._done) * worked / self._done - (time.monotonic() - self._last)
-        return Text(f"{timedelta(seconds=max(round(seconds), 0))} left")
+        seconds = (self._total - self._done) * worked / done - (time.monotonic() - self._last)
+        return Text(f"{done / worked:.3g}/s, {timedelta(seconds=max(round(seconds), 0))} left")
 
 
 @contextmanager
@@ -203,20 +206,20 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         yield progress or show_no_progress
         return
     console = console or Console(stderr=True)
-    time_left, ended, line = _TimeLeft(), Event(), "starting"
+    pace, ended, line = _Pace(), Event(), "starting"
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal line
         line = f"{stage}: {done} of {total}"
-        time_left.update(done, total)
+        pace.update(done, total)
         bar.update(task, description=stage, completed=done, total=total)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(console, f"{line}, {time_left.render()}")
+            print_text(console, f"{line}, {pace.render()}")
 
     stage = TextColumn("{task.description}", markup=False)
-    columns = (stage, BarColumn(bar_width=None), MofNCompleteColumn(), time_left)
+    columns = (stage, BarColumn(bar_width=None), MofNCompleteColumn(), pace)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(line, total=None)

@@ -21,16 +21,16 @@ from safevar_sumo.campaign import local
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import InlinePool, searched
+from tests.in_process import InlinePool, inline_worker, searched
 
-collect_ignore = [] if os.name == "posix" else ["campaign/test_local_pool.py", "end_to_end/test_processes.py"]
+collect_ignore = [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
 """Tests that send POSIX signals to processes; other systems skip them."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
 # Programs that tests start need not compile the package each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-WORKER_PROCESSES = local.LocalPool
+WORKER_PROCESSES = local.ProcessWorker
 FITS = 2
 """Number of fitted vehicle models of the study `slippery`, with which conclusions are repeated."""
 SLIPPERY = """
@@ -60,14 +60,14 @@ def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactor
         patch.setenv(
             "XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache")
         )
-        patch.setattr(local, "LocalPool", InlinePool)
+        patch.setattr(local, "ProcessWorker", inline_worker)
         yield
 
 
 @pytest.fixture
 def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let pools start worker processes, as for a user."""
-    monkeypatch.setattr(local, "LocalPool", WORKER_PROCESSES)
+    monkeypatch.setattr(local, "ProcessWorker", WORKER_PROCESSES)
 
 
 @pytest.fixture(params=[name for name in study_names() if not is_rated(load_study(name))])

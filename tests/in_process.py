@@ -1,6 +1,4 @@
-"""Campaigns and commands in this process: a pool that computes at once, an observer without output, commands as users
-type them.
-"""
+"""Campaigns and commands in this process: a pool that computes at once, commands as users type them."""
 
 from __future__ import annotations
 
@@ -8,6 +6,7 @@ import io
 import json
 import os
 import sys
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -15,56 +14,46 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from safevar_sumo.campaign import all_runs, run_campaign
-from safevar_sumo.campaign.evaluation import evaluate_batch
-from safevar_sumo.campaign.identity import identity_of
-from safevar_sumo.campaign.pool import Job, Report
-from safevar_sumo.campaign.worker import carry_out_job
+from safevar_sumo.campaign import all_runs, evaluation, run_campaign
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import main
-from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import show_no_progress
 
 
-class InlinePool:
-    """A pool that computes in this process, at once; it has the interface of a pool of worker processes."""
+class InlinePool(Pool):
+    """A pool that computes in this process, at once, and is its own worker."""
 
-    workers = 1
+    def __init__(self, workers: int = 1) -> None:
+        super().__init__(workers, lambda place: self)
 
-    def __init__(self, jobs: int = 1, time_limit: float = 0.0) -> None: ...
-
-    def carry(self, job: Job, report: Report) -> Future[None]:
-        future: Future[None] = Future()
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
         try:
-            future.set_result(self.work(job, report))
+            future.set_result(self.compute(function, *arguments))
         except Exception as error:
             future.set_exception(error)
         return future
 
-    def work(self, job: Job, report: Report) -> None:
-        carry_out_job(job, report, evaluate_batch)
+    def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments)
 
-    def close(self) -> None: ...
+    def cause_of_death(self, error: BaseException) -> str:
+        return ""
 
-
-class TwoWorkers(InlinePool):
-    """A pool in this process whose work is split for two workers."""
-
-    workers = 2
+    def end(self) -> None: ...
 
 
-class SilentObserver:
-    """An observer that ignores all reports."""
-
-    def progressed(self, *_: object) -> None: ...
-    def finished(self, *_: object) -> None: ...
-    def warned(self, message: str) -> None: ...
+def inline_worker(last_words: Path) -> InlinePool:
+    """A worker in this process, which knows as little as a new one."""
+    evaluation._assemble_packed.cache_clear()
+    return InlinePool()
 
 
 def searched(study: Study, out: Path) -> Path:
     """Search a study in this process; returns its results directory, `out`."""
-    results = ResultsDirectory(out, study, identity_of(study, assemble(study)))
-    results.finish(run_campaign(study, all_runs(study), results, InlinePool(), SilentObserver()).solutions)
+    run_campaign(study, assemble(study), all_runs(study), out, InlinePool(), show_no_progress, lambda message: None)
     return out
 
 
@@ -102,11 +91,11 @@ def json_of(*arguments: str) -> Any:
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:
-    """The command must end with exit code 2 and print, warnings apart, all of `message` in one or two lines, or a line
-    for each mistake.
+    """The command must end with exit code 2 and print, warnings and notes apart, all of `message` in one or two lines,
+    or a line for each mistake.
     """
     output = run(*arguments, expect=2)
     for part in message:
         assert part in output.stderr, output.stderr
-    lines = [line for line in output.stderr.strip().splitlines() if not line.startswith("warning: ")]
+    lines = [line for line in output.stderr.strip().splitlines() if not line.startswith(("warning: ", "note: "))]
     assert len(lines) <= 2 or lines[0].endswith("mistakes"), output.stderr

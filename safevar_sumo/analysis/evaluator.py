@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 
@@ -12,14 +12,18 @@ import numpy as np
 
 from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.model_spread import studies_of_sets
-from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, Task
-from safevar_sumo.campaign.identity import files_of
-from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.campaign.pool import Batch, Pool, evaluate_batches
+from safevar_sumo.campaign.evaluation import (
+    EVERYTHING,
+    VERIFIED_SETTINGS,
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+)
+from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.plugins import Files
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
@@ -88,19 +92,10 @@ class Evaluator:
 
         The values stand beside the settings, shape (M, n + P).
         """
-        return self._evaluate_shown(rows, stage, 0, selection, self._files)
-
-    @cached_property
-    def _files(self) -> Files:
-        return files_of(self.study)
+        return self._evaluate_shown(rows, stage, 0, selection)
 
     def _evaluate_shown(
-        self,
-        settings: FloatArray,
-        stage: str,
-        verified: int,
-        selection: Selection = EVERYTHING,
-        files: Files | None = None,
+        self, settings: FloatArray, stage: str, verified: int, selection: Selection = EVERYTHING
     ) -> Evaluations:
         """Evaluate settings while progress is shown."""
         if not len(settings):
@@ -113,7 +108,7 @@ class Evaluator:
             done += increment
             self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection, files)
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection)
         self.simulated += total
         return evaluations
 
@@ -160,17 +155,19 @@ class Evaluator:
         cell_count = len(rater.protocol.cells)
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
-        tasks = (Task(study=self.study, files=self._files, cells=(part, parts)) for part in range(parts))
-        batches = [Batch(task.packed, settings) for task in tasks]
+        jobs = [
+            (Task(study=self.study, batch_size=max(len(settings), 1), cells=(part, parts)), settings)
+            for part in range(parts)
+        ]
         results, done = list[CellResults](), 0
 
-        def show_more_done(part: int, size: int) -> None:
+        def show_more_done(ended: Sequence[int]) -> None:
             nonlocal done
-            done += len(cells[part])
+            done += sum(len(cells[part]) for part in ended)
             self.progress(stage, done, cell_count)
 
-        self.progress(stage, done, cell_count)
-        for evaluations in evaluate_batches(batches, self._pool, show_more_done):
+        show_more_done([])
+        for evaluations in carry_out(evaluate_settings, jobs, self._pool, show_more_done):
             if evaluations.cells is None:
                 reason = evaluations.reason(int(np.argmax(evaluations.failed)))
                 raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
@@ -262,7 +259,7 @@ def open_evaluator(
         yield Evaluator(study, pool, progress)
         return
     assemble(study, study.source)
-    with local_pool(jobs or available_cores(), study.search.time_limit) as new_pool:
+    with open_pool(jobs) as new_pool:
         yield Evaluator(study, new_pool, progress)
 
 

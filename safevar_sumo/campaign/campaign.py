@@ -1,99 +1,69 @@
-"""A campaign: runs of a study, dealt out in shares to the workers of a pool; and its cost, from a short measurement."""
+"""A campaign: runs of a study, dealt out in shares to the workers of a pool; and how fast they will be."""
 
 from __future__ import annotations
 
 import math
-import tempfile
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-import msgspec
+import numpy as np
 
-from safevar_sumo.campaign.batches import check_code
-from safevar_sumo.campaign.evaluation import Task, tasks_for_sumo
+from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, system_of
 from safevar_sumo.campaign.identity import identity_of
-from safevar_sumo.campaign.pool import Pool, Share, carry_out, evaluate_original
-from safevar_sumo.campaign.run import RunKey, RunProgress, RunResult, all_runs
-from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code
+from safevar_sumo.campaign.runs import RunKey, RunResult, algorithm_of, all_runs
+from safevar_sumo.campaign.share import Share, carry_share
+from safevar_sumo.errors import InputError, SimulationError, one_of
+from safevar_sumo.metrics import Scoring
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
+from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import Engine, assemble
-from safevar_sumo.sumo.matrix import MAX_COPIES, MAX_VEHICLES
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
+from safevar_sumo.sumo.system import System
+from safevar_sumo.terminal import Progress
 
-PROBE_VEHICLES = 2 * MAX_VEHICLES
-"""Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
-PROBE_SECONDS = 2.0
-"""Shortest measurement [s], unless the runs are over before."""
-CHARACTERS_PER_NUMBER = 18
-"""Characters of a number in a journal, at most, with its comma."""
-NUMBERS_BESIDE_METRICS = 5
-"""Values in a journal besides the metrics of a setting: f_diff, f_num_diff, collision speed, position, outcome."""
 BATCHES_PER_SHARE = 2
 """Number of largest batches that the populations of all runs of a share fill, at most."""
 MAX_RUNS = 256
 """Maximum number of runs in a share: each keeps a file open."""
-
-
-class Observer(Protocol):
-    """Receives the progress of a campaign."""
-
-    def progressed(self, runs: Sequence[RunProgress]) -> None:
-        """The state of some runs under way."""
-
-    def finished(self, run: RunProgress) -> None:
-        """The last state of a run."""
-
-    def warned(self, message: str) -> None:
-        """A warning for the user."""
+PROBE_VEHICLES = 4000
+"""Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
+ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
+"""The engines that a study may name."""
 
 
 class Campaign(NamedTuple):
-    """Results of the runs of a study: the evaluation of the original vehicle, and the solutions of each finished run.
-
-    `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions`
-    and `invalid_tests` are numbers of distinct settings of each finished run: those that collided, and those that left
-    the speed tolerance of a test. `scoring` holds the metrics and objectives. `no_verdict` says why the runs tell
-    nothing about the ADS.
-    """
+    """Results of the runs of a study; `no_verdict` says why they tell nothing about the ADS."""
 
     original: Evaluations
-    solutions: dict[RunKey, Evaluations]
-    failures: list[Failure]
-    busy: list[RunKey]
-    collisions: dict[RunKey, int]
-    invalid_tests: dict[RunKey, int]
-    scoring: Scoring = PUBLISHED_SCORING
-    no_verdict: str = ""
+    runs: list[RunResult]
+    scoring: Scoring
+    no_verdict: str
 
 
 def run_campaign(
     study: Study,
-    keys: Iterable[RunKey],
-    results: ResultsDirectory,
+    system: System,
+    keys: Sequence[RunKey],
+    directory: Path,
     pool: Pool,
-    observer: Observer,
+    progress: Progress,
+    warn: Callable[[str], None],
     batch_size: int | None = None,
+    engine: str = Engine.RECORDED,
     *,
-    engine: Engine = Engine.LIBSUMO,
     retry_failed: bool = False,
 ) -> Campaign:
-    """Carry out runs of a study, or resume unfinished ones.
+    """Carry out runs of a study, or resume unfinished ones; write the solutions if these are all runs of the study.
 
     Parameters
     ----------
-    keys
-        The runs.
-    results
-        The directory of their journals.
-    pool
-        Carries the shares of the runs.
+    directory
+        The directory of the results.
     batch_size
         Maximum number of settings in a batch, which may hold settings of several runs.
     engine
@@ -104,146 +74,105 @@ def run_campaign(
     Raises
     ------
     SafevarError
-        If a journal cannot be written, or the study is at fault.
+        If a journal cannot be written, another process works on a run, or the study is at fault.
     """
-    batch_size = batch_size or MAX_COPIES
-    packed_task = Task(study=study, files=results.files, engine=engine).packed
-    check_code(study, results.files, pool)
-    original = _evaluate_original(study, packed_task, results, pool, observer)
+    results = ResultsDirectory(directory, study, identity_of(study, system), system.measuring.scoring)
+    for remark in results.extent_remarks(set(map(str, all_runs(study)))):
+        warn(remark)
+    engine_used, reason = choose_engine(system, engine)
+    results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
+    algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
+    results.manifest["titles"] = {name: one.title for name, one in algorithms.items() if one.title}
+    task = Task(study=study, engine=engine_used, batch_size=batch_size or settings_per_batch(system, engine_used))
+    show_journals = journal_progress(study, keys, directory, progress)
+    show_journals([])
+    check_code(study, pool)
+    no_verdict = ask_why_no_verdict(study, pool)
+    if no_verdict:
+        warn(f"study {study.name!r}: {no_verdict}")
+    original = evaluate_original(task, pool)
+    if original.collided[0] and not is_rated(study):
+        warn(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
     results.begin(original)
-    sumo_tasks = tasks_for_sumo(study, results.files) if engine is Engine.RECORDED else (b"", b"")
-    directory, identity = results.path.absolute(), results.digest
-    runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / study.search.population), MAX_RUNS)
+    verifies = engine_used is Engine.RECORDED
     shares = [
-        Share(packed_task, *sumo_tasks, batch_size, tuple(dealt), directory, identity, original, retry_failed)
-        for dealt in deal(list(keys), pool.workers, runs_at_once)
+        (task, Share(dealt, directory.absolute(), results.manifest, original, verifies, retry_failed))
+        for dealt in deal(keys, pool.workers, task.batch_size, study.search.population)
     ]
-    run_results, busy = _collect(shares, pool, observer)
-    runs = [(key, run_results[key]) for key in sorted(run_results)]
-    return Campaign(
-        original=original,
-        solutions={key: run.solutions for key, run in runs},
-        busy=busy,
-        scoring=results.scoring,
-        failures=sorted(failure for _, run in runs for failure in run.failures),
-        collisions={key: run.progress.collisions for key, run in runs},
-        invalid_tests={key: run.invalid_tests for key, run in runs},
-    )
+    runs = list[RunResult]()
+    for finished_runs, remark in carry_out(carry_share, shares, pool, show_journals):
+        runs += finished_runs
+        if remark:
+            warn(remark)
+    runs.sort(key=lambda run: run.key)
+    if [run.key for run in runs] == sorted(all_runs(study)):
+        results.finish({run.key: run.solutions for run in runs})
+    return Campaign(original, runs, system.measuring.scoring, no_verdict)
 
 
-def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
-    """Deal runs out in shares of at most `runs_at_once` runs; the number of shares is a multiple of the number of
-    workers.
-
-    All runs of a share are under way at the same time: they fill large batches, which cost least for each setting.
-    """
-    count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
-    return [keys[number::count] for number in range(count)]  # like cards: each share gets runs of all algorithms
-
-
-def _collect(shares: Sequence[Share], pool: Pool, observer: Observer) -> tuple[dict[RunKey, RunResult], list[RunKey]]:
-    """Carry out shares; returns the finished runs, and the runs that another process carries out."""
-    run_results, busy = dict[RunKey, RunResult](), list[RunKey]()
-    with closing(carry_out(shares, pool)) as messages:
-        for _, message in messages:
-            if isinstance(message, RunResult):
-                run_results[message.progress.key] = message
-                observer.finished(message.progress)
-            elif isinstance(message, RunKey):
-                busy.append(message)
-            elif isinstance(message, str):
-                observer.warned(message)
-            elif isinstance(message, list):
-                observer.progressed(message)
-    return run_results, busy
-
-
-def _evaluate_original(
-    study: Study, packed_task: bytes, results: ResultsDirectory, pool: Pool, observer: Observer
-) -> Evaluations:
-    """Evaluate the original vehicle, or read its journal; raises an error if the runs need another one."""
-    try:
-        with closing(results.journal(ORIGINAL)) as journal:
-            if journal.content.tail_size:
-                observer.warned(journal.remark_on_tail)
-            original = journal.content.evaluations
-            if not len(original):
-                original = evaluate_original(study, packed_task, pool)
-                journal.append([0], original)
-    except JournalBusyError:  # another process, such as a job of an array, writes this journal
-        original = evaluate_original(study, packed_task, pool)
+def evaluate_original(task: Task, pool: Pool) -> Evaluations:
+    """Evaluate the original vehicle; raises an error if a search cannot compare with it."""
+    settings = np.array([[row.original for row in task.study.vehicle.characteristics.values()]])
+    original: Evaluations = carry_out(evaluate_settings, [(task, settings)], pool)[0]
+    if original.failed[0]:
+        raise SimulationError(
+            f"study {task.study.name!r}: the original vehicle cannot be simulated: {original.reason(0)}"
+        )
     if not original.valid[0]:
         raise InputError(
-            study.source,
+            task.study.source,
             "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
             "so there is no baseline",
             "tests whose speed the vehicle can hold",
         )
-    if original.collided[0] and not is_rated(study):
-        observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
     return original
 
 
-class Forecast(NamedTuple):
-    """Upper limits of a campaign's evaluations, `seconds`, and `size` of results [bytes]; and its evaluations per
-    second, `rate`.
+def deal(keys: Sequence[RunKey], workers: int, batch_size: int, population: int) -> list[Sequence[RunKey]]:
+    """Deal runs out in shares; their number is a multiple of the number of workers.
+
+    All runs of a share are under way at the same time: they fill large batches, which cost least for each setting.
     """
-
-    evaluations: int
-    rate: float
-    seconds: float
-    size: int
+    runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / population), MAX_RUNS)
+    count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
+    return [keys[number::count] for number in range(count)]  # like cards: each share gets runs of all algorithms
 
 
-class _Enough(Exception):
-    """The measurement is long enough."""
+def journal_progress(
+    study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
+) -> Callable[[Sequence[int]], None]:
+    """A function that shows the evaluations that runs have asked for, as their journals tell."""
+    readers = [JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys]
+
+    def show(ended: Sequence[int]) -> None:
+        asked = [reader.asked() for reader in readers]
+        finished = sum(reader.is_finished for reader in readers)
+        stage = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
+        progress(stage, sum(asked), len(keys) * study.search.evaluations)
+
+    return show
 
 
-class _Stopwatch:
-    """Measures the evaluations per second of all workers together, from the first batch of the last worker on."""
-
-    def __init__(self, run_count: int) -> None:
-        self._run_count = run_count
-        self._asked: dict[object, int] = {}
-        self._start = (time.perf_counter(), 0)  # [s], and the evaluations until then
-        self._is_warm = False
-        self.rate = 0.0
-
-    def progressed(self, runs: Sequence[RunProgress]) -> None:
-        self._asked |= {run.key: run.asked for run in runs}
-        now, asked = time.perf_counter(), sum(self._asked.values())
-        if asked > self._start[1]:
-            self.rate = (asked - self._start[1]) / (now - self._start[0])
-        if not self._is_warm and len(self._asked) == self._run_count:
-            self._is_warm, self._start = True, (now, asked)
-        elif self._is_warm and now - self._start[0] > PROBE_SECONDS:
-            raise _Enough
-
-    def finished(self, run: RunProgress) -> None:
-        self.progressed([run])
-
-    def warned(self, message: str) -> None: ...
+def choose_engine(system: System, name: str) -> tuple[Engine, str]:
+    """Choose the engine that moves a system's vehicles, and say why; raises InputError for an unknown engine."""
+    if name not in ENGINES:
+        raise InputError("engine", repr(name), one_of(ENGINES))
+    if name == Engine.LIBSUMO:
+        return Engine.LIBSUMO, "requested"
+    reason = reason_for_sumo(system)
+    return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
 
 
-def forecast(
-    study: Study, runs: int, pool: Pool, batch_size: int = MAX_COPIES, engine: Engine = Engine.RECORDED
-) -> Forecast:
-    """Estimate upper limits for a number of runs, from a short measurement of some of them in a temporary directory."""
-    system = assemble(study, study.source)
-    settings_at_once = min(batch_size, max(PROBE_VEHICLES // len(system.points), 1))
-    search = study.search
-    probe = msgspec.structs.replace(
-        study, search=msgspec.structs.replace(search, population=min(search.population, settings_at_once))
-    )
-    runs_of_worker = min(math.ceil(settings_at_once / probe.search.population), math.ceil(runs / pool.workers))
-    keys = all_runs(probe)[: max(runs_of_worker, 1) * pool.workers]
-    stopwatch = _Stopwatch(len(keys))
-    with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
-        results = ResultsDirectory(Path(folder), probe, identity_of(probe, system), system.measuring.scoring)
-        with suppress(_Enough):
-            run_campaign(probe, keys, results, pool, stopwatch, batch_size, engine=engine)
-    evaluations = runs * search.evaluations
-    numbers = len(CharacteristicSet.of(study)) + len(METRICS) + NUMBERS_BESIDE_METRICS
-    return Forecast(
-        evaluations, stopwatch.rate, evaluations / stopwatch.rate, evaluations * numbers * CHARACTERS_PER_NUMBER
-    )
+def measure_speed(task: Task, pool: Pool) -> float:
+    """Evaluations per second of all workers, measured with one batch of random settings for each; the search costs
+    little beside them.
+    """
+    system = system_of(task.study)
+    characteristics, size = system.characteristics, max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
+    drawn = np.random.default_rng(task.study.search.seed).random((pool.workers, size, len(characteristics)))
+    settings = characteristics.lower + drawn * (characteristics.upper - characteristics.lower)
+    jobs = [(task, characteristics.filter(rows)) for rows in settings]
+    carry_out(evaluate_settings, [(task, rows[:1]) for _, rows in jobs], pool)  # workers load the study
+    start = time.perf_counter()
+    carry_out(evaluate_settings, jobs, pool)
+    return pool.workers * size / (time.perf_counter() - start)

@@ -1,34 +1,36 @@
-"""A task, what a worker computes with every setting of a study; the evaluation of a batch of settings, a pure function
-for any process on any machine; and the check of its results against SUMO.
+"""What a worker computes with the settings of a study: a task, the evaluation of a batch of settings, a pure function
+for any process on any machine, and the comparison of its results with SUMO.
 """
 
 from __future__ import annotations
 
-import faulthandler
-from collections.abc import Callable, Mapping
+import math
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import IO, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.ads.varied import VariedAds
-from safevar_sumo.errors import InputError
+from safevar_sumo.campaign.local import end_if_longer
+from safevar_sumo.campaign.pool import Pool, WorkerLostError
+from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Files, changed_files
 from safevar_sumo.protocol.rater import study_for_sumo_check
-from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
-from safevar_sumo.study import Study
-from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, Outcome, differences
+from safevar_sumo.shipped import PROGRAM_COMMAND
+from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate, evaluate_cells, settings_per_batch
+from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_cells, settings_per_batch
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
 """Number of settings to verify in SUMO: of a study in questions; of each run of a campaign, besides its solutions."""
-Evaluate = Callable[[bytes, FloatArray], Evaluations]
-"""A function of a packed task and settings, as `evaluate_batch`."""
+COMMAND_PREFIX = "; to reproduce it: "
 
 
 class Selection(msgspec.Struct, frozen=True):
@@ -63,15 +65,10 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    files
-        Digests of files by name: a worker refuses to compute with other files.
     engine
         What moves the vehicles.
-    afresh
-        Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
-    purpose
-        "evaluate" the settings; or, without settings, "check" the user code, or apply `why_no_verdict` on an "empty
-        road", whose sentence, if any, is the only one of the result's `reasons`.
+    batch_size
+        Maximum number of settings in a batch.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     selection
@@ -79,55 +76,114 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     study: Study
-    files: Files = {}
     engine: Engine = Engine.RECORDED
-    afresh: bool = False
-    purpose: Literal["evaluate", "check", "empty road"] = "evaluate"
+    batch_size: int = MAX_COPIES
     cells: tuple[int, int] | None = None
     selection: Selection = EVERYTHING
 
-    @property
-    def packed(self) -> bytes:
-        """The task as bytes: so it is sent to workers, and serves as the key of a cache."""
-        return msgspec.msgpack.encode(self)
+
+def system_of(study: Study) -> System:
+    """The system of a study, which this process assembles once."""
+    return _assemble_packed(msgspec.msgpack.encode(study))
 
 
-@lru_cache(maxsize=8)
-def task_of(packed_task: bytes) -> Task:
-    """The unpacked task."""
-    return msgspec.msgpack.decode(packed_task, type=Task)
+@lru_cache(maxsize=4)
+def _assemble_packed(packed_study: bytes) -> System:
+    study = msgspec.msgpack.decode(packed_study, type=Study)
+    return assemble(study, study.source)
 
 
-def evaluate_batch(packed_task: bytes, settings: FloatArray) -> Evaluations:
-    """Carry out a packed task with k settings, shape (k, n).
+def carry_out(
+    function: Callable[..., Any],
+    jobs: Sequence[tuple[Any, ...]],
+    pool: Pool,
+    look: Callable[[Sequence[int]], None] = lambda ended: None,
+) -> list[Any]:
+    """The results of a function for the arguments of each job: a task, and what to compute.
 
     Raises
     ------
-    InputError
-        If files of the study have changed since the campaign began.
+    SafevarError
+        If two workers die of a job; the error names the study, the job and user code.
     """
-    task = task_of(packed_task)
-    if task.purpose == "check":
-        from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
+    try:
+        return pool.map(function, jobs, look)
+    except WorkerLostError as error:
+        task, *arguments = jobs[error.job]
+        work = ", ".join(
+            f"{len(argument)} settings" if isinstance(argument, np.ndarray) else str(argument) for argument in arguments
+        )
+        names = user_code_names(task.study)
+        problem = f"two workers were lost at the same work, {work or function.__name__.strip('_')}: {error}"
+        if names:
+            raise UserCodeError(f"study {task.study.name!r}", f"{problem}, probably in {' and '.join(names)}") from None
+        raise SafevarError(f"study {task.study.name!r}: {problem}") from None
 
-        refuse_defects(task.study)
-        return Evaluations.none(settings.shape[1], METRICS)
-    refuse_changed_files(changed_files(task.files, task.study.origin.places))
-    system = assemble(task.study) if task.afresh else system_of(task)
-    if task.purpose == "empty road":
-        reason = why_no_verdict(system)
-        return replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
-    if task.cells is not None:
-        return evaluate_cells(system, settings, task.cells, task.engine)
-    if task.selection != EVERYTHING:
-        return _evaluate_parameters(system, task, settings)
-    return evaluate(system, settings, task.engine)
+
+def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
+    """Evaluate settings of n characteristics, and values of the selected parameters, shape (k, n + p), in equal
+    batches.
+
+    Raises
+    ------
+    UserCodeError
+        With the command that simulates the setting on which user code fails.
+    EnvironmentFault
+        If this machine lacks memory, disk space or files.
+    """
+    batches = np.array_split(rows, max(math.ceil(len(rows) / task.batch_size), 1))
+    try:
+        return Evaluations.concatenate([_evaluate_or_halve(task, batch) for batch in batches])
+    except (OSError, MemoryError) as error:
+        raise EnvironmentFault(f"a batch cannot be computed: {str(error) or 'no memory is left'}") from None
+
+
+def _evaluate_or_halve(task: Task, rows: FloatArray) -> Evaluations:
+    """Evaluate a batch. One that fails is halved until the failing settings are alone: a setting that SUMO cannot
+    simulate gets the outcome `simulator-error`.
+    """
+    try:
+        return evaluate_batch(task, rows)
+    except (SimulationError, UserCodeError) as error:
+        failure = error
+    if len(rows) > 1:
+        halves = [_evaluate_or_halve(task, half) for half in np.array_split(rows, 2)]
+        if isinstance(failure, UserCodeError):
+            raise failure
+        return Evaluations.concatenate(halves)
+    characteristics, undefined = CharacteristicSet.of(task.study), np.full(1, np.nan)
+    values = rows[:, : len(characteristics)]  # without the ADS's parameters
+    if isinstance(failure, UserCodeError):
+        command = reproduction_command(task.study, values[0])
+        raise UserCodeError(failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal) from None
+    return Evaluations(
+        settings=rows,
+        outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
+        collision_speed=undefined,
+        metrics=dict.fromkeys(METRICS, undefined),
+        f_diff=characteristics.largest_change(values),
+        f_num_diff=characteristics.number_changed(values),
+        reasons={rows[0].tobytes(): " ".join(str(failure).split())},
+    )
+
+
+def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
+    """Evaluate settings as a task says, shape (k, n + p), in one batch. A worker that takes longer than the study's
+    time limit ends.
+    """
+    system = system_of(task.study)
+    with end_if_longer(task.study.search.time_limit):
+        if task.cells is not None:
+            return evaluate_cells(system, rows, task.cells, task.engine)
+        if task.selection != EVERYTHING:
+            return _evaluate_parameters(task.selection.of(system), task, rows)
+        return evaluate(system, rows, task.engine)
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate rows of n characteristics and values of the selected parameters of the ADS, at the selected points."""
+    """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
     selection, n = task.selection, len(system.characteristics)
-    settings, values, system = rows[:, :n], rows[:, n:], selection.of(system)
+    settings, values = rows[:, :n], rows[:, n:]
     if not values.size:
         return evaluate(system, settings, task.engine)
     if selection.arrays and len(rows) <= settings_per_batch(system, task.engine):
@@ -150,66 +206,50 @@ def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
     return msgspec.structs.replace(study, ads=ads)
 
 
-def evaluate_in_time(packed_task: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:
-    """Evaluate a batch. A process that takes longer than the time limit [s] writes to the file `last_words` what it is
-    doing, and ends.
+def reproduction_command(study: Study, setting: FloatArray) -> str:
+    """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the only point to which
+    the study was reduced.
     """
-    faulthandler.dump_traceback_later(time_limit, exit=True, file=last_words)
-    try:
-        return evaluate_batch(packed_task, settings)
-    finally:
-        faulthandler.cancel_dump_traceback_later()
+    characteristics, origin = CharacteristicSet.of(study), study.origin
+    words = [f"{PROGRAM_COMMAND} simulate", shlex.quote(origin.called or study.name)]
+    words += ["--point", shlex.quote(origin.point)] if origin.point else []
+    words += [
+        f"--set {characteristic.name}={value!r}"
+        for characteristic, value in zip(characteristics, setting.tolist(), strict=True)
+        if value != characteristic.original
+    ]
+    words += ["--no-filter"] if (characteristics.filter(setting) != setting).any() else []
+    words += ["--beyond"] if ((setting < characteristics.lower) | (setting > characteristics.upper)).any() else []
+    return " ".join(words)
 
 
-def system_of(task: Task) -> System:
-    """The system of a task's study; it is kept, and stays the same even if source files change."""
-    return _assemble_packed(Task(study=task.study, files=task.files).packed)
-
-
-@lru_cache(maxsize=4)
-def _assemble_packed(packed_task: bytes) -> System:
-    return assemble(task_of(packed_task).study)
-
-
-def refuse_changed_files(files: list[str]) -> None:
-    """Raise an error if there are files that have changed since the study began."""
-    if files:
-        raise InputError(
-            files[0],
-            "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
-            "the file as it was, and the same command; or another `out`",
-        )
-
-
-def tasks_for_sumo(study: Study, files: Files) -> tuple[bytes, bytes]:
-    """The packed task with which SUMO verifies results, and one with comparable results from recorded scenes.
-
-    SUMO repeats only a few cells of a rating; the second task then has the same cells. Otherwise it is empty, and the
-    results to verify are comparable themselves.
-    """
-    sumo_study = study_for_sumo_check(study, assemble(study).weather)
-    recorded = Task(study=sumo_study, files=files)
-    in_sumo = msgspec.structs.replace(recorded, engine=Engine.LIBSUMO)
-    return in_sumo.packed, b"" if sumo_study is study else recorded.packed
-
-
-def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings with different results in a recorded scene and in SUMO, except failed simulations.
+def verify_in_sumo(task: Task, recorded: Evaluations) -> str:
+    """Refuse results of a task from recorded scenes that differ in SUMO; returns a remark on settings that SUMO cannot
+    simulate, "" without any. Of a rating, SUMO repeats a few cells.
 
     Raises
     ------
     InputError
-        With the first such setting and both values.
+        With the first setting whose results differ, and both values.
     """
+    study = task.study
+    sumo_study = study_for_sumo_check(study, system_of(study).weather)
+    if sumo_study is not study:
+        recorded = evaluate_settings(Task(study=sumo_study, batch_size=task.batch_size), recorded.settings)
+    in_sumo = evaluate_settings(Task(study=sumo_study, engine=Engine.LIBSUMO), recorded.settings)
     is_comparable = ~(recorded.failed | in_sumo.failed)
-    if not is_comparable.any():
-        return  # evaluations that have failed lack the user's metrics
-    recorded, in_sumo = recorded.take(is_comparable), in_sumo.take(is_comparable)
-    for row, difference in differences(in_sumo.results, recorded.results, ROUNDING):
-        pairs = zip(study.vehicle.characteristics, recorded.settings[row], strict=True)
-        values = ", ".join(f"{name} = {value:.17g}" for name, value in pairs)
-        raise InputError(
-            f"study {study.name!r}",
-            f"{difference} in the recorded scene and in SUMO with {values}",
-            "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
-        )
+    if is_comparable.any():  # evaluations that have failed lack the user's metrics
+        recorded, compared = recorded.take(is_comparable), in_sumo.take(is_comparable)
+        for row, difference in differences(compared.results, recorded.results, ROUNDING):
+            pairs = zip(study.vehicle.characteristics, recorded.settings[row], strict=True)
+            values = ", ".join(f"{name} = {value:.17g}" for name, value in pairs)
+            raise InputError(
+                f"study {study.name!r}",
+                f"{difference} in the recorded scene and in SUMO with {values}",
+                "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
+            )
+    failed_rows = np.flatnonzero(in_sumo.failed)
+    if not len(failed_rows):
+        return ""
+    reason = in_sumo.reason(failed_rows[0])
+    return f"{len(failed_rows)} of {len(in_sumo)} settings could not be verified in SUMO: {reason}"

@@ -12,7 +12,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
 from safevar_sumo.sumo.network import open_network
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 
 
 def identity_of(study: Study, system: System) -> JsonObject:
@@ -28,12 +28,12 @@ def identity_of(study: Study, system: System) -> JsonObject:
     }
 
 
-def files_of(study: Study, system: System | None = None) -> Files:
+def files_of(study: Study, system: System) -> Files:
     """Digests, by name, of the files that a study's results depend on: of its networks, its user code and FMUs, and the
     data files that it names.
     """
     places = study.origin.places
-    networks = {point.scenario.network for point in (system or assemble(study)).points}
+    networks = {point.scenario.network for point in system.points}
     opened = [open_network(network) for network in sorted(networks)]
     network_files = {network.path(name) for network in opened for name, _ in network.digests}
     fmus = {Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)}

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import time
 from collections import Counter
-from contextlib import nullcontext
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 import msgspec
 import numpy as np
-from rich import filesize
-from rich.console import Console, Group
-from rich.live import Live
-from rich.text import Text
+from rich.console import Console
 
-from safevar_sumo.analysis.research_questions.fronts import nondominated_points
 from safevar_sumo.analysis.words import question_command, two_decimals
-from safevar_sumo.api.running import ENGINES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
-from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
+from safevar_sumo.api.running import load_for_search
+from safevar_sumo.campaign import Campaign, RunKey, all_runs, run_campaign
+from safevar_sumo.campaign.campaign import ENGINES, choose_engine, measure_speed
+from safevar_sumo.campaign.evaluation import Task
+from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
-from safevar_sumo.cli.program import commands, print_note, print_remarks, print_warning
+from safevar_sumo.cli.program import commands, print_json, print_remarks, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
-from safevar_sumo.terminal import WholeTable, print_text
+from safevar_sumo.terminal import WholeTable, open_progress, print_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,7 +61,7 @@ if TYPE_CHECKING:
     help="Simulate again the settings that could not be simulated before (simulator-error).",
 )
 @click.option("--quiet", is_flag=True, help="Print only errors and warnings.")
-@click.option("--dry-run", is_flag=True, help="Estimate time and disk space without running anything.")
+@click.option("--dry-run", is_flag=True, help="Estimate the time from a short measurement.")
 def study(
     study: str,
     batch: int | None,
@@ -96,28 +91,36 @@ def study(
     if not keys:
         print_warning(f"--shard {shard} selects none of the runs")
     directory = out or Path("results") / loaded_study.name
-    with open_pool(loaded_study, jobs, cluster) as pool:
+    with open_pool(jobs, cluster) as pool:
         if dry_run:
             used_engine, reason = choose_engine(system, engine)
-            size = batch or settings_per_batch(system, used_engine)
-            if system.matrix:
-                print_note(f"measuring the time of a few vehicles at {len(system.matrix)} points")
-            cost = forecast(loaded_study, len(keys), pool, size, used_engine)
-            print_forecast(Console(), loaded_study, len(keys), cost, f"{used_engine}: {reason}")
+            task = Task(
+                study=loaded_study, engine=used_engine, batch_size=batch or settings_per_batch(system, used_engine)
+            )
+            rate = measure_speed(task, pool)
+            print_forecast(Console(), loaded_study, len(keys), rate, f"{used_engine}: {reason}")
             return
         try:
-            with open_observer(not quiet, loaded_study, keys, print_warning) as observer:
-                campaign = carry_out_runs(
-                    loaded_study, system, keys, directory, pool, observer, batch, engine, retry_failed=retry_failed
+            with open_progress(not quiet) as progress:
+                campaign = run_campaign(
+                    loaded_study,
+                    system,
+                    keys,
+                    directory,
+                    pool,
+                    progress,
+                    print_warning,
+                    batch,
+                    engine,
+                    retry_failed=retry_failed,
                 )
         except KeyboardInterrupt:
             click.echo(
                 f"finished evaluations are kept in {directory}: run the same command again to continue", err=True
             )
             raise
-        if not quiet:
-            print_summary(Console(), loaded_study, campaign, directory)
     if not quiet:
+        print_summary(Console(), loaded_study, campaign, directory)
         print_text(Console(), f"Results: {directory}")
 
 
@@ -140,32 +143,17 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
 
 @commands.command()
 @click.argument("directory", metavar="DIR")
-@click.option("--watch", is_flag=True, help="Keep showing progress until the study is finished.")
-@click.option(
-    "--every", type=click.FloatRange(0.1, 86400), metavar="SECONDS", help="Interval of --watch.  [default: 2]"
-)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
-def status(directory: str, watch: bool, every: float | None, as_json: bool) -> None:
-    """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def status(directory: str, as_json: bool) -> None:
+    """Show the progress of the study in DIR, without disturbing it: runs, evaluations, collisions."""
     from safevar_sumo.results import status as read_status
 
-    progress, start_time, console = read_status(directory), time.monotonic(), Console()
-    start_share, rate = progress.share, None
-    with Live(console=console, auto_refresh=False) if watch and not as_json else nullcontext() as live:
-        while True:
-            if as_json:
-                click.echo(json.dumps(progress.record(), indent=None if watch else 2))
-            elif live is not None:
-                live.update(status_view(progress, rate), refresh=True)
-            else:
-                console.print(status_view(progress, rate))
-            if not watch or progress.finished:
-                break
-            time.sleep(every or 2.0)
-            progress = read_status(directory)
-            rate = (progress.share - start_share) / (time.monotonic() - start_time)
-    if live is not None and not console.is_terminal:
-        console.line()  # on a terminal, `Live` ends its last line itself
+    progress, console = read_status(directory), Console()
+    if as_json:
+        print_json(progress.record())
+        return
+    console.print(_status_table(progress))
+    print_text(console, "Finished." if progress.finished else f"{progress.share:.0%} done.")
 
 
 SAFETY_NOTE = (
@@ -173,19 +161,18 @@ SAFETY_NOTE = (
 )
 
 
-def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, engine: str) -> None:
-    """Print the estimated time and disk space of a campaign."""
+def print_forecast(console: Console, study: Study, runs: int, rate: float, engine: str) -> None:
+    """Print the estimated time of a campaign from its evaluations per second."""
     print_text(console, study.title)
+    evaluations = runs * study.search.evaluations
+    seconds = evaluations / rate
     table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
     table.add_row("engine", engine)
-    table.add_row("evaluations, at most", str(cost.evaluations))
-    table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.{0 if cost.rate >= 10 else 1}f}")
-    table.add_row(
-        "search time, at most", f"{cost.seconds / 60:.1f} min" if cost.seconds >= 60 else f"{cost.seconds:.0f} s"
-    )
-    table.add_row("disk, at most", filesize.decimal(cost.size))
+    table.add_row("evaluations, at most", str(evaluations))
+    table.add_row("evaluations/s, measured on random settings", f"{rate:.{0 if rate >= 10 else 1}f}")
+    table.add_row("time, at most", f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s")
     console.print(table)
 
 
@@ -200,25 +187,23 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     from safevar_sumo.analysis.research_questions.comparisons import summary_lines
 
     names = study.vehicle.characteristics
-    solutions = solutions_frame(names, campaign.solutions.items())
+    solutions = solutions_frame(names, [(run.key, run.solutions) for run in campaign.runs])
     case = build_case(
         study,
         record(campaign.original, row=0),
         solutions,
         solutions_frame(names, []),
-        tuple(campaign.solutions),
+        tuple(run.key for run in campaign.runs),
         scoring=campaign.scoring,
     )
     for line in [campaign.no_verdict] if campaign.no_verdict else study_verdict(case, campaign.original):
         print_text(console, line)
     console.print(_summary_table(study, campaign, solutions))
     lines = SAFETY_NOTE.splitlines()
-    if campaign.failures:
-        lines.append(
-            f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:"
-        )
-        lines += [f"  {line}" for line in failure_lines(campaign.failures)]
-    if invalid := sum(campaign.invalid_tests.values()):
+    if failures := [failure for run in campaign.runs for failure in run.failures]:
+        lines.append(f"{len(failures)} settings could not be simulated (simulator-error); no result contains them:")
+        lines += [f"  {line}" for line in failure_lines(failures)]
+    if invalid := sum(run.invalid_tests for run in campaign.runs):
         lines.append(
             f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
             "they are neither failures nor successes, and no result contains them."
@@ -231,13 +216,17 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
 def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) -> WholeTable:
     """The original vehicle, and each algorithm's solutions: their number, collisions, and means of metrics."""
     original = evaluations_frame(study.vehicle.characteristics, [(("", 0), campaign.original)])
-    searched = {key.algorithm for key in campaign.solutions}
+    searched = {run.key.algorithm for run in campaign.runs}
     by_algorithm = {name: solutions[solutions["algorithm"] == name] for name in study.search.labels if name in searched}
     frames = {"original vehicle": original, **by_algorithm}
     simulated = Counter({"original vehicle": int(campaign.original.collided[0])})
-    for key, count in campaign.collisions.items():
-        simulated[key.algorithm] += count
+    for run in campaign.runs:
+        simulated[run.key.algorithm] += run.collisions
     table = WholeTable("", right=frames, title=study.title)
+    means = (np.mean([run.simulated for run in campaign.runs if run.key.algorithm == name]) for name in by_algorithm)
+    table.add_row(
+        f"evaluations of a run (of {study.search.evaluations}), mean", "-", *(f"{mean:.0f}" for mean in means)
+    )
     table.add_row("solutions", "-", *(str(len(frame)) for frame in by_algorithm.values()))
     table.add_row(
         "solutions that collide", *(str((frame["outcome"] == Outcome.COLLISION).sum()) for frame in frames.values())
@@ -248,16 +237,8 @@ def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) ->
     return table
 
 
-MAX_FRONT_ROWS = 5
-"""Maximum number of rows in the table of the front."""
-MAX_RUNS_NAMED = 12
-"""Maximum number of runs under way that the view names."""
-
-
-def status_view(progress: Status, rate: float | None) -> Group:
-    """The study's runs by algorithm, and its front so far; `rate` is the share of all work that is done in a second,
-    None if unknown.
-    """
+def _status_table(progress: Status) -> WholeTable:
+    """The study's runs by algorithm."""
     table = WholeTable(
         "algorithm",
         right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
@@ -271,21 +252,4 @@ def status_view(progress: Status, rate: float | None) -> Group:
         table.add_row(
             algorithm, f"{states['finished']}/{len(runs)}", str(states["begun"]), *map(str, counts), two_decimals(best)
         )
-    begun = [
-        f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"
-    ]
-    further_runs = f" and {len(begun) - MAX_RUNS_NAMED} more" if len(begun) > MAX_RUNS_NAMED else ""
-    under_way = f"Under way: {', '.join(begun[:MAX_RUNS_NAMED])}{further_runs}" if begun else ""
-    time_left = f", {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace" if rate else ""
-    state = "Finished." if progress.finished else f"{progress.share:.0%} done{time_left}."
-    if not len(progress.points):
-        return Group(table, Text(under_way), Text(state), Text("Nothing simulated yet."))
-    front = nondominated_points(progress.points)
-    front_table = WholeTable(
-        right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
-        title=f"Front of safety degree and changes so far: {len(front)} points, the most severe ones",
-    )
-    by_safety_degree = front[:, 0].argsort(kind="stable")
-    for f_safe, f_diff, number in front[by_safety_degree][:MAX_FRONT_ROWS].tolist():
-        front_table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
-    return Group(table, Text(under_way), Text(state), front_table)
+    return table

@@ -42,9 +42,8 @@ class Evaluations:
     `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
     `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
-    setting, why the setting could not be simulated. `cells` are a rating's results,
-    None without a rating. `worst_points` are the numbers of the points at which the settings were worst, None without
-    a matrix.
+    setting, why the setting could not be simulated. `cells` are a rating's results, None without a rating.
+    `worst_points` are the numbers of the points at which the settings were worst, None without a matrix.
     """
 
     settings: FloatArray

@@ -1,9 +1,8 @@
 """Results of campaigns: journalled, written, and read back."""
 
 from safevar_sumo.results.journal import (
-    PATIENCE as PATIENCE,
     Journal as Journal,
-    JournalBusyError as JournalBusyError,
+    JournalReader as JournalReader,
     journal_head as journal_head,
 )
 from safevar_sumo.results.load import (
@@ -23,19 +22,18 @@ from safevar_sumo.results.load import (
 from safevar_sumo.results.manifest import (
     FILES as FILES,
     MANIFEST as MANIFEST,
-    ORIGINAL as ORIGINAL,
     RESULTS as RESULTS,
     SOLUTIONS as SOLUTIONS,
     changed_values as changed_values,
     differences as differences,
     evaluation_keys as evaluation_keys,
     folders_of as folders_of,
+    identity_digest as identity_digest,
     journal_file as journal_file,
     make_directory as make_directory,
     manifest_of as manifest_of,
     read_manifest as read_manifest,
     run_name as run_name,
-    stored_runs as stored_runs,
     write_whole as write_whole,
 )
 from safevar_sumo.results.store import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.journal import JournalContent, journal_head, read_journal
@@ -92,15 +92,13 @@ class RunStatus(NamedTuple):
 class Status(NamedTuple):
     """Progress of a study.
 
-    `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all M settings
-    so far, shape (M, 3).
+    `budget` is the largest number of evaluations of a run.
     """
 
     study: str
     title: str
     budget: int
     runs: tuple[RunStatus, ...]
-    points: np.ndarray
 
     @property
     def finished(self) -> bool:
@@ -144,7 +142,7 @@ def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, in
 
 
 def load_runs(directory: str | Path) -> StoredResults:
-    """Read the runs and evaluations of a results directory's study, which may be unfinished; warns of torn journals.
+    """Read the runs and evaluations of a results directory's study, which may be unfinished.
 
     Raises
     ------
@@ -162,11 +160,6 @@ def load_runs(directory: str | Path) -> StoredResults:
     for algorithm, run, content in runs:
         if content is None:
             continue
-        if content.tail_size and budget not in content.results:
-            warn(
-                f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
-                "so the run counts as unfinished; running the same study again simulates the lost evaluations"
-            )
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
@@ -175,8 +168,7 @@ def load_runs(directory: str | Path) -> StoredResults:
             for row in np.flatnonzero(evaluations.failed).tolist()
         ]
         if budget in content.results:
-            solution_positions, _ = content.results[budget]
-            solutions_of_runs.append(((algorithm, run), content.take_positions(solution_positions)))
+            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget])))
     frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)  # behind algorithm and run
     solutions = solutions_frame(characteristics, solutions_of_runs)
@@ -199,14 +191,13 @@ def status(directory: str | Path) -> Status:
     if "imported" in manifest:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     runs, budget = _read_search(folder, manifest)
-    statuses, points = list[RunStatus](), [np.zeros((0, 3))]
+    statuses = list[RunStatus]()
     for algorithm, run, content in runs:
         if content is None:
             statuses.append(RunStatus(algorithm, run, "waiting", 0, 0, 0, best=None))
             continue
         _, evaluations = content.requested_within(budget)
-        valid = evaluations.take(evaluations.valid)
-        points.append(valid.objectives)
+        degrees = evaluations.f_safe[evaluations.valid]
         statuses.append(
             RunStatus(
                 algorithm,
@@ -215,16 +206,11 @@ def status(directory: str | Path) -> Status:
                 simulated=len(evaluations),
                 collisions=int(np.count_nonzero(evaluations.collided)),
                 simulator_errors=int(np.count_nonzero(evaluations.failed)),
-                best=float(np.min(valid.f_safe)) if len(valid) else None,
+                best=float(np.min(degrees)) if len(degrees) else None,
             )
         )
-    return Status(
-        study=str(manifest["study"].get("name")),
-        title=str(manifest["study"].get("title")),
-        budget=budget,
-        runs=tuple(statuses),
-        points=np.concatenate(points),
-    )
+    study = manifest["study"]
+    return Status(str(study.get("name")), str(study.get("title")), budget, tuple(statuses))
 
 
 HANDLE_FORMAT = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"

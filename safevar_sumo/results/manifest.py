@@ -54,8 +54,6 @@ IDENTITY = {
 REMEDY".
 """
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
-ORIGINAL = "original"
-"""Name of the original vehicle's journal."""
 FILES = (
     (
         MANIFEST,
@@ -69,7 +67,6 @@ FILES = (
         "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
         "`study` after each batch",
     ),
-    (f"{RUNS}/{ORIGINAL}.jsonl", "the original vehicle's evaluation", "`study` before its first run"),
 )
 """Every file of a results directory: its name or a pattern of names, its content, and the command that writes it."""
 
@@ -80,13 +77,13 @@ def run_name(algorithm: str, run: int) -> str:
 
 
 def journal_file(directory: Path, run: str) -> Path:
-    """The journal of a run, by the run's name, or of the `ORIGINAL`."""
+    """The journal of a run, by the run's name."""
     return directory / RUNS / f"{run}.jsonl"
 
 
 def stored_runs(directory: Path) -> set[str]:
     """Names of the runs that have a journal."""
-    return {path.stem for path in (directory / RUNS).glob("*.jsonl")} - {ORIGINAL}
+    return {path.stem for path in (directory / RUNS).glob("*.jsonl")}
 
 
 def make_directory(path: Path) -> None:

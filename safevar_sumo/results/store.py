@@ -17,7 +17,6 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
-from safevar_sumo.results.journal import Journal, JournalBusyError, journal_head, read_journal
 from safevar_sumo.results.manifest import (
     FORMAT,
     IDENTITY,
@@ -26,12 +25,11 @@ from safevar_sumo.results.manifest import (
     SOLUTIONS,
     differences,
     disk_errors,
-    identity_digest,
-    journal_file,
     make_directory,
     manifest_of,
     read_manifest,
     search_extent_of,
+    stored_runs,
     write_manifest,
     write_whole,
 )
@@ -68,40 +66,22 @@ class ResultsDirectory:
     def __init__(
         self, path: Path, study: Study, identity: Tables = MappingProxyType({}), scoring: Scoring = PUBLISHED_SCORING
     ) -> None:
-        self.path, self._study, self.scoring = path, study, scoring
+        self.path, self._study = path, study
         folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
         self.manifest = {**manifest_of(study, identity), "folders": folders}
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
-        self._refuse_another_study()
-        self.files: dict[str, str] = self.manifest.get("files", {})
-        """Digests of the files that all workers must share."""
-
-    @property
-    def digest(self) -> str:
-        """The digest of the study's identity."""
-        return identity_digest(self.manifest)
-
-    def journal(self, run: str) -> Journal:
-        """Open and lock the journal of a run, such as nsga2-03."""
-        path = journal_file(self.path, run)
-        head = journal_head(self.digest, run, self._study.vehicle.characteristics)
-        try:
-            return Journal(path, head)
-        except JournalBusyError:
-            read_journal(path, head)  # refuses the journal of another study
-            raise
+        self._earlier_manifest()
 
     def begin(self, original: Evaluations) -> None:
         """Write the manifest with the original vehicle's evaluation; remove a table of solutions that covers other
         runs.
         """
-        self._refuse_another_study()  # which may have begun meanwhile
+        earlier_manifest = self._earlier_manifest()  # another study may have begun meanwhile
         manifest = {**self.manifest, "original": record(original, row=0)}
-        earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
         write_manifest(self.path, manifest)
-        if search_extent_of(earlier_manifest) != search_extent_of(manifest):
+        if earlier_manifest and search_extent_of(earlier_manifest) != search_extent_of(manifest):
             with disk_errors(self.path / SOLUTIONS, "removed"):
                 (self.path / SOLUTIONS).unlink(missing_ok=True)
 
@@ -110,15 +90,35 @@ class ResultsDirectory:
         frame = solutions_frame(self._study.vehicle.characteristics, solutions.items())
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
-    def _refuse_another_study(self) -> None:
+    def extent_remarks(self, names: Collection[str]) -> list[str]:
+        """Remarks on earlier results: runs of another length, and runs that the study, with runs of these names, no
+        longer has.
+        """
+        earlier_manifest, remarks = self._earlier_manifest(), []
+        if not earlier_manifest:
+            return []
+        (_, _, before), (_, _, now) = search_extent_of(earlier_manifest), search_extent_of(self.manifest)
+        if before != now:
+            remarks.append(
+                f"{self.path}: each run had {before} evaluations before and has {now} now: an id such as nsga2:0:0 may "
+                "name another solution than in earlier output and reports"
+            )
+        if left_out := sorted(stored_runs(self.path) - set(names)):
+            remarks.append(f"{self.path}: earlier runs are left out of the results: {', '.join(left_out)}")
+        return remarks
+
+    def _earlier_manifest(self) -> JsonObject:
+        """The manifest of earlier results in the directory, empty without any; raises an error if they are of another
+        study.
+        """
         if not (self.path / MANIFEST).exists():
-            return
-        stored = read_manifest(self.path)
-        problem = "holds results of another study"
+            return {}
+        stored, problem = read_manifest(self.path), "holds results of another study"
         if "imported" in stored:
             raise InputError(self.path, f"{problem}: they are imported", "another `out`")
         for layer, text, _ in differences(stored, self.manifest):
             raise InputError(self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}")
+        return stored
 
 
 def solutions_frame(

@@ -1,25 +1,19 @@
-"""Made-up studies reach their pool only by name, since no vehicle model has their characteristics."""
+"""Made-up studies have no vehicle model whose batches could be measured."""
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 
-from safevar_sumo.analysis import evaluator
-from safevar_sumo.campaign import batches, evaluation, identity
+from safevar_sumo.campaign import questions
+from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.study import Study
 
 
 @pytest.fixture(autouse=True)
-def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    def packed(task: evaluation.Task) -> bytes:
-        return b"made-up" if task.study.name == "made-up" else msgspec.msgpack.encode(task)
+def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
+    choose = questions.choose_batch_size
 
-    def choose_batch_size(study: Study, *selection: evaluation.Selection) -> tuple[int, bool]:
-        return (100, False) if study.name == "made-up" else choose(study, *selection)
+    def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
+        return (100, False) if study.name == "made-up" else choose(study, selection)
 
-    choose, read = batches.choose_batch_size, identity.files_of
-    monkeypatch.setattr(evaluation.Task, "packed", property(packed))
-    monkeypatch.setattr(batches, "choose_batch_size", choose_batch_size)
-    for module in (batches, evaluator):
-        monkeypatch.setattr(module, "files_of", lambda study: {} if study.name == "made-up" else read(study))
+    monkeypatch.setattr(questions, "choose_batch_size", choose_batch_size)

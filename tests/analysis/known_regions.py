@@ -5,12 +5,13 @@ known.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.campaign.pool import Batch, Report
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study, load_study
@@ -45,13 +46,14 @@ class Plant(InlinePool):
         degree: Callable[[FloatArray], FloatArray] | None = None,
         failing: Region | None = None,
     ):
+        super().__init__()
         self._characteristics, self._region = CharacteristicSet.of(study), region
         self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
         self._failing = failing or nowhere
         self.seen: set[bytes] = set()
 
-    def work(self, job: Batch, report: Report) -> None:
-        report(self.evaluate(job.settings))
+    def compute(self, function: Callable[..., Any], task: Task, *arguments: Any) -> Any:
+        return self.evaluate(*arguments) if function is evaluate_settings else ""
 
     def evaluate(self, settings: FloatArray) -> Evaluations:
         collides = np.asarray(self._region(settings), dtype=bool)

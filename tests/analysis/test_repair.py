@@ -24,7 +24,7 @@ from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, TwoWorkers, run
+from tests.in_process import InlinePool, run
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the price of
@@ -160,7 +160,7 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Pat
 
 @pytest.mark.slow
 def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
-    answers = [sv.repair(planted, change=["always"], pool=pool).to_dict() for pool in (InlinePool(), TwoWorkers())]
+    answers = [sv.repair(planted, change=["always"], pool=pool).to_dict() for pool in (InlinePool(), InlinePool(2))]
     assert answers[0] == answers[1]
     (repair, _) = answers[0]
     assert repair["needless_braking"] == repair["benign_scenes"] >= 6

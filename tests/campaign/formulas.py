@@ -1,20 +1,24 @@
-"""Campaigns over pools that evaluate settings by a formula."""
+"""Campaigns whose settings are evaluated by a formula, in this process or in a thread for each worker."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
-from safevar_sumo.campaign import Campaign, RunKey, RunProgress, all_runs, run_campaign
-from safevar_sumo.campaign.pool import Job, PoolLostError, Report, WorkerLostError
-from safevar_sumo.campaign.worker import carry_out_job
+from safevar_sumo.campaign import Campaign, RunKey, all_runs, evaluation, run_campaign
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings
+from safevar_sumo.campaign.share import carry_share
+from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
 from tests.made_up import made_up_evaluations
@@ -36,58 +40,32 @@ def evaluated(settings: FloatArray) -> Evaluations:
     )
 
 
-class Death(BaseException):
-    """The end of a worker that carries a share."""
-
-
 class FormulaPool(InlinePool):
     """Computes in this process, or in a thread for each worker; fails after `limit` batches."""
 
     def __init__(self, workers: int = 1, limit: int | None = None) -> None:
-        self.workers, self._limit = workers, limit
+        super().__init__(workers)
+        self._limit = limit
         self.simulated: list[bytes] = []
         self.sizes: list[int] = []
         self._threads = ThreadPoolExecutor(workers) if workers > 1 else None
 
-    def evaluate(self, packed_task: bytes, settings: FloatArray) -> Evaluations:
+    def evaluate(self, task: Task, settings: FloatArray) -> Evaluations:
         if self._limit is not None:
             if not self._limit:
-                raise PoolLostError("broken down")
+                raise SafevarError("broken down")
             self._limit -= 1
         self.simulated += [row.tobytes() for row in settings]
         self.sizes.append(len(settings))
         return evaluated(settings)
 
-    def carry(self, job: Job, report: Report) -> Future[None]:
-        return self._threads.submit(self.work, job, report) if self._threads else super().carry(job, report)
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        if self._threads:
+            return self._threads.submit(self.compute, function, *arguments)
+        return super().submit(function, *arguments)
 
-    def work(self, job: Job, report: Report) -> None:
-        try:
-            carry_out_job(job, report, self.evaluate)
-        except Death as death:
-            raise WorkerLostError(str(death)) from None
-
-
-class EventLog:
-    """An observer that records all reports."""
-
-    def __init__(self) -> None:
-        self.runs: dict[RunKey, RunProgress] = {}
-        self.finished_runs: dict[RunKey, int] = {}
-        self.warnings: list[str] = []
-
-    @property
-    def simulated(self) -> int:
-        return sum(run.asked - run.replayed for run in self.runs.values())
-
-    def progressed(self, runs: Sequence[RunProgress]) -> None:
-        self.runs |= {run.key: run for run in runs}
-
-    def finished(self, run: RunProgress) -> None:
-        self.runs[run.key], self.finished_runs[run.key] = run, run.asked
-
-    def warned(self, message: str) -> None:
-        self.warnings.append(message)
+    def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments) if function in (carry_share, evaluate_settings) else ""
 
 
 def with_search(study: Study, **changes: object) -> Study:
@@ -98,17 +76,25 @@ def carried_out(
     study: Study,
     path: Path,
     pool: FormulaPool | None = None,
-    keys: Iterable[RunKey] | None = None,
+    keys: Sequence[RunKey] | None = None,
     batch: int | None = None,
-    **options: bool,
-) -> tuple[Campaign, EventLog]:
-    observer = EventLog()
-    results = ResultsDirectory(path, study)
-    campaign = run_campaign(
-        study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch, **options
-    )
-    results.finish(campaign.solutions)
-    return campaign, observer
+    progress: Progress = show_no_progress,
+) -> Campaign:
+    """Carry out a study whose results are not verified in SUMO."""
+    pool, warnings = pool or FormulaPool(), list[str]()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+        return run_campaign(
+            study,
+            assemble(study),
+            all_runs(study) if keys is None else keys,
+            path,
+            pool,
+            progress,
+            warnings.append,
+            batch,
+            engine="sumo",
+        )
 
 
 def solutions(path: Path) -> bytes:

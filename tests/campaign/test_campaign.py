@@ -1,6 +1,4 @@
-"""Runs carried by pools whose evaluations are formulas: in any shares, alone and together, with more or fewer
-evaluations.
-"""
+"""Runs whose evaluations are formulas: in any shares, alone and together, with more or fewer evaluations."""
 
 from __future__ import annotations
 
@@ -12,16 +10,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign
-from safevar_sumo.campaign.campaign import deal
-from safevar_sumo.campaign.pool import WorkerLostError
-from safevar_sumo.campaign.run import RANDOM_SAMPLES, Run
-from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.results import Journal, ResultsDirectory, journal_head, load_runs
+from safevar_sumo.campaign import RunKey, evaluation
+from safevar_sumo.campaign.campaign import deal, measure_speed
+from safevar_sumo.campaign.evaluation import Task
+from safevar_sumo.campaign.runs import Run
+from safevar_sumo.errors import SafevarError
+from safevar_sumo.records import Outcome
+from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
-from tests.campaign.formulas import SUN, Death, EventLog, FormulaPool, carried_out, evaluated, solutions, with_search
+from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
 
 
 @pytest.fixture
@@ -63,7 +61,7 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
     workers: int, runs_at_once: int, sizes: set[int]
 ) -> None:
     keys = [RunKey(name, run) for name in ("nsga2", "rs", "safe_fuzzer") for run in range(30)]
-    shares = deal(keys, workers, runs_at_once)
+    shares = deal(keys, workers, batch_size=50 * runs_at_once, population=100)
     assert sorted(key for share in shares for key in share) == sorted(keys)
     assert {len(share) for share in shares} == sizes
     assert workers > 90 or len(shares) % workers == 0
@@ -72,17 +70,20 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
         assert len(share) < 3 or max(numbers.values()) - min(numbers.values()) <= 1
 
 
-def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> None:
+def test_a_run_in_other_hands_is_left_to_them_and_named(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     study = with_search(study, algorithms=["nsga2", "rs"])
     carried_out(study, tmp_path / "whole")
-    results = ResultsDirectory(tmp_path / "out", study)
-    theirs = [results.journal("rs-01"), results.journal("original")]
-    campaign = run_campaign(study, all_runs(study), results, FormulaPool(), log := EventLog())
-    assert campaign.busy == [RunKey("rs", 1)]
-    assert set(campaign.solutions) == set(all_runs(study)) - {RunKey("rs", 1)}
-    assert set(log.finished_runs.values()) == {study.search.evaluations}
-    for journal in theirs:
-        journal.close()
+    carried_out(study, tmp_path / "out", keys=[RunKey("rs", 1)])
+    path = journal_file(tmp_path / "out", "rs-01")
+    theirs = path.read_bytes()
+    head = evaluation.msgspec.json.decode(theirs.partition(b"\n")[0])
+    journal = Journal(path, head)
+    with pytest.raises(SafevarError, match=r"rs-01\.jsonl: another process works on this run"):
+        carried_out(study, tmp_path / "out")
+    journal.close()
+    assert path.read_bytes() == theirs
     carried_out(study, tmp_path / "out")
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
 
@@ -100,25 +101,16 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
     results, fresh = load_runs(tmp_path / "out"), load_runs(tmp_path / "fresh")
     pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
-    assert not {*before.simulated} & {*after.simulated}
-    carried_out(first, tmp_path / "out", FormulaPool(limit=0))
+    assert not {*before.simulated[1:]} & {*after.simulated[1:]}, "the original apart"
+    carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 
 
-def journaled(evaluations: Evaluations, budget: int, path: Path) -> Run:
-    """A run that has ended, and whose journal has evaluations."""
-    head = journal_head("study", "rs-00", SUN.names)
-    journal = Journal(path / "rs-00.jsonl", head)
-    journal.append(range(len(evaluations)), evaluations)
-    journal.finish([0], budget, budget)
-    journal.close()
-    return Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), budget)  # type: ignore[arg-type]
-
-
-def test_the_worst_and_the_last_evaluation_are_repeated_alone(tmp_path: Path) -> None:
-    settings = SUN.original + np.linspace(1, 0, 99)[:, np.newaxis] * (SUN.upper - SUN.original)
-    worst, last, *others = journaled(evaluated(settings), 99, tmp_path).sample_evaluations(np.random.default_rng(1))
-    assert np.array_equal(np.concatenate([worst.settings, last.settings]), settings[[0, -1]])
-    assert len(others) == RANDOM_SAMPLES
+def test_progress_has_its_total_from_the_start_and_begins_with_the_journals(study: Study, tmp_path: Path) -> None:
+    study, shown = with_search(study, algorithms=["rs"]), list[tuple[str, int, int]]()
+    carried_out(study, tmp_path, keys=[RunKey("rs", 0)])
+    carried_out(study, tmp_path, progress=lambda *values: shown.append(values))
+    assert shown[0] == ("smoke: 1/2 runs, evaluations", 100, 200)
+    assert shown[-1] == ("smoke: 2/2 runs, evaluations", 200, 200)
 
 
 @pytest.mark.parametrize("outcome", [Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR])
@@ -126,33 +118,32 @@ def test_what_a_longer_run_found_after_its_budget_is_not_counted(outcome: Outcom
     """A journal of two settings, and a run of one evaluation."""
     both = evaluated(np.stack([SUN.original, SUN.upper]))
     both = dataclasses.replace(both, outcome=np.array(["stopped", outcome.value]))
-    result = journaled(both, 1, tmp_path).finish()
-    assert (result.progress.collisions, result.invalid_tests, result.failures) == (0, 0, [])
-    assert result.progress.best == both.f_safe[0]
+    head = journal_head("study", "rs-00", SUN.names)
+    journal = Journal(tmp_path / "rs-00.jsonl", head)
+    journal.append([0, 1], both)
+    journal.finish([0], 1)
+    journal.close()
+    result = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1).finish()  # type: ignore[arg-type]
+    assert (result.collisions, result.invalid_tests, result.failures) == (0, 0, [])
+    assert np.array_equal(result.solutions.settings, both.settings[:1])
+
+
+def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = with_search(study, algorithms=["rs"], runs=1)
+    carried_out(study, tmp_path, batch=3)
+    path = journal_file(tmp_path, "rs-00")
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
+    monkeypatch.setattr("safevar_sumo.campaign.runs.zlib.crc32", lambda name: 7)  # another random sequence
+    with pytest.raises(SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"):
+        carried_out(study, tmp_path)
 
 
 @pytest.mark.parametrize("workers", [1, 4])
-def test_a_forecast_counts_and_measures_the_search_itself(
-    workers: int, study: Study, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seconds = iter(range(100_000))
-    monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
-    pool = FormulaPool(workers)
-    ahead = forecast(study, 6, pool)
-    assert ahead.evaluations == 600
-    assert ahead.seconds == pytest.approx(600 / ahead.rate)
-    assert 600 * 8 * (12 + len(METRICS)) <= ahead.size <= 600 * 20 * (17 + len(METRICS))
-    assert study.search.population / 4 < ahead.rate <= 6 * study.search.population, (
-        "at most a generation of all runs in a second"
-    )
-
-
-def test_a_worker_that_always_dies_outside_of_batches_ends_the_study(
-    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def die(*_: object) -> bool:
-        raise Death("died in the search")
-
-    monkeypatch.setattr(Run, "advance", die)
-    with pytest.raises(WorkerLostError, match="died in the search"):
-        carried_out(study, tmp_path)
+def test_the_speed_of_a_study_is_that_of_all_workers(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    pool, seconds = FormulaPool(workers), iter([10.0, 14.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
+    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    assert measure_speed(Task(study=load_study("smoke"), batch_size=200), pool) == workers * 200 / 4
+    assert sorted(pool.sizes) == [1] * workers + [200] * workers

@@ -11,31 +11,37 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import portalocker
 import pytest
 
 from safevar_sumo import output
-from safevar_sumo.campaign import all_runs, run_campaign
-from safevar_sumo.campaign.evaluation import Task, evaluate_batch
+from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.results import ResultsDirectory, journal, load_runs, manifest
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import load_runs, manifest
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import EventLog, FormulaPool
+from tests.campaign import formulas
+from tests.campaign.formulas import FormulaPool
 
 
-def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -> None:
-    shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
-    study = load_study("native", scenario={"parameters": {"network": str(tmp_path / "mine")}})
-    packed_task = Task(study=study, files=files_of(study)).packed
-    original = CharacteristicSet.of(study).original[None]
-    evaluate_batch(packed_task, original)
+def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_finished(tmp_path: Path) -> None:
+    shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
+    search = {"algorithms": ["rs"], "evaluations": 20, "runs": 1}
+    study = load_study("smoke", scenario={"parameters": {"network": str(tmp_path / "mine")}}, search=search)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
-    traffic.write_text(traffic.read_text() + "<!-- -->")
-    with pytest.raises(InputError, match=r"traffic\.rou\.xml: is not the file"):
-        evaluate_batch(packed_task, original)
+
+    class Edited(FormulaPool):
+        def evaluate(self, task: Task, settings: FloatArray) -> Evaluations:
+            if len(self.simulated) == 1:  # the original vehicle
+                traffic.write_text(traffic.read_text() + "<!-- -->")
+            return super().evaluate(task, settings)
+
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml has changed since: it was changed meanwhile"):
+        formulas.carried_out(study, tmp_path / "out", Edited())
+    assert not load_runs(tmp_path / "out").finished
 
 
 ADS = """
@@ -91,7 +97,8 @@ def test_imported_modules_whole_packages_and_named_files_count_wherever_the_comm
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def files(place: Path) -> dict[str, str]:
-        return files_of(load_study(place / "mine.toml"))
+        study = load_study(place / "mine.toml")
+        return files_of(study, assemble(study))
 
     result = files(place)
     network = {name for name in result if name.startswith("pedestrian_crossing/")}
@@ -183,15 +190,14 @@ def tiny() -> Study:
 
 
 def carried_out(study: Study, path: Path) -> bytes:
-    results = ResultsDirectory(path, study)
-    results.finish(run_campaign(study, all_runs(study), results, FormulaPool(), EventLog()).solutions)
-    return (path / "solutions.csv").read_bytes()
+    formulas.carried_out(study, path)
+    return formulas.solutions(path)
 
 
 def broken(study: Study, path: Path, disk: Disk) -> bool:
     """Carry the study out on a disk that fails; whether it ended with an error."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (manifest, journal, output):
+        for module in (manifest, portalocker.utils, output):
             patch.setattr(module, "open", disk.open, raising=False)
         for name in ("fsync", "replace", "mkdir", "open", "unlink"):
             patch.setattr(os, name, disk.failing(getattr(os, name)))

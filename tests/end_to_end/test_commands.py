@@ -94,24 +94,22 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
     )
     assert "left out" not in longer
     fewer = study("--out", "out", "--evaluations", "160", "--runs", "1", "--algorithms", "nsga2,rs")
-    assert "out: 4 earlier runs left out of the results: nsga2-01, rs-01, safe_fuzzer-00, safe_fuzzer-01" in fewer
+    assert "out: earlier runs are left out of the results: nsga2-01, rs-01, safe_fuzzer-00, safe_fuzzer-01" in fewer
     assert "evaluations before" not in fewer
 
 
 @pytest.mark.slow
-def test_torn_tails_are_cut_off_with_a_warning(copied: Path, whole: Path) -> None:
+def test_torn_runs_are_continued(copied: Path, whole: Path) -> None:
     for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
         path = copied / "runs" / f"{name}.jsonl"
         os.truncate(path, path.stat().st_size - lost)
-    result = study("--out", "out")
-    assert result.count("warning") == 2
-    assert "nsga2-00.jsonl" in result
+    study("--out", "out")
     assert solutions("out") == solutions(whole)
 
 
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     output = run("study", "small.toml", "--dry-run").stdout
-    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations/s", " s ", "kB"):
+    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations/s", " s "):
         assert word in output
     assert max(map(len, output.splitlines())) <= 80
     assert not Path("results").exists()
@@ -123,5 +121,12 @@ def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
         "    def drive(self, seen):\n        return 1 / 0\n"
     )
     Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
-    for options in ([], ["--dry-run"]):
-        refused("study", "bad.toml", "--out", "out", *options, message=("ZeroDivisionError", "simulate bad.toml"))
+    for options, command in (([], "check bad.toml"), (["--dry-run"], "simulate bad.toml")):
+        refused(
+            "study",
+            "bad.toml",
+            "--out",
+            "out",
+            *options,
+            message=("ZeroDivisionError", f"it: python -m safevar_sumo {command}"),
+        )

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.api.running import carry_out_runs
-from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
@@ -23,7 +21,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import InlinePool, SilentObserver, json_of, run
+from tests.in_process import json_of, run, searched
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
 
@@ -44,8 +42,7 @@ class Mine:
 
 def search_all(folder: Path, out: Path) -> None:
     """Carry out all runs of mine.toml."""
-    study = load_study(str(folder / "mine.toml"))
-    carry_out_runs(study, assemble(study), all_runs(study), out, InlinePool(), SilentObserver(), None)
+    searched(load_study(str(folder / "mine.toml")), out)
 
 
 @pytest.mark.parametrize(("own", "shared"), [("Mine", True), ("self", False)])

@@ -22,7 +22,7 @@ from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import TwoWorkers, json_of, run, searched
+from tests.in_process import InlinePool, json_of, run, searched
 from tests.made_up import case_of
 from tests.sumo.test_recording import still as still
 
@@ -56,7 +56,7 @@ def test_what_is_shipped_passes_the_check() -> None:
 @pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     result = find_tolerances(
-        STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), Evaluator(STUDY, TwoWorkers())
+        STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), Evaluator(STUDY, InlinePool(2))
     )
     (scan,) = result.alone
     assert scan.points is not None
@@ -75,7 +75,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 @pytest.mark.slow
 def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_points_that_are_kept() -> None:
-    evaluator = Evaluator(STUDY, TwoWorkers())
+    evaluator = Evaluator(STUDY, InlinePool(2))
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
     original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
@@ -95,7 +95,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_po
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither cells of a better colour nor cells of an unknown colour, of either vehicle, count as worse."""
-    evaluator, matrix = Evaluator(STUDY, TwoWorkers()), assemble(STUDY).matrix
+    evaluator, matrix = Evaluator(STUDY, InlinePool(2)), assemble(STUDY).matrix
     colours = np.zeros((2, len(matrix)), dtype=np.int8)
     colours[:, :5] = [[0, 2, -1, 1, 0], [1, 0, 4, -1, 3]]  # worse, better, unknown before, unknown after, worst
     monkeypatch.setattr(Evaluator, "simulate_cells", lambda self, settings, stage: None)

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,9 +14,9 @@ import pandas as pd
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, differences
-from safevar_sumo.results import Journal, JournalBusyError, journal_head
+from safevar_sumo.results import Journal, JournalReader, journal_head
 from safevar_sumo.results.journal import JournalContent, read_journal
 
 BATCHES = 4
@@ -60,7 +59,7 @@ def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int
         journal.append(places(number), batch(number))
         ends.append(path.stat().st_size)
     if finished:
-        journal.finish(RESULT, 99, BUDGET)
+        journal.finish(RESULT, BUDGET)
         ends.append(path.stat().st_size)
     journal.close()
     return ends
@@ -85,12 +84,11 @@ def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
     write(path)
     journal = Journal(path, HEAD)
     assert holds_the_first(BATCHES, journal.content)
-    assert journal.content.results == {BUDGET: (RESULT, 99)}
-    assert journal.content.tail_size == 0
+    assert journal.content.results == {BUDGET: RESULT}
     journal.close()
     content = read_journal(path, HEAD)
     assert holds_the_first(BATCHES, content)
-    assert content.results == {BUDGET: (RESULT, 99)}
+    assert content.results == {BUDGET: RESULT}
     _, first = content.requested_within(ROWS)
     assert same(first, batch(0)), "positions count from 0: the first three"
 
@@ -119,7 +117,6 @@ def test_a_truncated_journal_loads_its_whole_lines_and_continues(tmp_path: Path,
     journal = Journal(path, HEAD)
     assert holds_the_first(max(0, whole - 1), journal.content)
     assert not journal.content.results
-    assert journal.content.tail_size == left - max([0, *(end for end in ends if end <= left)])
     for number in range(max(0, whole - 1), BATCHES):
         journal.append(places(number), batch(number))
     journal.close()
@@ -127,21 +124,43 @@ def test_a_truncated_journal_loads_its_whole_lines_and_continues(tmp_path: Path,
     assert holds_the_first(BATCHES, content)
 
 
-@pytest.mark.parametrize("line", range(1 + BATCHES + 1))
-def test_a_damaged_line_is_cut_at_the_end_and_an_error_with_its_number_elsewhere(line: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", range(1, 1 + BATCHES + 1))
+def test_a_damaged_line_and_all_after_it_are_lost(line: int, tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
-    write(path)
+    ends = write(path)
     lines = path.read_bytes().splitlines(keepends=True)
     lines[line] = lines[line].replace(b":", b"\0", 2)
     path.write_bytes(damaged := b"".join(lines))
-    if line == BATCHES + 1:
-        content = read_journal(path, HEAD)
-        assert holds_the_first(BATCHES, content)
-        assert (content.results, content.tail_size) == ({}, len(lines[-1]))
-        return
-    with pytest.raises(InputError, match=rf"a\.jsonl: is damaged in line {line + 1}:"):
-        Journal(path, HEAD)
-    assert path.read_bytes() == damaged, "a damaged file is left as it is"
+    content = read_journal(path, HEAD)
+    assert holds_the_first(line - 1, content)
+    assert content.results == {}
+    assert path.read_bytes() == damaged, "a reader leaves the file as it is"
+    Journal(path, HEAD).close()
+    assert path.stat().st_size == ends[line - 1]
+
+
+def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    path.write_bytes(b"\0" * 99)
+    Journal(path, HEAD).close()
+    assert holds_the_first(0, read_journal(path, HEAD))
+    write(path, finished=False)
+    path.write_bytes(path.read_bytes() + b"\0" * 99)
+    assert holds_the_first(BATCHES, Journal(path, HEAD).content)
+
+
+def test_a_reader_follows_a_journal_that_grows_line_by_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    ends, whole = write(path), path.read_bytes()
+    path.unlink()
+    reader = JournalReader(path, BUDGET)
+    assert reader.asked() == 0
+    for size in range(0, len(whole), 50):
+        path.write_bytes(whole[:size])
+        assert reader.asked() == ROWS * max(sum(end <= size for end in ends) - 1, 0)
+        assert not reader.is_finished
+    path.write_bytes(whole)
+    assert (reader.asked(), reader.is_finished) == (BUDGET, True)
 
 
 @pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])
@@ -150,7 +169,7 @@ def test_a_journal_of_another_study_or_run_is_refused(
     tmp_path: Path, opened: Callable[..., object], study: str, run: str
 ) -> None:
     write(tmp_path / "a.jsonl")
-    with pytest.raises(InputError, match="belongs to another study, version or run"):
+    with pytest.raises(InputError, match="belongs to another study, version or run, or is no journal"):
         opened(tmp_path / "a.jsonl", journal_head(study, run, ("a", "b")))
 
 
@@ -162,20 +181,23 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert other.stdout is not None
     assert other.stdout.readline() == "locked\n"
-    with pytest.raises(JournalBusyError):
+    with pytest.raises(SafevarError, match=r"a\.jsonl: another process works on this run"):
         Journal(path, HEAD)
     other.kill()
-    Journal(path, HEAD, time.monotonic() + 9).close()  # waits until the other has ended
+    Journal(path, HEAD).close()  # waits until the other has ended
     other.communicate()
 
 
-def test_a_retry_drops_the_first_failure_and_all_after_it(tmp_path: Path) -> None:
+def test_a_retry_drops_the_first_batch_that_failed_and_all_after_it(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
-    write(path, batches=2)
+    whole = Evaluations.concatenate([batch(0), batch(1)])
     journal = Journal(path, HEAD)
-    journal.retry()
-    for content in (journal.content, read_journal(path, HEAD)):
-        assert content.positions == [0, 1], "the third and the sixth have failed"
-        assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3]
-        assert content.results == {}
+    for rows in ([0, 1], [2, 3], [4]):  # the third row has failed
+        journal.append(rows, whole.take(rows))
+    journal.finish([0], BUDGET)
     journal.close()
+    Journal(path, HEAD, retry_failed=True).close()
+    content = read_journal(path, HEAD)
+    assert content.positions == [0, 1]
+    assert same(content.evaluations, whole.take([0, 1]))
+    assert content.results == {}

@@ -1,0 +1,125 @@
+"""What a pool computes for a study besides its runs: many settings for a question; whether simulations tell anything
+about the ADS; and the check of user code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import msgspec
+import numpy as np
+import platformdirs
+
+from safevar_sumo.campaign.evaluation import (
+    EVERYTHING,
+    VERIFIED_SETTINGS,
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+    system_of,
+    verify_in_sumo,
+)
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import manifest_of
+from safevar_sumo.study import Study, user_code_names
+from safevar_sumo.sumo import is_recorded, settings_per_batch
+from safevar_sumo.sumo.empty_road import why_no_verdict
+
+BATCHES_PER_WORKER = 4
+"""Largest number of batches per worker: with several, no worker waits long for another, and the time left is known."""
+ECONOMICAL_FRACTION = 1 / 4
+"""Fraction of the most economical batch size from which on the steps of a simulation cost no more than its vehicles.
+Settings that fill only smaller batches make one batch for each worker.
+"""
+
+
+def evaluate_all(
+    study: Study,
+    settings: FloatArray,
+    pool: Pool,
+    done: Callable[[int], None] = lambda size: None,
+    verified: int = VERIFIED_SETTINGS,
+    selection: Selection = EVERYTHING,
+) -> Evaluations:
+    """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
+
+    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO,
+    until `verified` ones of the study have been.
+    `done` is called with the number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO.
+    """
+    packed_study = msgspec.msgpack.encode(study)
+    if packed_study not in pool.verified:
+        check_code(study, pool)
+        pool.verified[packed_study] = 0
+    distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
+    best_size, has_recorded_scene = choose_batch_size(study, selection)
+    per_worker = len(distinct_settings) / pool.workers
+    size = math.ceil(
+        min(best_size, max(per_worker / BATCHES_PER_WORKER, min(per_worker, ECONOMICAL_FRACTION * best_size)))
+    )
+    task = Task(study=study, batch_size=size, selection=selection)
+    jobs = [(task, distinct_settings[start : start + size]) for start in range(0, len(distinct_settings), size)]
+
+    def show_ended(ended: Sequence[int]) -> None:
+        for number in ended:
+            done(len(jobs[number][1]))
+
+    evaluations = Evaluations.concatenate(carry_out(evaluate_settings, jobs, pool, show_ended))
+    sample_size = min(verified - pool.verified[packed_study], len(distinct_settings))
+    if has_recorded_scene and sample_size > 0 and selection == EVERYTHING:
+        sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
+        carry_out(verify_in_sumo, [(task, evaluations.take(sample))], pool)
+        pool.verified[packed_study] += sample_size
+    return evaluations.take(row_of.ravel())
+
+
+def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
+    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
+    SUMO.
+    """
+    task = Task(study=study, selection=selection)
+    system = selection.of(system_of(study))
+    return settings_per_batch(system, task.engine), is_recorded(system)
+
+
+def ask_why_no_verdict(study: Study, pool: Pool) -> str:
+    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
+    return str(carry_out(_why_no_verdict, [(Task(study=study),)], pool)[0])
+
+
+def _why_no_verdict(task: Task) -> str:
+    return why_no_verdict(system_of(task.study)) or ""
+
+
+def check_code(study: Study, pool: Pool) -> None:
+    """Check the user code of a study in a worker, unless it has passed before with the same files.
+
+    Raises
+    ------
+    UserCodeError
+        With file, line and advice of the first finding that makes results wrong.
+    """
+    if not user_code_names(study):
+        return
+    identity = json.dumps(manifest_of(study, identity_of(study, system_of(study))), sort_keys=True)
+    digest = hashlib.sha256(identity.encode()).hexdigest()
+    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / digest
+    if marker.exists():
+        return
+    carry_out(_refuse_defects, [(Task(study=study),)], pool)
+    with suppress(OSError):  # without the marker, the next process checks again
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
+
+
+def _refuse_defects(task: Task) -> None:
+    from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
+
+    refuse_defects(task.study)

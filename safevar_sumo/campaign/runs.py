@@ -1,0 +1,183 @@
+"""The runs of a study: their names, algorithms and random numbers; and a run under way, its search and its known
+evaluations.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.campaign.evaluation import VERIFIED_SETTINGS
+from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.plugins import Lookup, instance_of
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.results import Failure, Journal, run_name
+from safevar_sumo.search import ALGORITHMS, Algorithm, MapElites, MoCell, Search
+from safevar_sumo.study import SearchTable, Study
+
+
+class RunKey(NamedTuple):
+    """The name of a run: its algorithm, and its number from 0."""
+
+    algorithm: str
+    run: int
+
+    def __str__(self) -> str:
+        return run_name(self.algorithm, self.run)
+
+
+class RunResult(NamedTuple):
+    """A finished run: its solutions, settings that could not be simulated, and numbers of distinct settings: all that
+    were simulated, those that collided, and those that left the speed tolerance of a test.
+    """
+
+    key: RunKey
+    solutions: Evaluations
+    failures: list[Failure]
+    simulated: int
+    collisions: int
+    invalid_tests: int
+
+
+def all_runs(study: Study) -> list[RunKey]:
+    """The keys of all runs of a study."""
+    return [RunKey(label, run) for label in study.search.labels for run in range(study.search.runs)]
+
+
+def algorithm_of(label: str, study: Study) -> Algorithm:
+    """An algorithm by its label in results, with its parameters from the study.
+
+    Raises
+    ------
+    InputError
+        If no algorithm has this label, or the algorithm does not meet its contract or does not take its parameters.
+    """
+    source, search = study.source, study.search
+    name, key = search.labels.get(label, label), f"search.{label}"
+    if len(search.labels) < len(search.algorithms):
+        raise InputError(
+            source,
+            f"search.algorithms = {search.algorithms}: two have the same name",
+            "algorithms with different names",
+        )
+    for table in search.parameters:
+        if table not in ALGORITHMS and table not in search.labels:
+            legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
+            raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
+    lookup = Lookup(source, study.origin.places)
+    member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
+    parameters = lookup.with_paths(member, search.parameters.get(label, {}), key)
+    algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
+    if isinstance(algorithm, MoCell):
+        algorithm.grid_sides(search.population, source)  # raises for a grid of another size
+    if isinstance(algorithm, MapElites):
+        algorithm.count_cells(len(study.vehicle.characteristics), source)  # raises for too many cells
+    return algorithm
+
+
+def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
+    """The random generator of a run, independent of those of other runs."""
+    sequence = np.random.SeedSequence(study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run))
+    return np.random.Generator(np.random.PCG64(sequence))
+
+
+class Run:
+    """A search, and the table of its evaluations, which a journal continues.
+
+    Parameters
+    ----------
+    budget
+        Number of evaluations that the search may request.
+
+    Attributes
+    ----------
+    solutions
+        The result of the search, once it has ended.
+    is_finished
+        Whether the journal has the result.
+    """
+
+    solutions: Evaluations
+
+    def __init__(self, key: RunKey, search: Search, journal: Journal, budget: int) -> None:
+        self.key, self._search, self._journal, self._budget = key, search, journal, budget
+        self._positions, self._table = list(journal.content.positions), journal.content.evaluations
+        self._journaled = set(self._positions)
+        self._row_of = {setting.tobytes(): row for row, setting in enumerate(self._table.settings)}
+        self._request = self._table.settings[:0]
+        self._asked = 0
+        """Number of settings in all earlier requests."""
+        self._missing = dict[bytes, int]()
+        """The first position in the run of each setting in this request that is not known."""
+        self.is_finished = budget in journal.content.results
+        if self.is_finished:
+            self.solutions = journal.content.take_positions(journal.content.results[budget])
+
+    def look_up(self) -> FloatArray:
+        """Answer the search while all that it asks is known; returns the distinct settings that are missing, shape
+        (k, n), none once the search has ended.
+        """
+        answer = None  # starts a generator
+        while not (self._missing or self.is_finished):
+            if len(self._request):
+                answer = self._table.take([self._row_of[setting.tobytes()] for setting in self._request])
+                self._asked += len(answer)
+            try:
+                self._request = self._search.send(answer)  # type: ignore[arg-type]
+            except StopIteration as end:
+                self.solutions = end.value
+                break
+            for position, setting in enumerate(self._request, self._asked):
+                if setting.tobytes() not in self._row_of:
+                    self._missing.setdefault(setting.tobytes(), position)
+        return np.asarray(self._request[np.array([*self._missing.values()], dtype=int) - self._asked])
+
+    def receive(self, evaluations: Evaluations) -> None:
+        """Journal and remember evaluations of missing settings."""
+        positions = [self._missing.pop(setting.tobytes()) for setting in evaluations.settings]
+        if not self._journaled.isdisjoint(positions):
+            raise InputError(self._journal.path, "holds other settings than this search requests", "another `out`")
+        self._journal.append(positions, evaluations)
+        self._row_of |= {setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(self._table))}
+        self._positions += positions
+        self._table = Evaluations.concatenate([self._table, evaluations])
+
+    def sample_for_sumo(self, rng: np.random.Generator) -> Evaluations:
+        """Sample the evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
+        _, requested = self._requested()
+        solutions = {setting.tobytes() for setting in self.solutions.settings}
+        is_solution = np.array([setting.tobytes() in solutions for setting in requested.settings], dtype=bool)
+        other_rows = np.flatnonzero(~requested.failed & ~is_solution)
+        sample = other_rows[rng.permutation(len(other_rows))[:VERIFIED_SETTINGS]]
+        return requested.take(np.concatenate([np.flatnonzero(~requested.failed & is_solution), sample]))
+
+    def finish(self) -> RunResult:
+        """Journal the result of a search that has ended, and close the journal."""
+        if not self.is_finished:
+            rows = [self._row_of[setting.tobytes()] for setting in self.solutions.settings]
+            self._journal.finish([self._positions[row] for row in rows], self._budget)
+        self.close()
+        positions, requested = self._requested()
+        failed_rows = np.flatnonzero(requested.failed).tolist()
+        return RunResult(
+            self.key,
+            self.solutions,
+            [Failure(*self.key, positions[row], requested.reason(row)) for row in failed_rows],
+            simulated=len(requested),
+            collisions=int(np.count_nonzero(requested.collided)),
+            invalid_tests=int(np.count_nonzero(requested.outcome == Outcome.INVALID_TEST.value)),
+        )
+
+    def close(self) -> None:
+        """Leave the run to another process."""
+        self._journal.close()
+
+    def _requested(self) -> tuple[list[int], Evaluations]:
+        """Positions and evaluations of the known settings within the run's budget, in the order of their positions.
+
+        A journal may hold more: those of a search with a larger budget.
+        """
+        rows = [row for row in np.argsort(self._positions).tolist() if self._positions[row] < self._budget]
+        return [self._positions[row] for row in rows], self._table.take(rows)

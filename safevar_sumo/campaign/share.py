@@ -1,0 +1,141 @@
+"""A share of a study's runs, which one worker carries out together: their searches wait for common batches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.campaign.cluster import has_caller
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of, verify_in_sumo
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, random_generator_of
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.results import (
+    MANIFEST,
+    Journal,
+    differences,
+    identity_digest,
+    journal_file,
+    journal_head,
+    manifest_of,
+)
+from safevar_sumo.search import Problem
+from safevar_sumo.vehicles import region_of
+
+MAX_NAMES = 6
+"""Largest number of runs that the name of a share lists."""
+
+
+class Share(NamedTuple):
+    """Some of a study's runs.
+
+    Attributes
+    ----------
+    keys
+        The runs.
+    directory
+        The directory of the journals, which the worker must see.
+    manifest
+        The inputs of the study's results, which the worker must share.
+    original
+        The original vehicle's evaluation.
+    verifies
+        Whether to verify results in SUMO.
+    retry_failed
+        Whether settings are simulated again that failed before.
+    """
+
+    keys: Sequence[RunKey]
+    directory: Path
+    manifest: JsonObject
+    original: Evaluations
+    verifies: bool
+    retry_failed: bool
+
+    def __str__(self) -> str:
+        more = len(self.keys) - MAX_NAMES
+        return f"runs {', '.join(map(str, self.keys[:MAX_NAMES]))}{f' and {more} more' if more > 0 else ''}"
+
+
+def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
+    """Carry out runs in rounds, each of which evaluates all settings that their searches wait for; then verify and
+    finish them. Also returns a remark on the verification, "" without any.
+
+    Raises
+    ------
+    SafevarError
+        If another process works on a run, a journal cannot be written, or user code fails.
+    InputError
+        If this worker does not see the directory or has other inputs, or results differ in SUMO.
+    """
+    if not (share.directory / MANIFEST).exists():
+        raise InputError(
+            "out", f"a worker does not see {share.directory}", "a directory on a disk that all workers share"
+        )
+    refuse_other_inputs(task, share)
+    with ExitStack() as stack:
+        runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
+        waiting = [(run, settings) for run in runs if len(settings := run.look_up())]
+        while waiting:
+            _evaluate(task, waiting)
+            waiting = [(run, settings) for run, _ in waiting if len(settings := run.look_up())]
+        remark = _verify(task, [run for run in runs if not run.is_finished]) if share.verifies else ""
+        refuse_other_inputs(task, share)
+        return [run.finish() for run in runs], remark
+
+
+def refuse_other_inputs(task: Task, share: Share) -> None:
+    """Raise an error if the inputs of a study's results are not those with which it began."""
+    now = manifest_of(task.study, identity_of(task.study, system_of(task.study)))
+    for _, text, _ in differences(share.manifest, now):
+        raise InputError(
+            f"study {task.study.name!r}",
+            f"{text}: it was changed meanwhile, or a worker has another one",
+            "the file as it was, and the same command; or another `out`",
+        )
+
+
+def _begin(task: Task, share: Share, key: RunKey) -> Run:
+    """Open the journal of a run and begin its search."""
+    study, system = task.study, system_of(task.study)
+    path = journal_file(share.directory, str(key))
+    head = journal_head(identity_digest(share.manifest), str(key), system.characteristics.names)
+    problem = Problem(
+        characteristics=system.characteristics,
+        original=share.original,
+        evaluations=study.search.evaluations,
+        population=study.search.population,
+        scoring=system.measuring.scoring,
+        region=region_of(study),
+    )
+    search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
+    return Run(key, search, Journal(path, head, retry_failed=share.retry_failed), study.search.evaluations)
+
+
+def _evaluate(task: Task, waiting: Sequence[tuple[Run, FloatArray]]) -> None:
+    """Evaluate the settings that runs wait for in equal batches; the runs journal each."""
+    owners = [run for run, settings in waiting for _ in settings]
+    settings, start = np.concatenate([settings for _, settings in waiting]), 0
+    for batch in np.array_split(settings, math.ceil(len(settings) / task.batch_size)):
+        if not has_caller():
+            raise SafevarError("nobody waits for these runs any more")
+        evaluations = evaluate_settings(task, batch)
+        for run, rows in groupby(range(len(batch)), owners[start : start + len(batch)].__getitem__):
+            run.receive(evaluations.take([*rows]))
+        start += len(batch)
+
+
+def _verify(task: Task, runs: Sequence[Run]) -> str:
+    """Verify all solutions of runs, and a sample of their other settings, in SUMO."""
+    samples = [
+        run.sample_for_sumo(random_generator_of(task.study, run.key._replace(algorithm=f"verify {run.key.algorithm}")))
+        for run in runs
+    ]
+    return verify_in_sumo(task, Evaluations.concatenate(samples)) if any(map(len, samples)) else ""
