@@ -23,14 +23,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
 """The algorithm that RQ2 compares with the others, and whose solutions RQ3 analyses."""
-ALGORITHM_TITLES = {
-    "nsga2": "NSGA-II",
-    "spea2": "SPEA2",
-    "mocell": "MOCell",
-    "map_elites": "MAP-Elites",
-    "rs": "RS",
-    "safe_fuzzer": "SafeFuzzer",
-}
+ALGORITHM_TITLES = {"nsga2": "NSGA-II", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
 class UnanswerableError(InputError):

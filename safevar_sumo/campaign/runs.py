@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import Failure, Journal, run_name
-from safevar_sumo.search import ALGORITHMS, Algorithm, MapElites, MoCell, Search
+from safevar_sumo.search import ALGORITHMS, Algorithm, Search
 from safevar_sumo.study import SearchTable, Study
 
 
@@ -70,10 +70,6 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
     parameters = lookup.with_paths(member, search.parameters.get(label, {}), key)
     algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
-    if isinstance(algorithm, MoCell):
-        algorithm.grid_sides(search.population, source)  # raises for a grid of another size
-    if isinstance(algorithm, MapElites):
-        algorithm.count_cells(len(study.vehicle.characteristics), source)  # raises for too many cells
     return algorithm
 
 

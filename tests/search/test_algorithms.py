@@ -12,10 +12,9 @@ from deap import tools
 from hypothesis import given, strategies as st
 
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
+from safevar_sumo.search import ALGORITHMS, Problem
 from safevar_sumo.search.baselines import _Ranges
-from safevar_sumo.search.evolution import Individual, Operators, Reproduction, fitness_class, run_tournament
-from safevar_sumo.search.genetic import choose_survivor, select_survivors
+from safevar_sumo.search.genetic import Individual, fitness_class, run_tournament, select_survivors
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import POPULATION, SUN, evaluated, searched, sphere
 
@@ -55,7 +54,7 @@ def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
     assert solutions.valid.all()
 
 
-@pytest.mark.parametrize("name", ["mocell", "nsga2", "rs", "spea2"])
+@pytest.mark.parametrize("name", ["nsga2", "rs"])
 def test_the_result_is_non_dominated(name: str) -> None:
     solutions = searched(name, 7, 600)[0]
     assert len(solutions) > 0
@@ -129,14 +128,6 @@ def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
     assert all(run_tournament([better, worse]) is worse for _ in range(20))
 
 
-def test_every_individual_enters_a_tournament_before_any_enters_a_second() -> None:
-    four = individuals(*[(k, k, k) for k in range(4)])
-    reproduction = Reproduction(Operators(), problem(), np.random.default_rng(1))
-    for one in four:
-        one.standing = (one[0],)
-    assert all(four[0] in reproduction._parents(four) for _ in range(20))
-
-
 def problem() -> Problem:
     original = evaluated(TWO, TWO.original[np.newaxis], np.array([5.0]))
     return Problem(characteristics=TWO, original=original, evaluations=1000, population=POPULATION)
@@ -162,75 +153,8 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
     assert ranges.max_changes == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 
 
-def test_a_grid_closes_on_itself() -> None:
-    around = MoCell(grid=(3, 4))._neighbours(12)
-    assert sorted(around[0]) == [0, 1, 3, 4, 5, 7, 8, 9, 11], "the corner's neighbours are on all sides"
-    assert all(len(place) == 9 for place in around)
-    assert sorted(MoCell(neighbourhood="von_neumann", grid=(3, 4))._neighbours(12)[5]) == [1, 4, 5, 6, 9]
-    assert MoCell()._neighbours(2) == [[0, 1], [1, 0]]
-
-
-def test_a_child_that_neither_dominates_nor_is_dominated_enters_only_if_a_neighbour_is_worse() -> None:
-    cell, child, far, worst = individuals((0, 2, 0), (0, 2, 0), (2, 0, 0), (3, 3, 0))
-    assert choose_survivor(cell, child, [cell]) is cell
-    assert choose_survivor(cell, child, [cell, far]) is cell
-    assert choose_survivor(cell, child, [cell, worst]) is child
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("spea2", {"archive": 5}),
-        ("spea2", {"normalised": False}),
-        ("mocell", {"archive": 5}),
-        ("mocell", {"grid": [2, 10]}),
-        ("mocell", {"neighbourhood": "von_neumann"}),
-        ("nsga2", {"tournament_size": 3}),
-        ("mocell", {"mutation_probability": 1.0}),
-        ("map_elites", {"behaviour": "speed"}),
-    ],
-)
-def test_options_change_what_a_search_asks_for(name: str, options: dict[str, object]) -> None:
-    algorithm = msgspec.convert(options, ALGORITHMS[name])
-    solutions, asked = searched(name, 1, 200, algorithm=algorithm)
-    assert not np.array_equal(asked[-1], searched(name, 1, 200)[1][-1])
-    assert len(solutions) <= options.get("archive", len(solutions))
-
-
-@pytest.mark.parametrize(("characteristics", "most"), [(SUN, 3), (TWO, 0)])
-def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes(
-    characteristics: CharacteristicSet, most: int
-) -> None:
-    """Every setting with more changes than `most` collides."""
-
-    def colliding(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
-        good = sphere(characteristics, settings)
-        outcome = np.where(good.f_num_diff > most, Outcome.COLLISION.value, good.outcome).astype("U16")
-        return dataclasses.replace(good, outcome=outcome)
-
-    solutions, asked = searched("map_elites", 1, 400, characteristics, colliding)
-    everything = colliding(characteristics, np.concatenate(asked))
-    smallest: dict[bytes, float] = {}
-    for changed, size in zip(
-        characteristics.changed(everything.settings)[everything.collided],
-        everything.f_diff[everything.collided],
-        strict=True,
-    ):
-        smallest[changed.tobytes()] = min(size, smallest.get(changed.tobytes(), np.inf))
-    assert {
-        changed.tobytes(): size
-        for changed, size in zip(characteristics.changed(solutions.settings), solutions.f_diff, strict=True)
-    } == smallest
-
-
-def test_cells_of_an_atlas_over_the_speed_are_a_metre_a_second_wide_and_the_last_one_is_open() -> None:
-    """For each number of changes, 20 cells of collisions and one cell without a collision."""
-    speeds = [np.nan, 0.0, 0.9, 1.0, 18.9, 19.0, 25.0]
-    one, two = (
-        dataclasses.replace(window([setting] * 7, [1.0] * 7), collision_speed=np.array(speeds))
-        for setting in ([60, 50], [60, 60])
-    )
-    atlas = MapElites(behaviour="speed")
-    assert atlas._cell_numbers(one, problem()).tolist() == [0, 1, 1, 2, 19, 20, 20]
-    assert atlas._cell_numbers(two, problem()).tolist() == [21, 22, 22, 23, 40, 41, 41]
-    assert atlas.count_cells(2) == 42
+@pytest.mark.parametrize("options", [{"tournament_size": 3}, {"mutation_probability": 1.0}])
+def test_options_change_what_a_search_asks_for(options: dict[str, object]) -> None:
+    algorithm = msgspec.convert(options, ALGORITHMS["nsga2"])
+    _, asked = searched("nsga2", 1, 200, algorithm=algorithm)
+    assert not np.array_equal(asked[-1], searched("nsga2", 1, 200)[1][-1])

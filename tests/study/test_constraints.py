@@ -23,7 +23,7 @@ from tests.search.problems import SUN
 BOUND = """
 extends = "smoke"
 [search]
-algorithms = ["map_elites", "mocell", "nsga2", "rs", "safe_fuzzer", "spea2"]
+algorithms = ["nsga2", "rs", "safe_fuzzer"]
 runs = 1
 evaluations = 60
 population = 10
