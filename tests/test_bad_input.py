@@ -77,6 +77,7 @@ TYPED = [
     ("rating euro_ncap_rating --format csv --table layers", "cells"),
     ("check mine:Nothing", "has no 'Nothing'"),
     ("check broken:Mine", "ZeroDivisionError: division by zero"),
+    ("check smokee", "did you mean 'smoke'?"),
     ("tables nowhere", "nowhere: is not a results directory"),
     ("tables other", "other"),
     ("tables results/smoke --format html", "latex"),

@@ -13,10 +13,9 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study, load_study, tables_of
-from safevar_sumo.study.file import drop_nulls
 from safevar_sumo.sumo.system import assemble
 
-TABLES = drop_nulls(tables_of(load_study("smoke")))
+TABLES = tables_of(load_study("smoke"))
 SCALARS = st.one_of(
     st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times()
 )

@@ -13,7 +13,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter, missing_parameter
+from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -170,25 +170,17 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
     """
     tables = _as_tables(study)
     for name, value in values.items():
-        table, key = _locate(study, tables, name)
+        table, key = locate_parameter(tables, name)
         table[key] = value
     return convert_table(study.source, tables, Study)
 
 
 def value_of(study: Study, name: str) -> float:
     """The value of a parameter in the study."""
-    table, key = _locate(study, _as_tables(study), name)
+    table, key = locate_parameter(_as_tables(study), name)
     return float(table[key])
 
 
 def _as_tables(study: Study) -> Any:
     """The study as plain tables; a weather's name is replaced by the weather's table."""
     return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
-
-
-def _locate(study: Study, tables: Any, name: str) -> tuple[Any, int | str]:
-    """The table or list that holds a parameter, and the parameter's key or index in it."""
-    place = locate_parameter(tables, name)
-    if place is None:
-        raise missing_parameter(study.source, name)
-    return place

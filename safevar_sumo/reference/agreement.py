@@ -186,5 +186,5 @@ def shipped_agreement(study: Study) -> pd.DataFrame:
         name: evaluation_keys(tables_of(load_study(name))) for name in frame["study"].unique() if name in study_names()
     }
     own_keys = evaluation_keys(tables_of(study))
-    same = [name for name, keys in keys.items() if all(keys[key] == own_keys[key] for key in SIMULATION_KEYS)]
+    same = [name for name, keys in keys.items() if all(keys.get(key) == own_keys.get(key) for key in SIMULATION_KEYS)]
     return frame[frame["study"].isin(same)]

@@ -35,12 +35,9 @@ from safevar_sumo.study.schema import (
     VehicleTable as VehicleTable,
     Weather as Weather,
     label_of as label_of,
+    locate_parameter as locate_parameter,
     study_names as study_names,
     study_path as study_path,
     tables_of as tables_of,
 )
-from safevar_sumo.study.validation import (
-    convert_table as convert_table,
-    locate_parameter as locate_parameter,
-    missing_parameter as missing_parameter,
-)
+from safevar_sumo.study.validation import convert_table as convert_table

@@ -6,8 +6,8 @@ the world; constraints that they satisfy together; and limits that a user sets, 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta, Struct
@@ -16,9 +16,20 @@ from safevar_sumo.errors import InputError, one_of, unknown_name
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 Description = Annotated[str, Meta(max_length=200)]
+MAX_MAGNITUDE = 1e12
+"""Largest magnitude of a characteristic."""
 
 
-class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Table(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A table of a study file, without keys that are unknown; its keys with default values are not written."""
+
+
+def mistake(problem: str, legal: str) -> ValueError:
+    """The error for a record whose values contradict each other; `convert_table` adds its path."""
+    return ValueError(f"{problem}\n{legal}")
+
+
+class CharacteristicTable(Table, frozen=True, kw_only=True):
     """One row of the characteristics table: its `original` value, and the ends `lower` and `upper` of its domain, in
     `unit`; f_diff multiplies its change by `weight`.
 
@@ -34,20 +45,46 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     meaning: Description = ""
     counterpart: Description = ""
 
+    def __post_init__(self) -> None:
+        if max(abs(self.original), abs(self.lower), abs(self.upper)) > MAX_MAGNITUDE:
+            raise mistake(f"{self.original} in [{self.lower}, {self.upper}]", f"numbers up to {MAX_MAGNITUDE:g}")
+        if self.lower >= self.upper:
+            raise mistake(f"lower = {self.lower} and upper = {self.upper}", "lower < upper")
+        if not self.lower <= self.original <= self.upper:
+            raise mistake(f"original = {self.original}", f"a value in [{self.lower}, {self.upper}]")
+        if self.original == 0:
+            raise mistake("original = 0", "a value other than 0: changes are relative to it")
+
 
 def unit_text(unit: str, layout: str = " {}") -> str:
     """A unit as text after a number or, in another `layout`, after a name; empty for a pure number."""
     return "" if unit == "-" else layout.format(unit)
 
 
-class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
+class Uniform(
+    Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="distribution",
+    tag="uniform",
+):
     """Every value from `lower` to `upper` is equally likely; by default the whole domain."""
 
     lower: float | None = None
     upper: float | None = None
 
 
-class Normal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="normal"):
+class Normal(
+    Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="distribution",
+    tag="normal",
+):
     """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the
     ends of the domain.
     """
@@ -57,7 +94,13 @@ class Normal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_
 
 
 class Triangular(
-    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="triangular"
+    Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="distribution",
+    tag="triangular",
 ):
     """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the
     original.
@@ -69,7 +112,13 @@ class Triangular(
 
 
 class Lognormal(
-    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="lognormal"
+    Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="distribution",
+    tag="lognormal",
 ):
     """A lognormal distribution with `median`, by default the original, cut off at the ends of the domain.
 
@@ -80,7 +129,15 @@ class Lognormal(
     median: float | None = None
 
 
-class Fixed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="fixed"):
+class Fixed(
+    Struct,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="distribution",
+    tag="fixed",
+):
     """The characteristic always has `value`, by default the original."""
 
     value: float | None = None
@@ -89,28 +146,31 @@ class Fixed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
 Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
-class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Correlation(Table, frozen=True, kw_only=True):
     """The correlation, `value`, of the two characteristics `between` after each is transformed to a standard normal
     variable (Gaussian copula).
     """
 
-    between: tuple[str, str]
+    between: Annotated[list[str], Meta(min_length=2, max_length=2)]
     value: Annotated[float, Meta(gt=-1, lt=1)]
 
 
-def variation_mistakes(
-    source: object,
-    rows: Mapping[str, CharacteristicTable],
-    variation: Mapping[str, Distribution],
-    correlations: Sequence[Correlation],
-) -> Iterator[InputError]:
-    """Errors for distributions and correlations that do not fit the characteristics' domains, or each other."""
+def check_variation(
+    rows: Mapping[str, CharacteristicTable], variation: Mapping[str, Distribution], correlations: Sequence[Correlation]
+) -> None:
+    """Refuse distributions and correlations that do not fit the characteristics' domains, or each other."""
     for name, distribution in variation.items():
-        if name in rows:
-            yield from _distribution_mistakes(source, f"variation.{name}", rows[name], distribution)
-        else:
-            yield unknown_name(source, f"variation.{name}: there is no such characteristic", name, rows)
-    yield from _correlation_mistakes(source, list(rows), correlations)
+        if name not in rows:
+            raise unknown_name("", f"variation.{name}: there is no such characteristic", name, rows)
+        _check_distribution(f"variation.{name}", rows[name], distribution)
+    pairs = [frozenset(correlation.between) for correlation in correlations]
+    for correlation, pair in zip(correlations, pairs, strict=True):
+        for name in correlation.between:
+            if name not in rows:
+                raise unknown_name("", f"correlations.between: there is no characteristic {name!r}", name, rows)
+        if len(pair) < len(correlation.between) or pairs.count(pair) > 1:
+            problem = f"correlations.between = {list(correlation.between)}"
+            raise InputError("", problem, "two characteristics, each pair once")
 
 
 def stated_values(distribution: Distribution) -> dict[str, float]:
@@ -118,39 +178,22 @@ def stated_values(distribution: Distribution) -> dict[str, float]:
     return {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
 
 
-def _distribution_mistakes(
-    source: object, key: str, row: CharacteristicTable, distribution: Distribution
-) -> Iterator[InputError]:
-    unit = unit_text(row.unit)
-    stated = stated_values(distribution)
+def _check_distribution(key: str, row: CharacteristicTable, distribution: Distribution) -> None:
+    unit, stated = unit_text(row.unit), stated_values(distribution)
     lower, upper = stated.get("lower", row.lower), stated.get("upper", row.upper)
     mode = stated.get("mode", row.original)
     for field, value in stated.items():
         if field not in ("deviation", "sigma") and not row.lower <= value <= row.upper:
-            yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{row.lower:g}, {row.upper:g}]{unit}")
+            raise InputError("", f"{key}.{field} = {value:g}", f"a number in [{row.lower:g}, {row.upper:g}]{unit}")
     if lower >= upper:
-        yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
-    elif isinstance(distribution, Triangular) and not lower <= mode <= upper:
-        yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
-    elif isinstance(distribution, Lognormal) and row.lower <= 0:
-        yield InputError(source, f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0")
+        raise InputError("", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
+    if isinstance(distribution, Triangular) and not lower <= mode <= upper:
+        raise InputError("", f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
+    if isinstance(distribution, Lognormal) and row.lower <= 0:
+        raise InputError("", f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0")
 
 
-def _correlation_mistakes(
-    source: object, names: Sequence[str], correlations: Sequence[Correlation]
-) -> Iterator[InputError]:
-    pairs = set[frozenset[str]]()
-    for correlation in correlations:
-        between, pair = correlation.between, frozenset(correlation.between)
-        for name in between:
-            if name not in names:
-                yield unknown_name(source, f"correlations.between: there is no characteristic {name!r}", name, names)
-        if len(pair) < len(between) or pair in pairs:
-            yield InputError(source, f"correlations.between = {list(between)}", "two characteristics, each pair once")
-        pairs.add(pair)
-
-
-class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Constraint(Table, frozen=True, kw_only=True):
     """The bounds `at_least` and `at_most` of a weighted sum of characteristics.
 
     `sum` holds a weight for each characteristic in its unit. `unit`, the unit of the sum and its bounds, is the unit of
@@ -163,6 +206,11 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     at_most: float | None = None
     unit: str | None = None
     meaning: Annotated[str, Meta(max_length=400)] = ""
+
+    def __post_init__(self) -> None:
+        if 0 in self.sum.values():
+            raise mistake(f"sum = {self.sum}", "weights other than 0")
+        check_bounds(self.at_least, self.at_most)
 
     @property
     def quantity(self) -> str:
@@ -185,43 +233,34 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
 
 
-def constraint_mistakes(
-    source: object, rows: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]
-) -> Iterator[InputError]:
-    """Errors for constraints that name unknown characteristics, add quantities of different units, or have no
-    bounds.
-    """
+def check_bounds(at_least: float | None, at_most: float | None) -> None:
+    """Refuse bounds that are missing or cross."""
+    if at_least is None and at_most is None:
+        raise mistake("neither at_least nor at_most", "one of them, or both")
+    if at_least is not None and at_most is not None and at_least > at_most:
+        raise mistake(f"at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most")
+
+
+def check_constraints(rows: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]) -> None:
+    """Refuse constraints that name unknown characteristics or add quantities of different units."""
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
-        for name, weight in constraint.sum.items():
+        for name in constraint.sum:
             if name not in rows:
-                yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, rows)
-            if weight == 0:
-                yield InputError(source, f"{key}.sum.{name} = 0", "a number other than 0")
-        at_least, at_most = constraint.at_least, constraint.at_most
-        if at_least is None and at_most is None:
-            yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
-        elif at_least is not None and at_most is not None and at_least > at_most:
-            yield InputError(source, f"{key}: at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most")
-        yield from _unit_mistakes(source, key, constraint, rows)
-
-
-def _unit_mistakes(
-    source: object, key: str, constraint: Constraint, rows: Mapping[str, CharacteristicTable]
-) -> Iterator[InputError]:
-    units = {rows[name].unit for name in constraint.sum if name in rows}
-    legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
-    if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
-        terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum if name in rows)
-        problem = f"{key}: unit = {constraint.unit!r} for the sum of {terms}"
-        yield InputError(source, problem, f"{one_of(legal_units)}; weights may convert units")
+                raise unknown_name("", f"{key}.sum.{name}: there is no such characteristic", name, rows)
+        units = {rows[name].unit for name in constraint.sum}
+        legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
+        if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
+            terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum)
+            problem = f"{key}: unit = {constraint.unit!r} for the sum of {terms}"
+            raise InputError("", problem, f"{one_of(legal_units)}; weights may convert units")
 
 
 LIMIT_FORM = re.compile(r"\s*([^<>=]*[^\s<>=])\s*(>=|<=)\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*")
 FORMS = '"NAME >= X" or "NAME <= X" with a number in the unit of the characteristic, such as "treadDepth >= 3"'
 
 
-class Limit(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Limit(Table, frozen=True, kw_only=True):
     """The values that a characteristic may take, in its unit: `at_least`, `at_most`, or both; `source` says who demands
     it.
     """
@@ -229,6 +268,9 @@ class Limit(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     at_least: float | None = None
     at_most: float | None = None
     source: Annotated[str, Meta(max_length=400)] = ""
+
+    def __post_init__(self) -> None:
+        check_bounds(self.at_least, self.at_most)
 
     def interval(self, row: CharacteristicTable) -> tuple[float, float]:
         """The limited interval [unit]; a side without a limit ends with the domain."""
@@ -252,45 +294,38 @@ def limits_of(
         If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of one characteristic
         cross, or a limit is outside the domain or excludes the original.
     """
-    typed: dict[str, Limit] = {}
+    sides: dict[str, dict[str, Any]] = {}
     for text in texts:
         match = LIMIT_FORM.fullmatch(text)
         if match is None:
             raise InputError(source, repr(text), FORMS)
         name, side = match[1], "at_least" if match[2] == ">=" else "at_most"
-        limit = typed.get(name, Limit())
-        if getattr(limit, side) is not None:
+        if side in sides.setdefault(name, {}):
             raise InputError(source, f"{name} {match[2]} is given twice", "each limit once")
-        typed[name] = msgspec.structs.replace(limit, **{side: float(match[3])})
-    for mistake in limit_mistakes(source, rows, typed):
-        raise mistake
+        sides[name][side] = float(match[3])
+    try:
+        typed = {name: Limit(**limit) for name, limit in sides.items()}
+    except ValueError as error:
+        problem, _, legal = str(error).partition("\n")
+        raise InputError(source, f"{', '.join(texts)}: {problem}", legal) from None
+    check_limits(rows, typed, source)
     limits = {**(stated or {}), **typed}
     return {name: limits[name] for name in rows if name in limits}
 
 
-def limit_mistakes(
-    source: object, rows: Mapping[str, CharacteristicTable], limits: Mapping[str, Limit], table: str = ""
-) -> Iterator[InputError]:
-    """Errors for limits that are of unknown characteristics, have no number, cross, are outside the domain, or exclude
-    the original.
-    """
+def check_limits(
+    rows: Mapping[str, CharacteristicTable], limits: Mapping[str, Limit], source: object = "", table: str = ""
+) -> None:
+    """Refuse limits of unknown characteristics, outside the domain, or that exclude the original."""
     for name, limit in limits.items():
-        key = f"{table}{name}"
         if name not in rows:
-            yield unknown_name(source, f"{key}: there is no such characteristic", name, rows)
-            continue
+            raise unknown_name(source, f"{table}{name}: there is no such characteristic", name, rows)
         row, unit = rows[name], unit_text(rows[name].unit)
-        low, high = limit.interval(row)
-        if limit.at_least is None and limit.at_most is None:
-            yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
-        elif low > high and None not in (limit.at_least, limit.at_most):
-            yield InputError(source, f"{key}: at least {low:g} and at most {high:g}{unit}", "at_least <= at_most")
-        legal_sides = ((">=", "at_least", row.lower, row.original), ("<=", "at_most", row.original, row.upper))
-        for sign, side, lower, upper in legal_sides:
+        for side, lower, upper in (("at_least", row.lower, row.original), ("at_most", row.original, row.upper)):
             value = getattr(limit, side)
             if value is not None and not lower <= value <= upper:
-                text = f"{key}.{side} = {value:g}" if table else f"{key} {sign} {value:g}"
                 why = " is outside its domain"
                 if row.lower <= value <= row.upper:
                     why = f": the original, {row.original:g}{unit}, does not keep it"
-                yield InputError(source, f"{text}{why}", f"a number in [{lower:g}, {upper:g}]{unit}")
+                legal = f"a number in [{lower:g}, {upper:g}]{unit}"
+                raise InputError(source, f"{table}{name}.{side} = {value:g}{why}", legal)

@@ -29,13 +29,7 @@ from safevar_sumo.study.schema import (
     study_path,
     tables_of,
 )
-from safevar_sumo.study.validation import (
-    contradictions,
-    contradictions_of_file,
-    convert_table,
-    infinite_numbers,
-    raise_mistakes,
-)
+from safevar_sumo.study.validation import convert_table
 
 WHOLE_TABLES = ("published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
@@ -90,19 +84,17 @@ def plain_values(value: Any) -> Any:
 
 def _raw_study(study: StudyLike) -> _RawStudy:
     if isinstance(study, Study):
-        return _RawStudy(study.source, drop_nulls(tables_of(study)), study.origin)
+        return _RawStudy(study.source, tables_of(study), study.origin)
     if isinstance(study, Mapping):
         return _with_base(_RawStudy("study", plain_values(study)), Path("."), ())
     return _read_file(study_path(str(study)), visited_paths=())
 
 
 def _checked_study(raw: _RawStudy) -> Study:
-    raise_mistakes(infinite_numbers(raw.source, raw.tables))
     if "origin" in raw.tables:
         raise InputError(raw.source, "origin: there is no such key")
     tables = _with_parameters(_with_parameters(raw.tables, "search", SearchTable), "repair", RepairTable)
     study = convert_table(raw.source, tables, Study)
-    raise_mistakes(contradictions(raw.source, study))
     return msgspec.structs.replace(study, origin=raw.origin)
 
 
@@ -138,7 +130,6 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
-        raise_mistakes(contradictions_of_file(raw.source, tables, tables))
         return raw
     if not isinstance(base, str):
         raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
@@ -184,6 +175,8 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
         if "vehicle" in changed_keys or "ads" in changed_keys:
             for key in {"spread", "model_error"} - overrides.keys():  # they concern the parameters of both
                 tables.pop(key, None)
+        if "matrix" in changed_keys and "rating" not in overrides:
+            tables.pop("rating", None)
         if omitted_keys:
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
             remarks = (
@@ -191,7 +184,6 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
                 f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
                 f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}",
             )
-    raise_mistakes(contradictions_of_file(source, overrides, tables))
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 
@@ -222,13 +214,6 @@ def _refines(key: str, base_value: object, override: object) -> bool:
     )
 
 
-def drop_nulls(raw: Any) -> Any:
-    """Tables without null values, which TOML does not have."""
-    if isinstance(raw, list):
-        return [drop_nulls(value) for value in raw]
-    return {key: drop_nulls(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
-
-
 def write_study(path: Path, study: Study, comment: str) -> None:
     """Write a complete study file that begins with `SCHEMA_LINE` and a comment; the study takes the file's name if that
     is a legal name of a study.
@@ -240,11 +225,10 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     """
     if re.fullmatch(NAME_PATTERN, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
-    tables = {name: value for name, value in drop_nulls(tables_of(study)).items() if value != {}}
     lines = (
         "".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines()
     )
-    text = SCHEMA_LINE + "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
+    text = SCHEMA_LINE + "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables_of(study))
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
 

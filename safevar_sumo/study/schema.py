@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta
 
-from safevar_sumo.errors import unknown_name
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.characteristics import (
     CharacteristicTable,
@@ -19,6 +19,11 @@ from safevar_sumo.study.characteristics import (
     Distribution,
     Limit,
     PositiveNumber,
+    Table,
+    check_constraints,
+    check_limits,
+    check_variation,
+    mistake,
 )
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
@@ -30,17 +35,17 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 Name = Annotated[
     str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")
 ]
+SPREAD_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
+"""Prefixes of the parameters that may stand in [spread]."""
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the safety degree."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
-FMU_KEYS = ("kind", "inputs", "outputs")
-"""Keys of a model's table that only FMUs use, except the first one: an ADS that is no FMU may have a `kind`."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
 """Keys that describe a characteristic to people; no result depends on them."""
 
 
-class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ModelTable(Table, frozen=True, kw_only=True):
     """A `model` by its name, or by `package.module:Name`, and its `parameters`.
 
     An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
@@ -55,8 +60,12 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     outputs: dict[str, str] = {}
     files: list[str] = []
 
+    def __post_init__(self) -> None:
+        if self.kind != "fmu" and (self.inputs or self.outputs):
+            raise mistake(f"{self.model!r} is no FMU, but has inputs or outputs", 'kind = "fmu", or no such keys')
 
-class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+
+class VehicleTable(Table, frozen=True, kw_only=True):
     """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that vary.
 
     `files` are data files, or folders of them, that a model of your own reads, relative to the study's file.
@@ -68,7 +77,7 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     files: list[str] = []
 
 
-class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Weather(Table, frozen=True, kw_only=True, omit_defaults=False):
     """Weather as data: its `name`, and its effects on the road and on the sensors.
 
     `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose
@@ -85,7 +94,7 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     wet: bool = False
 
 
-class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MetricsTable(Table, frozen=True, kw_only=True):
     """Thresholds of the safety metrics.
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
@@ -98,8 +107,12 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     sampling_interval: PositiveNumber | None = None
     also: list[str] = []
 
+    def __post_init__(self) -> None:
+        if len({*self.also}) < len(self.also):
+            raise mistake(f"also = {self.also}", "each metric once")
 
-class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+
+class SearchTable(Table, frozen=True, kw_only=True):
     """The search: `runs` runs of each of the `algorithms`, each with `evaluations` simulations, in generations of
     `population`; `seed` is the seed of all random numbers.
 
@@ -130,7 +143,7 @@ def label_of(algorithm: str) -> str:
     return algorithm.rpartition(":")[2]
 
 
-class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MatrixTest(Table, frozen=True, kw_only=True):
     """A test of a matrix: its `name`, and a scenario at every combination of the values in `over`, in each of the
     `weathers`.
 
@@ -145,7 +158,7 @@ class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     weathers: list[str | Weather] = []
 
 
-class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RatingTable(Table, frozen=True, kw_only=True):
     """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be simulated here, such
     as glare.
     """
@@ -153,7 +166,7 @@ class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     claims: dict[str, list[str]] = {}
 
 
-class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MatrixTable(Table, frozen=True, kw_only=True):
     """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then
     rates every setting.
 
@@ -164,8 +177,12 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     protocol: Literal["", "euro_ncap_2026"] = ""
     aggregate: Literal["worst"] = "worst"
 
+    def __post_init__(self) -> None:
+        if bool(self.tests) == bool(self.protocol):
+            raise mistake(f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol")
 
-class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+
+class FreeParameter(Table, frozen=True, kw_only=True):
     """A parameter that may change: its bounds `lower` and `upper` in `unit`, and its `meaning`.
 
     The search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown
@@ -179,7 +196,7 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     log: bool = False
 
 
-class RepairTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class RepairTable(Table, frozen=True, kw_only=True):
     """What a repair of the ADS may change and has to keep.
 
     `parameters` may change, by name; a file has them directly under [repair]. Without any, those that come with a
@@ -192,7 +209,7 @@ class RepairTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True,
     benign: list[MatrixTest] = []
 
 
-class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Origin(Table, frozen=True, kw_only=True):
     """Where a study comes from; results do not depend on it.
 
     `called` is the study's path as given on the command line, empty if the study was given by its name; `point` is the
@@ -208,7 +225,7 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     remarks: tuple[str, ...] = ()
 
 
-class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Study(Table, frozen=True, kw_only=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
     `title` is its heading, `weather` a shipped weather by its name, or a table;
@@ -226,8 +243,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
-    # results/manifest.py. Any other new key becomes part of the identity of results: let `evaluation_keys` there omit
-    # its default, so that older results keep their identity.
+    # results/manifest.py. Any other new key becomes part of the identity of results.
     name: Name
     title: str
     scenario: ModelTable
@@ -250,6 +266,25 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     repair: RepairTable = RepairTable()
     origin: Origin = Origin()
 
+    def __post_init__(self) -> None:
+        rows = self.vehicle.characteristics
+        if not rows:
+            raise InputError("", "vehicle.characteristics: none", "at least one")
+        if self.scenario.kind:
+            raise InputError("", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU")
+        check_variation(rows, self.variation, self.correlations)
+        check_constraints(rows, self.constraints)
+        check_limits(rows, self.limits, table="limits.")
+        if len({len(values) for values in self.spread.values()}) > 1 or not all(self.spread.values()):
+            problem = "spread: its lists differ in length or are empty"
+            raise InputError("", problem, "a list for each parameter, all of one length")
+        for name in self.spread:
+            locate_parameter(msgspec.to_builtins(self), name)
+        if 0 in self.published.values():
+            raise InputError("", f"published = {self.published}", "numbers other than 0")
+        if self.rating.claims and not (self.matrix and self.matrix.protocol):
+            raise InputError("", "rating.claims: the study is not rated", "matrix.protocol, or no claims")
+
     @property
     def source(self) -> str:
         """The study's name in errors: its file, or its own name if it has no file."""
@@ -257,16 +292,38 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def tables_of(study: Study) -> Parameters:
-    """A study as plain tables, without its origin and without keys that it does not use."""
+    """A study as plain tables as in a file, without its origin and without defaults."""
     tables: Parameters = msgspec.to_builtins(study)
-    del tables["origin"]
-    for name in ("constraints", "limits", "repair"):
-        if not tables[name]:
-            del tables[name]  # so that results from before these tables existed stay the same bytes
-    for name in ("ads", "scenario"):
-        if tables[name]["kind"] != "fmu":
-            tables[name] = {key: value for key, value in tables[name].items() if key not in FMU_KEYS[1:]}
-    return tables
+    return {name: value for name, value in tables.items() if name != "origin" and value != {}}
+
+
+def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
+    """The table or list that holds a parameter of a study, and the parameter's key or index in it.
+
+    Raises
+    ------
+    InputError
+        If the study has no such number.
+    """
+    *path, last = name.split(".")
+    table = tables
+    try:
+        for key in path:
+            table = table[_key_or_index(table, key)]
+        key_or_index = _key_or_index(table, last)
+        is_number = isinstance(table[key_or_index], int | float)
+    except (KeyError, IndexError, ValueError, TypeError):
+        is_number = path[:1] == ["weather"] and isinstance(tables["weather"], str)  # a shipped one, looked up later
+        key_or_index = last
+    if not (is_number and name.startswith(SPREAD_TABLES)):
+        expected = f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in SPREAD_TABLES)}"
+        raise InputError("study", f"spread.{name!r} is no parameter of the study", expected)
+    return table, key_or_index
+
+
+def _key_or_index(table: Any, name: str) -> int | str:
+    """The key in a table, or the index in a list; an index has one spelling, so that each parameter has one name."""
+    return int(name) if isinstance(table, list) and name == str(int(name)) else name
 
 
 StudyLike = str | Path | Tables | Study

@@ -255,10 +255,10 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
 @pytest.mark.parametrize(
     ("keys", "value", "told"),
     [
-        ("study", None, "'study' is a required property"),
+        ("study", None, "study is missing"),
         ("versions", None, "'versions'"),
         ("versions.safevar_sumo", 3, "versions.safevar_sumo = 3"),
-        ("study.vehicle", None, "study: 'vehicle' is a required property"),
+        ("study.vehicle", None, "study: vehicle is missing"),
         ("study.ads", 3, "study.ads = 3"),
         ("study.search.algorithms", [None], "study.search.algorithms[0] = None"),
         ("study.vehicle.characteristics.mass.lower", "x", "study.vehicle.characteristics.mass.lower = 'x'"),

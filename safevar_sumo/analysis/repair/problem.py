@@ -20,7 +20,7 @@ from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
-from safevar_sumo.study.characteristics import limit_mistakes
+from safevar_sumo.study.characteristics import check_limits
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import FeasibleRegion
 
@@ -80,8 +80,7 @@ class Promise:
         if list(texts) == [ALL] or (not texts and stated == ALL):
             return cls(region, everything.lower, everything.upper)
         of_study = stated if stated and isinstance(stated, dict) else study.limits
-        for mistake in limit_mistakes(study.source, rows, of_study, "repair.promise."):
-            raise mistake
+        check_limits(rows, of_study, study.source, "repair.promise.")
         limits = limits_of(texts, rows, None if texts else of_study, "promise")
         if not limits:
             raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
