@@ -36,7 +36,6 @@ from .replay.comparison import Comparison as Comparison, compare_with_original a
 from .replay.figure import draw_comparison as draw_comparison
 from .replay.gui import show_in_gui as show_in_gui
 from .report import report as report
-from .results import Status as Status, status as status
 from .study import Study as Study, StudyLike as StudyLike, Weather as Weather, study_names as study_names
 from .terminal import Progress as Progress
 

@@ -60,7 +60,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     help="The original vehicle's metrics.  [default: those published for STUDY]",
 )
 def import_command(study: str, out: Path, original: str | None, **files: Path | None) -> None:
-    """Import published CSV solutions of STUDY as a results directory, or add another algorithm's solutions to it."""
+    """Import published CSV solutions of STUDY as a results directory, in place of an earlier import."""
     metrics = None if original is None else read_metrics(original)
     solutions = import_published(study, out, original=metrics, **files).solutions
     counts = ", ".join(f"{count} of {name}" for name, count in solutions["algorithm"].value_counts().items())

@@ -20,9 +20,9 @@ from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
 from safevar_sumo.cli.program import commands, print_json, print_remarks, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.records import JsonObject, Outcome, finite_or_none
+from safevar_sumo.results import evaluations_frame, failure_lines, record, solutions_frame
+from safevar_sumo.study import Study, label_of, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
 
@@ -146,14 +146,33 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def status(directory: str, as_json: bool) -> None:
     """Show the progress of the study in DIR, without disturbing it: runs, evaluations, collisions."""
-    from safevar_sumo.results import status as read_status
+    from safevar_sumo.results import load_runs
 
-    progress, console = read_status(directory), Console()
+    results = load_runs(directory)
+    study, finished = results.manifest["study"], Counter(algorithm for algorithm, _ in results.finished)
+    if "imported" in results.manifest:
+        raise InputError(directory, "holds imported solutions, which have no runs", "results of the command `study`")
+    rows = {
+        algorithm: {
+            "finished": finished[algorithm],
+            "runs": study["search"]["runs"],
+            "simulated": len(group),
+            "collisions": int((group["outcome"] == Outcome.COLLISION).sum()),
+            "simulator_errors": int((group["outcome"] == Outcome.SIMULATOR_ERROR).sum()),
+            "best": finite_or_none(group["f_safe"].min()),
+        }
+        for algorithm in map(label_of, study["search"]["algorithms"])
+        for group in [results.evaluations[results.evaluations["algorithm"] == algorithm]]
+    }
     if as_json:
-        print_json(progress.record())
+        print_json({"study": study["name"], "evaluations": study["search"]["evaluations"], "algorithms": rows})
         return
-    console.print(_status_table(progress))
-    print_text(console, "Finished." if progress.finished else f"{progress.share:.0%} done.")
+    heads = ("finished\nruns", "runs", "simulated", "collisions", "simulator\nerrors", "best\nSD")
+    table = WholeTable("algorithm", right=heads, title=study["title"])
+    for algorithm, row in rows.items():
+        *counts, best = row.values()
+        table.add_row(algorithm, *map(str, counts), two_decimals(best))
+    Console().print(table)
 
 
 SAFETY_NOTE = (
@@ -234,22 +253,4 @@ def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) ->
     table.add_row("collisions simulated", *(str(simulated[name]) for name in frames))
     for metric in campaign.scoring.metrics:
         table.add_row(f"mean {metric.heading}", *(two_decimals(frame[metric.name].mean()) for frame in frames.values()))
-    return table
-
-
-def _status_table(progress: Status) -> WholeTable:
-    """The study's runs by algorithm."""
-    table = WholeTable(
-        "algorithm",
-        right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
-        title=progress.title,
-    )
-    for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
-        runs = [run for run in progress.runs if run.algorithm == algorithm]
-        states = Counter(run.state for run in runs)
-        counts = np.sum([(run.simulated, run.collisions, run.simulator_errors) for run in runs], axis=0)
-        best = min((run.best for run in runs if run.best is not None), default=None)
-        table.add_row(
-            algorithm, f"{states['finished']}/{len(runs)}", str(states["begun"]), *map(str, counts), two_decimals(best)
-        )
     return table

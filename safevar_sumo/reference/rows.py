@@ -18,7 +18,7 @@ from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
-from safevar_sumo.results import MANIFEST, UNKNOWN, write_imported
+from safevar_sumo.results import UNKNOWN, write_imported
 from safevar_sumo.study import SAFETY_DEGREE, StudyLike, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -157,7 +157,7 @@ def import_published(
     safe_fuzzer: str | Path | None = None,
     original: Mapping[str, float] | None = None,
 ) -> Results:
-    """Import published CSV solutions of a study as a results directory, or add another algorithm's solutions to it.
+    """Import published CSV solutions of a study as a results directory, in place of an earlier import.
 
     Parameters
     ----------
@@ -168,8 +168,7 @@ def import_published(
     nsga2, rs, safe_fuzzer
         Files with the solutions of NSGA-II, random search and SafeFuzzer.
     original
-        The original vehicle's metrics, such as {"safety_degree": 2.7}; by default those of earlier imports into the
-        directory, or else those published for the study.
+        The original vehicle's metrics, such as {"safety_degree": 2.7}; by default those published for the study.
 
     Raises
     ------
@@ -181,18 +180,15 @@ def import_published(
     files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
-    metrics = None
-    if original is not None or not (directory / MANIFEST).exists():
-        metrics = {name: {**loaded_study.published, **(original or {})}.get(name) for name in METRICS}
-        if metrics[SAFETY_DEGREE] is None:
-            problem = "the study has no published values of the original vehicle"
-            raise InputError(study, problem, "them as `original`, at least the safety degree")
+    metrics = {name: {**loaded_study.published, **(original or {})}.get(name) for name in METRICS}
+    if metrics[SAFETY_DEGREE] is None:
+        problem = "the study has no published values of the original vehicle"
+        raise InputError(study, problem, "them as `original`, at least the safety degree")
     characteristics = CharacteristicSet.of(loaded_study)
     solutions = {
         algorithm: evaluations_of(read_reference(path, characteristics), characteristics)
         for algorithm, path in files.items()
     }
     names = {algorithm: path.name for algorithm, path in files.items()}
-    for name, count in write_imported(directory, loaded_study, solutions, metrics, names).items():
-        warn(f"{directory}: {count} solutions of {name} of an earlier import are replaced")
+    write_imported(directory, loaded_study, solutions, metrics, names)
     return load(directory)

@@ -8,16 +8,13 @@ from safevar_sumo.results.journal import (
 from safevar_sumo.results.load import (
     CHOICES as CHOICES,
     Failure as Failure,
-    RunStatus as RunStatus,
     SolutionId as SolutionId,
-    Status as Status,
     StoredResults as StoredResults,
     choose_handle as choose_handle,
     failure_lines as failure_lines,
     handles_of as handles_of,
     load_runs as load_runs,
     row_of_handle as row_of_handle,
-    status as status,
 )
 from safevar_sumo.results.manifest import (
     FILES as FILES,

@@ -1,11 +1,12 @@
-"""Reads results without SUMO: as tidy frames, and as the progress of a study; and finds single solutions, by their
-handles or by a choice such as the most severe one.
+"""Reads results without SUMO, as tidy frames; and finds single solutions, by their handles or by a choice such as the
+most severe one.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results.journal import JournalContent, journal_head, read_journal
+from safevar_sumo.results.journal import journal_head, read_journal
 from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
@@ -72,75 +73,6 @@ class StoredResults(NamedTuple):
     failures: tuple[Failure, ...] = ()
 
 
-class RunStatus(NamedTuple):
-    """Progress of one run.
-
-    `state` is waiting, begun or finished. `simulated`, `collisions` and `simulator_errors` are numbers of distinct
-    settings: all, those that collided, and those that failed. `best` is the lowest safety degree: a distance [m] or
-    minus a collision speed [m/s], None before the first simulation.
-    """
-
-    algorithm: str
-    run: int
-    state: str
-    simulated: int
-    collisions: int
-    simulator_errors: int
-    best: float | None
-
-
-class Status(NamedTuple):
-    """Progress of a study.
-
-    `budget` is the largest number of evaluations of a run.
-    """
-
-    study: str
-    title: str
-    budget: int
-    runs: tuple[RunStatus, ...]
-
-    @property
-    def finished(self) -> bool:
-        return all(run.state == "finished" for run in self.runs)
-
-    @property
-    def simulated(self) -> int:
-        """Settings simulated in all runs."""
-        return sum(run.simulated for run in self.runs)
-
-    @property
-    def share(self) -> float:
-        """Share of the work that is done; a finished run counts with its whole budget."""
-        done = sum(self.budget if run.state == "finished" else min(run.simulated, self.budget) for run in self.runs)
-        return done / max(self.budget * len(self.runs), 1)
-
-    def record(self) -> JsonObject:
-        """The object that `status --json` prints."""
-        return {
-            "study": self.study,
-            "finished": self.finished,
-            "share": self.share,
-            "simulated": self.simulated,
-            "budget": self.budget,
-            "runs": [run._asdict() for run in self.runs],
-        }
-
-
-def _read_search(folder: Path, manifest: JsonObject) -> tuple[list[tuple[str, int, JournalContent | None]], int]:
-    """Every run's algorithm, number, and journal's content (None without a journal); and the runs' budget
-    [evaluations].
-    """
-    search, digest = manifest["study"]["search"], identity_digest(manifest)
-    characteristics, runs = manifest["study"]["vehicle"]["characteristics"], []
-    for algorithm in dict.fromkeys(map(label_of, search["algorithms"])):
-        for run in range(search["runs"]):
-            path = journal_file(folder, run_name(algorithm, run))
-            content = read_journal(path, journal_head(digest, path.stem, characteristics)) if path.exists() else None
-            runs.append((algorithm, run, content))
-    return runs, search["evaluations"]
-
-
 def load_runs(directory: str | Path) -> StoredResults:
     """Read the runs and evaluations of a results directory's study, which may be unfinished.
 
@@ -156,10 +88,13 @@ def load_runs(directory: str | Path) -> StoredResults:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
     evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], list[int](), list[Failure]()
-    runs, budget = _read_search(folder, manifest)
-    for algorithm, run, content in runs:
-        if content is None:
+    search, digest = manifest["study"]["search"], identity_digest(manifest)
+    budget = search["evaluations"]
+    for algorithm, run in product(dict.fromkeys(map(label_of, search["algorithms"])), range(search["runs"])):
+        path = journal_file(folder, run_name(algorithm, run))
+        if not path.exists():
             continue
+        content = read_journal(path, journal_head(digest, path.stem, characteristics))
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
@@ -175,42 +110,6 @@ def load_runs(directory: str | Path) -> StoredResults:
     return StoredResults(
         manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures)
     )
-
-
-def status(directory: str | Path) -> Status:
-    """Progress of the study in a results directory; a process may be running the study, as nothing is locked or
-    written.
-
-    Raises
-    ------
-    InputError
-        If the directory holds no results or imported solutions, or a journal is damaged or belongs to another study.
-    """
-    folder = Path(directory)
-    manifest = read_manifest(folder)
-    if "imported" in manifest:
-        raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
-    runs, budget = _read_search(folder, manifest)
-    statuses = list[RunStatus]()
-    for algorithm, run, content in runs:
-        if content is None:
-            statuses.append(RunStatus(algorithm, run, "waiting", 0, 0, 0, best=None))
-            continue
-        _, evaluations = content.requested_within(budget)
-        degrees = evaluations.f_safe[evaluations.valid]
-        statuses.append(
-            RunStatus(
-                algorithm,
-                run,
-                "finished" if budget in content.results else "begun",
-                simulated=len(evaluations),
-                collisions=int(np.count_nonzero(evaluations.collided)),
-                simulator_errors=int(np.count_nonzero(evaluations.failed)),
-                best=float(np.min(degrees)) if len(degrees) else None,
-            )
-        )
-    study = manifest["study"]
-    return Status(str(study.get("name")), str(study.get("title")), budget, tuple(statuses))
 
 
 HANDLE_FORMAT = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"

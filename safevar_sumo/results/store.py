@@ -187,75 +187,41 @@ def write_imported(
     path: Path,
     study: Study,
     solutions: Mapping[str, Evaluations],
-    original: Mapping[str, float | None] | None,
+    original: Mapping[str, float | None],
     files: Mapping[str, str],
-) -> dict[str, int]:
-    """Write a results directory of imported solutions; returns the numbers of earlier solutions that they replace, by
-    algorithm.
+) -> None:
+    """Write a results directory of imported solutions, in place of an earlier import.
 
     Parameters
     ----------
     path
-        The directory, made if it does not exist. It keeps solutions of other algorithms from an earlier import of the
-        same study.
+        The directory, made if it does not exist.
     solutions
         Solutions by algorithm.
     original
-        The original vehicle's metrics, by name; None keeps the metrics of an earlier import.
+        The original vehicle's metrics, by name.
     files
         Name of the solutions' file, by algorithm.
 
     Raises
     ------
     InputError
-        If the directory cannot be written, or holds results of a campaign or of another study.
+        If the directory cannot be written, or holds results of a campaign.
     """
-    import pandas as pd
-
     make_directory(path)
-    tables, characteristics = tables_of(study), study.vehicle.characteristics
-    earlier_manifest = _earlier_manifest(path, tables)
-    frame = solutions_frame(
-        characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()]
-    )
-    frame = frame.drop(columns="run")
-    replaced_counts: dict[str, int] = {}
-    if earlier_manifest:
-        stored = read_imported(path, characteristics)
-        is_replaced = stored["algorithm"].isin(list(solutions))
-        replaced_counts = {
-            str(name): int(count) for name, count in stored["algorithm"][is_replaced].value_counts().items()
-        }
-        frame = pd.concat([stored[~is_replaced], frame], ignore_index=True)
-        frame = frame.sort_values(
-            ["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True
-        )
+    if (path / RUNS).exists():
+        raise InputError(path, "holds results of a campaign", "another directory")
+    runs = (((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items())
+    frame = solutions_frame(study.vehicle.characteristics, runs).drop(columns="run")
     manifest: JsonObject = {
         "format": FORMAT,
-        "study": tables,
-        "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
+        "study": tables_of(study),
+        "imported": {"files": dict(files)},
         "versions": {"safevar_sumo": version("safevar_sumo")},
-        "original": dict(earlier_manifest.get("original", {}) if original is None else original),
+        "original": dict(original),
     }
     write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
     write_manifest(path, manifest)
-    return replaced_counts
-
-
-def _earlier_manifest(path: Path, study: JsonObject) -> JsonObject:
-    """The manifest of an earlier import of the study; empty if there is none."""
-    if not (path / RUNS).exists() and not (path / MANIFEST).exists():
-        return {}
-    manifest = read_manifest(path) if (path / MANIFEST).exists() else {}
-    if (path / RUNS).exists() or "imported" not in manifest:
-        raise InputError(path, "holds results of a campaign", "another directory")
-    if manifest["study"] != study:
-        raise InputError(
-            path,
-            f"holds solutions of another study or another version of it, {manifest['study'].get('name')!r}",
-            "another directory",
-        )
-    return manifest
 
 
 def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import safevar_sumo as sv
 from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -25,12 +24,11 @@ from safevar_sumo.results import (
     record,
     row_of_handle,
     solutions_frame,
-    status,
 )
 from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
 from safevar_sumo.study import Study, load_study, tables_of
 from tests.campaign.formulas import with_search
-from tests.in_process import refused, run
+from tests.in_process import json_of, refused, run
 from tests.made_up import made_up_evaluations
 
 NAMES = ("a", "b")
@@ -284,18 +282,16 @@ def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
-def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path, case: Case) -> None:
-    assert sv.status is status
+def test_the_status_of_a_study_agrees_with_its_journals(slippery: Path, case: Case) -> None:
     before = contents(slippery)
-    result = status(slippery)
+    status = json_of("status", str(slippery))
     assert contents(slippery) == before
-    assert result.finished
-    assert result.share == 1
-    assert result.simulated == len(case.evaluations)
-    for one in result.runs:
-        group = case.evaluations.query(f"algorithm == '{one.algorithm}' and run == {one.run}")
-        assert one.collisions == (group["outcome"] == "collision").sum()
-        assert one.best == group["f_safe"].min()
+    assert list(status["algorithms"]) == ["nsga2", "rs"]
+    for algorithm, row in status["algorithms"].items():
+        group = case.evaluations.query(f"algorithm == '{algorithm}'")
+        assert (row["finished"], row["runs"], row["simulated"]) == (1, 1, len(group))
+        assert row["collisions"] == (group["outcome"] == "collision").sum()
+        assert row["best"] == group["f_safe"].min()
 
 
 def test_a_study_under_way(copied: Path) -> None:
@@ -303,12 +299,11 @@ def test_a_study_under_way(copied: Path) -> None:
     rs.unlink()
     (copied / "solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
-    result = status(copied)
-    assert [run.state for run in result.runs] == ["begun", "waiting"]
-    assert 0 < result.runs[0].simulated < 56
-    assert 0 < result.share < 0.5
+    begun, waiting = json_of("status", str(copied))["algorithms"].values()
+    assert (begun["finished"], waiting["finished"], waiting["simulated"], waiting["best"]) == (0, 0, 0, None)
+    assert 0 < begun["simulated"] < 56
     nsga2.write_bytes(nsga2.read_bytes().partition(b"\n")[0] + b"\n")
-    assert [(run.state, run.simulated) for run in status(copied).runs] == [("begun", 0), ("waiting", 0)]
+    assert json_of("status", str(copied))["algorithms"]["nsga2"]["simulated"] == 0
     assert load_cases([copied])[0].evaluations.empty
     assert "collisions" in run("status", str(copied)).stdout
 
