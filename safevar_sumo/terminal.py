@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bar, ProgressColumn, Task, TextColumn
+from rich.progress import BarColumn, Progress as Bar, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -176,6 +176,13 @@ def show_no_progress(stage: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
+class _Count(ProgressColumn):
+    """How much is done of a known total."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if task.total is None else f"{task.completed:.0f}/{task.total:.0f}")
+
+
 class _Pace(ProgressColumn):
     """The mean speed of the stage under way, and the time left at that speed."""
 
@@ -191,6 +198,8 @@ class _Pace(ProgressColumn):
             self._begun = done, self._last
 
     def render(self, task: Task | None = None) -> Text:
+        if not self._total:
+            return Text("")
         done_before, start = self._begun or (0, 0.0)
         done, worked = self._done - done_before, self._last - start
         if done <= 0 or worked < SETTLING_TIME:
@@ -206,20 +215,20 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         yield progress or show_no_progress
         return
     console = console or Console(stderr=True)
-    pace, ended, line = _Pace(), Event(), "starting"
+    pace, ended, line = _Pace(), Event(), "searching"
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal line
-        line = f"{stage}: {done} of {total}"
+        line = f"{stage}: {done} of {total}, "
         pace.update(done, total)
         bar.update(task, description=stage, completed=done, total=total)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(console, f"{line}, {pace.render()}")
+            print_text(console, f"{line}{pace.render()}")
 
     stage = TextColumn("{task.description}", markup=False)
-    columns = (stage, BarColumn(bar_width=None), MofNCompleteColumn(), pace)
+    columns = (stage, BarColumn(bar_width=None), _Count(), pace)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(line, total=None)

@@ -217,3 +217,11 @@ def test_on_a_terminal_all_fits_in_its_line(width: int, clock: list[float]) -> N
     last = [line for line in lines if "rain" in line][-1]
     assert re.fullmatch(r"rain: 1/6 runs, evaluations [━╸╺ ]+ 800/6000 10/s, 0:08:30 left", last)
     assert max(map(len, lines)) <= width
+
+
+def test_before_a_total_is_known_a_terminal_says_searching() -> None:
+    out = StringIO()
+    with open_progress(True, Console(file=out, force_terminal=True, width=80, _environ={})):
+        pass
+    last = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue()).splitlines()[-1].rstrip()
+    assert re.fullmatch(r"searching [━╸╺ ]+", last)
