@@ -66,7 +66,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         if table not in ALGORITHMS and table not in search.labels:
             legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
             raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
-    lookup = Lookup(source, study.origin.places)
+    lookup = Lookup.of(study)
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
     parameters = lookup.with_paths(member, search.parameters.get(label, {}), key)
     algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)

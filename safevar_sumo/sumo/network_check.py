@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -105,36 +105,26 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     return remarks
 
 
-def _refuse(file: Path, legal: str, problems: Mapping[str, bool]) -> None:
-    """Raise an `InputError` for the first problem that is true."""
-    for problem, is_true in problems.items():
-        if is_true:
-            raise InputError(file, problem, legal)
-
-
 @lru_cache(maxsize=100)
 def _check_files(network: Network) -> None:
     options = {"step-length": "1", "route-files": TRAFFIC_FILE, **options_of(network.path(OPTIONS_FILE))}
-    is_illegal = {
-        "step-length": not SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP,
-        "remote-port": "remote-port" in options,  # SUMO would wait for a client
-        "route-files": options["route-files"] != TRAFFIC_FILE,
-    }
-    problems = {f"{name} = {options.get(name)!r}": is_true for name, is_true in is_illegal.items()}
-    _refuse(network.path(OPTIONS_FILE), LEGAL_OPTIONS, problems)
+    is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
+    if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
+        names = ("remote-port", "step-length", "route-files")  # SUMO would wait for a client at the port
+        stated = ", ".join(f"{name} = {options[name]!r}" for name in names if name in options)
+        raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>')
     routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
-    subject, others_have_its_type = f"vehicle {VUT!r}:", len(traffic.findall(f"*[@type='{VUT}']")) > 1
-    problems = {
-        f"{subject} type = {vut.get('type')!r}": vut.get("type") != VUT or others_have_its_type,
-        f"{subject} depart = {vut.get('depart')!r}": parse_seconds(vut.get("depart", "")) != 0,
-        f"{subject} has a stop": any(route.find("stop") is not None for route in routes),
-    }
-    _refuse(file, LEGAL_VUT, problems)
+    type_name, depart = vut.get("type"), vut.get("depart", "")
+    others = sum(actor is not vut and actor.get("type") == VUT for actor in traffic)
+    has_stop = any(route.find("stop") is not None for route in routes)
+    if type_name != VUT or others or parse_seconds(depart) != 0 or has_stop:
+        problem = f"vehicle {VUT!r}: type = {type_name!r} (of {others} others), depart = {depart!r}"
+        raise InputError(file, f"{problem}, has {'a stop' if has_stop else 'no stop'}", LEGAL_VUT)
     _check_lanes(file, routes, parse_xml(built_network(network)))
     _refuse_random_types(file, traffic)
     _warnings_file(network)
@@ -148,8 +138,8 @@ def _check_lanes(file: Path, routes: Iterable[ElementTree.Element], roads: Eleme
         heights = [float(z) for _, _, z, *_ in coordinates]
         climb, friction = max(heights, default=0.0) - min(heights, default=0.0), float(lane.get("friction", 1))
         problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
-        is_illegal = climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1
-        _refuse(file, LEGAL_ROAD, {f"vehicle {VUT!r} {problem}": is_illegal})
+        if climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1:
+            raise InputError(file, f"vehicle {VUT!r} {problem}", LEGAL_ROAD)
 
 
 def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
@@ -159,9 +149,9 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
         model, speed_dev = vtype.get("carFollowModel", "Krauss"), vtype.get("speedDev", "0.1")
         sigma = vtype.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
         problem = f"vType {vtype.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}"
-        is_random = float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS)
-        legal = f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}'
-        _refuse(file, legal, {problem: bool(is_random)})
+        if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):
+            legal = f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}'
+            raise InputError(file, problem, legal)
 
 
 def _warnings_file(network: Network) -> Path:

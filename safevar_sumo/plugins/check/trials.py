@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.plugins import Lookup, instance_of
-from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, Results, differences
+from safevar_sumo.records import ROUNDING, FloatArray, Results, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import Engine, is_recorded
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
@@ -65,7 +65,7 @@ def try_simulations(study: Study) -> Iterator[Failure]:
 
 
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
-    """Let an algorithm minimise a smooth function in place of simulations, twice, the second time after another run."""
+    """Let an algorithm search twice, the second time after another run."""
     outputs, repeated = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
@@ -122,16 +122,14 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns;
     shape (k, n).
     """
-    system, lookup, label = assemble(study), Lookup.of(study), name.rpartition(":")[2]
+    system, lookup, label = _system(study), Lookup.of(study), label_of(name)
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
     parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
-    original = _smooth_evaluations(system, system.characteristics.original[np.newaxis])
     problem = Problem(
         characteristics=system.characteristics,
-        original=original,
+        original=evaluate(system, system.characteristics.original[np.newaxis]),
         population=min(study.search.population, MAX_POPULATION),
         evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
-        scoring=system.measuring.scoring,
         region=system.region,
     )
     for seed in seeds:
@@ -140,26 +138,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         try:
             settings.append(next(search))
             while True:
-                settings.append(search.send(_smooth_evaluations(system, settings[-1])))
+                settings.append(search.send(evaluate(system, settings[-1])))
         except StopIteration as end:
             settings.append(end.value.settings)
     return np.concatenate(settings)
-
-
-def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
-    """Evaluations in which the safety degree falls from 1 at the lower ends of the domains to -0.5 at the upper
-    ends.
-    """
-    characteristics, scoring = system.characteristics, system.measuring.scoring
-    share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
-    safety_degree = 1.0 - 1.5 * share.mean(axis=1)
-    names = {metric.name for metric in scoring.metrics} | {objective.name for objective in scoring.objectives}
-    metrics = (name for name in names if not name.startswith("f_"))  # without f_diff and f_num_diff
-    return Evaluations(
-        settings=settings,
-        outcome=np.where(safety_degree < 0, "collision", "stopped").astype("U16"),
-        metrics=dict.fromkeys(sorted(metrics), np.abs(safety_degree)) | {"safety_degree": safety_degree},
-        collision_speed=np.where(safety_degree < 0, -safety_degree, np.nan),
-        f_diff=characteristics.largest_change(settings),
-        f_num_diff=characteristics.number_changed(settings),
-    )
