@@ -42,10 +42,6 @@ CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
 a safety degree.
 """
-MAX_REJECTIONS = 64
-"""Maximum number of points drawn for each feasible setting; mixtures of the feasible region's vertices replace those
-that are still missing.
-"""
 
 
 class Evaluator:
@@ -117,7 +113,7 @@ class Evaluator:
 
         With `feasible_after_filter`, they are also feasible after the filter.
         """
-        rng, drawn = np.random.default_rng(seed), 0
+        drawn = 0
 
         def draw_next(count: int) -> FloatArray:
             """The next `count` settings of the Sobol sequence."""
@@ -125,21 +121,15 @@ class Evaluator:
             drawn += count
             return sobol_settings(self.characteristics, drawn, seed)[-count:]
 
-        return self.region.draw_feasible(
-            draw_next, number, rng, filtered=feasible_after_filter, rejections=MAX_REJECTIONS
-        )
+        return self.region.draw_feasible(draw_next, number, filtered=feasible_after_filter)
 
     def random_settings(self, number: int) -> FloatArray:
-        """The first `number` random vehicles of the study, uniform over the feasible part of the domain (where hardly
-        any setting is feasible, mixtures of its corners fill up); `risk` draws the same ones.
+        """The first `number` random vehicles of the study, uniform over the feasible part of the domain; `risk`
+        draws the same ones.
         """
-        bounds, seed = self.characteristics, self.study.search.seed
-        rng = np.random.default_rng(seed)
+        bounds, rng = self.characteristics, np.random.default_rng(self.study.search.seed)
         return self.region.draw_feasible(
-            lambda count: bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower),
-            number,
-            np.random.default_rng(seed),
-            rejections=MAX_REJECTIONS,
+            lambda count: bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower), number
         )
 
     def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:

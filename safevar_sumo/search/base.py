@@ -43,7 +43,7 @@ class Problem:
         def draw(count: int) -> FloatArray:
             return rng.uniform(lower, upper, (count, len(lower)))
 
-        return self.region.draw_feasible(draw, number, rng, filtered=True) if self.region else draw(number)
+        return self.region.draw_feasible(draw, number, filtered=True) if self.region else draw(number)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape (k,)."""

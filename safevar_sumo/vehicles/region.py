@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,14 +21,8 @@ REJECTIONS = 1000
 """Maximum number of settings drawn for each feasible setting."""
 LARGEST_DRAW = 10_000
 """Largest number of settings that are drawn at once, unless more are missing."""
-MIXTURE_CONCENTRATION = 0.5
-"""Concentration of the weights of vertices in a mixture: below 1, few vertices have most of the weight."""
-N_PROBES = 512
-"""Number of random settings among which a feasible change is sought, besides vertices of the region and ends of the
-domains.
-"""
-MEAN_CHANGES = 2
-"""Mean number of changes in a sparse setting; other random settings change every characteristic."""
+N_PROBES, LEAST_SHARE = 10_000, 0.002
+"""Number of random settings of which at least this share has to be feasible, so that random settings can be drawn."""
 
 
 class _Bounds(NamedTuple):
@@ -78,14 +71,10 @@ class _Bounds(NamedTuple):
 
 @dataclass(frozen=True)
 class FeasibleRegion:
-    """Settings that satisfy all constraints of a study; without constraints, all settings.
-
-    `vertices`, shape (V, n), are vertices of the polytope of the linear constraints; none without such constraints.
-    """
+    """Settings that satisfy all constraints of a study; without constraints, all settings."""
 
     characteristics: CharacteristicSet
     bounds: tuple[_Bounds, ...]
-    vertices: FloatArray
 
     def __bool__(self) -> bool:
         return bool(self.bounds)
@@ -139,31 +128,15 @@ class FeasibleRegion:
             infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered)]
         return repaired
 
-    def draw_feasible(
-        self,
-        draw: Callable[[int], FloatArray],
-        number: int,
-        rng: np.random.Generator | None = None,
-        *,
-        filtered: bool = False,
-        rejections: int = REJECTIONS,
-    ) -> FloatArray:
+    def draw_feasible(self, draw: Callable[[int], FloatArray], number: int, *, filtered: bool = False) -> FloatArray:
         """The first `number` feasible settings that `draw` draws, shape (number, n); if `filtered`, feasible after the
-        filter.
-
-        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices and the original fill
-        the rest; without `rng`, fewer settings are returned.
+        filter. They are fewer if `REJECTIONS` draws for each do not suffice.
         """
         batches, draws = [np.zeros((0, len(self.characteristics)))], 0
-        while (shortage := number - sum(map(len, batches))) and draws < rejections * number:
+        while (shortage := number - sum(map(len, batches))) and draws < REJECTIONS * number:
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))  # as many as all draws before
             draws += len(settings)
             batches.append(settings[self._are_accepted(settings, filtered)][:shortage])
-        if shortage and rng is not None:
-            corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
-            weights = rng.dirichlet(np.full(len(corners), MIXTURE_CONCENTRATION), shortage)
-            mixtures = np.clip(weights @ corners, self.characteristics.lower, self.characteristics.upper)
-            batches.append(self.repaired(mixtures, filtered=filtered))
         return np.concatenate(batches)
 
     def _are_accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
@@ -176,69 +149,21 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     Raises
     ------
     InputError
-        If the original vehicle or every change is infeasible.
+        If the original vehicle or nearly every other setting is infeasible.
     """
-    source = source or study.source
-    characteristics = CharacteristicSet.of(study)
-    if not study.constraints:
-        return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
+    source, characteristics = source or study.source, CharacteristicSet.of(study)
     bounds = tuple(_Bounds.of(constraint, study, characteristics) for constraint in study.constraints)
-    linear = [
-        (tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
-        for bound in bounds
-    ]
-    domain_ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
-    vertices = _vertices(tuple(linear), *domain_ends)
-    if vertices is None:
-        raise InputError(
-            source,
-            f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
-            "constraints that leave a region, with the original in it",
-        )
-    region = FeasibleRegion(characteristics, bounds, vertices)
+    region = FeasibleRegion(characteristics, bounds)
+    if not bounds:
+        return region
     region.check(
         characteristics.original[np.newaxis],
         f"{source}: the original vehicle",
         otherwise="; the original vehicle must satisfy every constraint",
     )
-    candidates = characteristics.filter(_candidate_changes(region))
-    if not (characteristics.changed(candidates).any(axis=1) & region.feasible(candidates)).any():
-        raise InputError(
-            source,
-            f"constraints leave only the original vehicle, as no feasible change passes the filter: {region}",
-            "constraints that leave a region around the original",
-        )
+    shape = (N_PROBES, len(characteristics))
+    probes = np.random.default_rng(0).uniform(characteristics.lower, characteristics.upper, shape)
+    if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:
+        problem = f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them: {region}"
+        raise InputError(source, problem, "narrower domains, or constraints that leave more than an equation does")
     return region
-
-
-@lru_cache(maxsize=16)
-def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
-    """Settings with the least and with the greatest value of each characteristic under the linear constraints.
-
-    None if no setting satisfies the constraints.
-    """
-    from scipy.optimize import linprog  # loading takes half a second
-
-    inequalities = [
-        (sign * np.array(weights), sign * limit)
-        for weights, minimum, maximum in linear
-        for sign, limit in ((-1, minimum), (1, maximum))
-        if np.isfinite(limit)
-    ]
-    left, right = map(np.array, zip(*inequalities, strict=True))
-    goals = (sign * goal for goal in np.eye(len(lower)) for sign in (1.0, -1.0))
-    results = [linprog(goal, left, right, bounds=np.transpose([lower, upper]), method="highs") for goal in goals]
-    if not all(result.success for result in results):
-        return None
-    return np.asarray(np.clip([result.x for result in results], lower, upper))
-
-
-def _candidate_changes(region: FeasibleRegion) -> FloatArray:
-    """Settings among which a feasible change is sought: vertices, ends of the domains, and random settings."""
-    characteristics, original = region.characteristics, region.characteristics.original
-    lower, upper, size = characteristics.lower, characteristics.upper, len(characteristics)
-    ends = [np.where(np.eye(size, dtype=bool), end, original) for end in (lower, upper)]
-    rng = np.random.default_rng(0)
-    probes = rng.uniform(lower, upper, (N_PROBES, size))
-    sparse_probes = np.where(rng.random((N_PROBES, size)) < MEAN_CHANGES / size, probes, original)
-    return np.concatenate([region.vertices, *ends, region.repaired(np.concatenate([probes, sparse_probes]))])

@@ -10,7 +10,7 @@ import pandas as pd
 from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.compare.answer import Side, SystemComparison
-from safevar_sumo.analysis.evaluator import MAX_REJECTIONS, Evaluator, sobol_points
+from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
 from safevar_sumo.analysis.rating.compute import rate
 from safevar_sumo.analysis.repair.price import benign_scenes, needless_braking
 from safevar_sumo.analysis.research_questions.changes import compare_weathers
@@ -26,6 +26,8 @@ from safevar_sumo.results import handles_of
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.system import assemble
 
+MAX_FACTOR = 512
+"""Largest number of settings that are drawn for each common one that satisfies the constraints."""
 SAMPLE = "sample"
 """Source of the settings of the common sample."""
 RUN_COLUMNS = ["source", "algorithm", "run"]
@@ -166,7 +168,7 @@ def _common_sample(
         for evaluator, order in zip(evaluators, orders, strict=True):
             if evaluator.region:
                 settings = settings[evaluator.region.feasible(settings[:, order])]
-        if len(settings) >= number or factor >= MAX_REJECTIONS:
+        if len(settings) >= number or factor >= MAX_FACTOR:
             return settings[:number]
         factor *= 2
 

@@ -208,8 +208,6 @@ def find_rules(source: Study | Case, options: RulesOptions, evaluator: Evaluator
     characteristics, unsafe = evaluator.characteristics, evaluator.choose_criterion(options.unsafe, source)
     evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
     rows = np.arange(len(evaluations))
-    if evaluator.region:  # where hardly any setting is feasible, the last ones are mixtures of corners
-        rows = np.random.default_rng(evaluator.study.search.seed).permutation(rows)
     training, validation = (
         evaluations.take(half[evaluations.valid[half]]) for half in np.split(rows, [len(rows) // 2])
     )
