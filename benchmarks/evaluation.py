@@ -18,10 +18,12 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
 from functools import partial
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import libsumo
 import numpy as np
+import sumo
 import traci
 from measuring import Record, clock_seconds, medians_in_turn, print_records, processor_seconds
 
@@ -30,7 +32,7 @@ from safevar_sumo.plugins import Guard
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import drive
-from safevar_sumo.sumo.engine import Engine, open_world, sumo_command
+from safevar_sumo.sumo.engine import open_world, sumo_options
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.system import System, assemble
@@ -153,7 +155,8 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     n, few = len(settings), settings[:SOCKET_SETTINGS]
     scalar = replace(system, ads=PerVehicleAds(Coasting, Guard("benchmark", "ads")))
     evaluate(system, settings)
-    command = sumo_command(Engine.TRACI, copied_network(stage_network(system.points[0].scenario), 1))
+    program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo")
+    command = [program, *sumo_options(copied_network(stage_network(system.points[0].scenario), 1))]
     with socket_to(command):
         through_socket(system, few[:1], command)
         together, alone, coasting, socket = medians_in_turn(

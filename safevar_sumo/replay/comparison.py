@@ -23,6 +23,7 @@ from safevar_sumo.sumo.copies import copy_and_name
 from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
 from safevar_sumo.sumo.network import Network, built_network, stage_network
 from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.verification import drive_again
 from safevar_sumo.sumo.world import SumoWorld
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -207,14 +208,15 @@ ABSENT = (np.nan, np.nan, np.nan)
 
 
 def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, ActorTrack]]:
-    """Simulate N settings, shape (N, n), and record the tracks of all actors by name, in alphabetical order."""
+    """Simulate N settings, shape (N, n), and record in SUMO how all actors move, by name in alphabetical order."""
     frames, sizes = list[dict[str, tuple[float, float, float]]](), dict[str, tuple[bool, float, float]]()
 
     def record(world: SumoWorld) -> None:
         frames.append(world.actor_poses())
         sizes.update({actor: world.actor_size(actor) for actor in frames[-1].keys() - sizes.keys()})
 
-    runs, tracks = simulate(system, settings, watch=record), dict[str, ActorTrack]()
+    runs, tracks = simulate(system, settings), dict[str, ActorTrack]()
+    drive_again(system, settings, runs, record)
     for actor in sorted(sizes):
         copy, name = copy_and_name(actor)
         absent = np.full((3, len(frames), len(settings)), np.nan)

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from safevar_sumo.errors import SimulationError
 from safevar_sumo.replay.animation import ACTOR_COLOUR, PATH_COLOUR, PERSON_COLOUR, ROAD_COLOUR
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 from safevar_sumo.replay.scene import LANE_KINDS, FlatBody, FlatScene, lane_outlines, lay_out_scene
-from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
+from safevar_sumo.sumo.engine import open_window
 from safevar_sumo.sumo.network import Network, copied_network
 from safevar_sumo.sumo.world import Api
 
@@ -99,7 +98,6 @@ def show_in_gui(
 @contextmanager
 def _open_window(network: Network, step: float) -> Iterator[Api]:
     """Open a window on one copy of a network without traffic; yields TraCI."""
-    api = engine_api(Engine.GUI)
     with tempfile.TemporaryDirectory() as folder:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
@@ -117,9 +115,7 @@ def _open_window(network: Network, step: float) -> Iterator[Api]:
             "--xml-validation": "never",
             "--xml-validation.net": "never",
         }
-        try:
-            command = [program_path(Engine.GUI), *(str(text) for item in options.items() for text in item)]
-            start_engine(api, Engine.GUI, command)
+        with open_window(options) as api:
             lane = next(
                 lane
                 for lane in api.lane.getIDList()
@@ -127,10 +123,6 @@ def _open_window(network: Network, step: float) -> Iterator[Api]:
             )
             api.route.add("route", [api.lane.getEdgeID(lane)])
             yield api
-        except (api.TraCIException, api.FatalTraCIError) as error:
-            raise SimulationError(f"sumo-gui failed: {str(error).strip() or 'its window was closed'}") from None
-        finally:
-            stop_engine(api)
 
 
 def _road_origin(scene: FlatScene, row: int) -> tuple[float, float]:

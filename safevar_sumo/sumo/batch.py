@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.ads import Ads
 from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
@@ -28,19 +30,19 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import VUT, Lane, Point, Scene
 from safevar_sumo.scenarios.base import Frame
+from safevar_sumo.scenarios.target import TargetTest
+from safevar_sumo.sumo.bodies import Contacts, Motion, World
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
-from safevar_sumo.sumo.perception import Perception, encounter_of, observer_of, per_vehicle
-from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld
-from safevar_sumo.sumo.recording import Recording, record_scenes
+from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, TargetObserver, encounter_of, per_vehicle
+from safevar_sumo.sumo.recorded_world import RecordedWorld
+from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.world import Contacts, SumoWorld
-from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, SumoType, slope_of
+from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
-Watcher = Callable[[SumoWorld], None]
-"""A function that is called with SUMO's world at every sample."""
 Listener = Callable[[Observation], None]
 """A function that is called with what the ADS observes at every sample."""
 
@@ -78,8 +80,7 @@ def reason_for_sumo(system: System) -> str:
     """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded scenes suffice."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
-    scenes_or_reasons = record_scenes([point.scenario for point in system.points], step_options(system))
-    return next((reason for reason in scenes_or_reasons if isinstance(reason, str)), "")
+    return system.scenes.reason_for_sumo(system.points)
 
 
 def is_recorded(system: System, engine: Engine = Engine.RECORDED) -> bool:
@@ -88,13 +89,13 @@ def is_recorded(system: System, engine: Engine = Engine.RECORDED) -> bool:
 
 
 def drive_all(
-    system: System, settings: FloatArray, engine: Engine, watch: Watcher | None = None, listen: Listener | None = None
+    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, listen: Listener | None = None
 ) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
     The result holds the runs at the first point, then the runs at the second point, and so on. Several points must have
-    recorded scenes of one road; SUMO simulates only one point at once. `watch` is called with SUMO's world at every
-    sample, `listen` with what the ADS observes.
+    recorded scenes of one road; SUMO simulates only one point at once. `listen` is called with what the ADS observes
+    at every sample.
 
     Raises
     ------
@@ -103,59 +104,50 @@ def drive_all(
     InputError
         If a user's ADS fails.
     """
+    points, n = system.points, len(settings)
     with user_errors(system.source):
-        return _drive_all(system, settings, engine, watch, listen)
+        if is_recorded(system, engine):
+            scenes = [scene for scene in system.scenes.of(points) if isinstance(scene, Recording)]
+            targets = [point.scenario for point in points if isinstance(point.scenario, TargetTest)]
+            world = RecordedWorld(scenes, n)
+            observer = TargetObserver(targets, scenes, n) if targets else None
+            return drive(system, np.tile(settings, (len(points), 1)), world, observer, listen)
+        with open_points_world(system, n) as sumo_world:
+            return drive(system, settings, sumo_world, listen=listen)
 
 
-def _drive_all(
-    system: System, settings: FloatArray, engine: Engine, watch: Watcher | None, listen: Listener | None
-) -> SimulationRuns:
-    scenarios, options = [point.scenario for point in system.points], step_options(system)
-    if watch is None and is_recorded(system, engine):
-        scenes = record_scenes(scenarios, options)
-        world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
-        return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
-    (scenario,), n = scenarios, len(settings)
-    sumo_engine = Engine.LIBSUMO if engine is Engine.RECORDED else engine
-    with open_world(copied_network(stage_network(scenario), n), n, sumo_engine, options) as sumo_world:
-        return drive(system, settings, sumo_world, watch, listen)
-
-
-def step_options(system: System) -> tuple[str, ...]:
-    """SUMO's options for the study's time step."""
-    return () if system.step_length is None else ("--step-length", repr(system.step_length))
+def open_points_world(system: System, n: int) -> AbstractContextManager[SumoWorld]:
+    """Start SUMO on `n` copies of the network of the system's only point."""
+    (point,) = system.points
+    return open_world(copied_network(stage_network(point.scenario), n), n, system.scenes.options)
 
 
 @np.errstate(all="ignore")
 def drive(
-    system: System,
-    settings: FloatArray,
-    world: DrivenWorld,
-    watch: Watcher | None = None,
-    listen: Listener | None = None,
+    system: System, settings: FloatArray, world: World, observer: Observer | None = None, listen: Listener | None = None
 ) -> SimulationRuns:
-    """Simulate vehicles in an open world that has not taken its first step; see `drive_all`.
+    """Simulate vehicles in a world that has not taken its first step; see `drive_all`.
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
     outcomes = _Outcomes(len(settings))
     with check_open_runs(outcomes.is_checked):
-        return _simulate(system, settings, world, outcomes, watch, listen)
+        return _simulate(system, settings, world, outcomes, observer, listen)
 
 
 def _simulate(
     system: System,
     settings: FloatArray,
-    world: DrivenWorld,
+    world: World,
     outcomes: _Outcomes,
-    watch: Watcher | None,
+    observer: Observer | None,
     listen: Listener | None,
 ) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
-    prepared, types = _insert_vehicles(system, settings, world)
+    prepared, ads, motion = enter(system, settings, world)
+    observer = observer or SceneObserver(system.points[0].scenario, world)
     vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
-    state = vehicle.at_start(prepared, world.speeds())
-    ads, observer = with_tau(system.ads, types.tau), observer_of(system.points, world)
+    state = vehicle.at_start(prepared, motion.speeds)
     ads_memory = ads.start(n, system.nominal, step)
     size = n // len(system.points)
     perception = Perception([point.weather for point in system.points], step, size)
@@ -164,13 +156,10 @@ def _simulate(
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
     for sample in range(log.length):
-        if watch is not None and isinstance(world, SumoWorld):
-            watch(world)
-        speed = world.speeds()
-        scene = observer.observe(outcomes.is_open)
+        speed, scene = motion.speeds, observer.observe(motion, outcomes.is_open)
         if system.sees_nobody:  # the run ends at the place of the encounter
             scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
-        collisions = contacts.record_collisions(world, outcomes.is_open, scene)
+        collisions = contacts.count(world, motion.hits, scene)
         active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_step)
         observation = perception.observe(sample * step, speed, scene)._replace(
             throttle=state.throttle, brake=state.brake
@@ -181,16 +170,13 @@ def _simulate(
         command, ads_memory = ads.drive(observation, ads_memory)
         _note_warnings(warning_ttc, ads.warns(ads_memory), outcomes.is_open, speed, scene)
         command, state = robot.drive(command, state, outcomes.is_open)
-        position = world.vehicle_positions(VUT)
-        log.write(sample, position, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
+        log.write(sample, motion.fronts, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
         if not np.count_nonzero(outcomes.is_open):
             break
-        if watch is None:
-            world.end_runs(outcomes.ended_copies)
         np.copyto(outcomes.is_checked, outcomes.is_open)
         state = vehicle.advance(prepared, state, command)
         _check_finite(state.speed, settings, system.characteristics)
-        world.advance(np.where(outcomes.is_open, state.speed, 0.0))
+        motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
         trace=trace,
@@ -203,18 +189,17 @@ def _simulate(
     )
 
 
-def _insert_vehicles(system: System, settings: FloatArray, world: DrivenWorld) -> tuple[Prepared, SumoType]:
-    """Put the vehicles onto the roads; returns their constants and types."""
+def enter(system: System, settings: FloatArray, world: World) -> tuple[Prepared, Ads, Motion]:
+    """Put the vehicles of settings onto the road; returns their constants, their ADS and their first motion."""
     vehicle, n = system.vehicle, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
-    if isinstance(world, SumoWorld) and isinstance(system.ads, TraciController):
-        world.insert_with_drivers(TraciController.types(system.nominal, types))
-        world.sensors = _sensors_in_weather(system, prepared, n)  # other ADSs get observations
-    else:
-        world.insert(types)
-    return prepared, types
+    ads = with_tau(system.ads, types.tau)
+    if not isinstance(ads, TraciController):
+        return prepared, ads, world.enter(types)
+    motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
+    return prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion
 
 
 def _note_warnings(
@@ -299,13 +284,12 @@ class _Log:
 class _Outcomes:
     """Outcomes of N runs (docs/method.md, section 4).
 
-    `is_open` is true where an outcome can change; `ended_copies` are the runs that ended in this step. `is_checked` is
-    true where user code is checked: in runs that were open when their vehicles last advanced.
+    `is_open` is true where an outcome can change; `is_checked` where user code is checked: in runs that were open when
+    their vehicles last advanced.
     """
 
     def __init__(self, n: int) -> None:
         self.is_open, self.is_checked = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
-        self.ended_copies: list[int] = []
         self.collision_speed = np.full(n, np.nan)
         self._has_moved = np.zeros(n, dtype=bool)
         self._has_stopped = np.zeros(n, dtype=bool)
@@ -315,7 +299,7 @@ class _Outcomes:
         self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool
     ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""
-        was_open, active = self.is_open.copy(), self.is_open & ~over
+        active = self.is_open & ~over
         for copy, collision_speed in collisions.items():
             if self.is_open[copy]:
                 self.collision_speed[copy] = collision_speed
@@ -325,7 +309,6 @@ class _Outcomes:
         self._has_moved |= self.is_open & ~is_standing
         self._is_over |= self.is_open & over
         self.is_open &= ~over & ~np.asarray(last)
-        self.ended_copies = (was_open & ~self.is_open).nonzero()[0].tolist()
         return active
 
     def classify(self) -> npt.NDArray[np.str_]:

@@ -1,7 +1,6 @@
 """Starts and stops SUMO; no other module imports libsumo or traci.
 
-Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo` or `sumo-gui` through a
-socket.
+Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo-gui` through a socket.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
@@ -24,22 +23,17 @@ CONNECTION_ATTEMPTS = 15
 
 
 class Engine(StrEnum):
-    """What moves the vehicles: numpy in recorded scenes (RECORDED), or SUMO.
+    """What moves the vehicles: numpy in recorded scenes, or SUMO in this process.
 
-    SUMO runs in this process (LIBSUMO), in another process (TRACI), or in another process with a window (GUI). If an
-    actor may react to the vehicles, RECORDED is the same as LIBSUMO.
+    If an actor may react to the vehicles, RECORDED is the same as LIBSUMO.
     """
 
     RECORDED = "recorded"
     LIBSUMO = "sumo"
-    TRACI = "traci"
-    GUI = "gui"
 
 
 @contextmanager
-def open_world(
-    files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()
-) -> Iterator[SumoWorld]:
+def open_world(files: CopiedNetwork, n: int, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
     """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an error.
 
     Raises
@@ -47,75 +41,69 @@ def open_world(
     SimulationError
         With SUMO's message, if SUMO cannot load the network or simulate a step.
     """
-    api = engine_api(engine)
+    with redirect_stdout(sys.stderr):  # libsumo warns of a pyarrow of another version
+        import libsumo
+    with _open(libsumo, "SUMO"):
+        try:
+            libsumo.start(["sumo", *sumo_options(files), *options])
+        except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+            raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
+        yield SumoWorld(libsumo, n)
+
+
+@contextmanager
+def open_window(options: Mapping[str, object]) -> Iterator[Api]:
+    """Start sumo-gui with options; yields TraCI.
+
+    Raises
+    ------
+    InputError
+        If there is no display.
+    SimulationError
+        If sumo-gui fails, or its window is closed.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError("gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment")
+    import sumo
+
+    api = traci_api()
+    command = [str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui")]
+    command += [str(text) for option in options.items() for text in option]
+    with _open(api, "sumo-gui"):
+        with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
+            warnings.simplefilter("ignore")
+            api.start(command, numRetries=CONNECTION_ATTEMPTS)
+        yield api
+
+
+@contextmanager
+def _open(api: Api, program: str) -> Iterator[None]:
+    """Report the errors of SUMO, and close SUMO at the end, even if it never started or its window was closed."""
     try:
-        start_engine(api, engine, [*sumo_command(engine, files), *options])
-        yield SumoWorld(api, n)
+        yield
     except (api.TraCIException, api.FatalTraCIError) as error:
-        raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
+        raise SimulationError(f"{program} failed: {str(error).strip() or 'it closed the connection'}") from None
     finally:
-        stop_engine(api)
+        with suppress(api.TraCIException, api.FatalTraCIError):
+            api.close()
 
 
-def engine_api(engine: Engine) -> Api:
-    if engine is Engine.LIBSUMO:
-        with redirect_stdout(sys.stderr):  # libsumo warns of a pyarrow of another version
-            import libsumo
-
-        return libsumo
+def traci_api() -> Api:
     import traci
 
     return traci
 
 
-def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
-    """The command line that starts SUMO on copies of a network."""
-    return [
-        program_path(engine),
-        "-c",
-        str(files.options),
-        "-n",
-        str(files.network),
-        "-r",
-        str(files.traffic),
-        "--no-step-log",
-        "true",
-        "--no-warnings",
-        "true",
-        "--xml-validation",
-        "never",
-        "--xml-validation.net",
-        "never",
-        "--xml-validation.routes",
-        "never",
-    ]
-
-
-def start_engine(api: Api, engine: Engine, command: list[str]) -> None:
-    if engine is Engine.LIBSUMO:
-        try:
-            api.start(command)
-        except (api.TraCIException, api.FatalTraCIError) as error:
-            raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
-        return
-    has_display = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if engine is Engine.GUI and not has_display:
-        raise InputError("gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment")
-    with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
-        warnings.simplefilter("ignore")
-        api.start(command, numRetries=CONNECTION_ATTEMPTS)
-
-
-def program_path(engine: Engine) -> str:
-    """Path of the SUMO program of an engine."""
-    if engine is Engine.LIBSUMO:
-        return "sumo"
-    import sumo
-
-    return str(Path(sumo.SUMO_HOME) / "bin" / ("sumo-gui" if engine is Engine.GUI else "sumo"))
-
-
-def stop_engine(api: Api) -> None:
-    """Close SUMO, without errors if SUMO never started or the user closed its window."""
-    with suppress(api.TraCIException, api.FatalTraCIError):
-        api.close()
+def sumo_options(files: CopiedNetwork) -> list[str]:
+    """The options with which SUMO simulates copies of a network."""
+    options: dict[str, object] = {
+        "-c": files.options,
+        "-n": files.network,
+        "-r": files.traffic,
+        "--no-step-log": "true",
+        "--no-warnings": "true",
+        "--xml-validation": "never",
+        "--xml-validation.net": "never",
+        "--xml-validation.routes": "never",
+    }
+    return [str(text) for option in options.items() for text in option]

@@ -28,10 +28,10 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo.batch import Watcher, drive_all, is_recorded, score, step_options
+from safevar_sumo.sumo.batch import drive_all, is_recorded, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
-from safevar_sumo.sumo.recording import Recording, record_scenes
+from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_COPIES = 200
@@ -174,14 +174,12 @@ def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]
     return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
 
-def simulate(
-    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, watch: Watcher | None = None
-) -> SimulationRuns:
-    """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> SimulationRuns:
+    """Run the scenario once for every setting, shape (N, n).
 
     In a matrix, all settings run at the worst point of the last setting. Raises the errors of `drive_all`.
     """
-    return drive_all(system_at_worst_point(system, settings), settings, engine, watch)
+    return drive_all(system_at_worst_point(system, settings), settings, engine)
 
 
 def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
@@ -208,7 +206,7 @@ def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> It
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if is_recorded(system, engine):
-        groups = _group_points(system.points, max(largest_batch(system) // max(n, 1), 1), step_options(system))
+        groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
@@ -269,12 +267,12 @@ def study_at(study: Study, name: str, source: object) -> Study:
     return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]), origin=origin)
 
 
-def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
+def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
     """Yield groups of at most `size` points whose recorded scenes may share a batch, sorted by duration; a point whose
     scenario observes no recorded target is alone.
     """
     groups: dict[Hashable, list[Point]] = {}
-    for point, scene in zip(points, record_scenes([point.scenario for point in points], options), strict=True):
+    for point, scene in zip(system.points, system.scenes.of(system.points), strict=True):
         has_target = isinstance(point.scenario, TargetTest)
         key = scene.batch_key if has_target and isinstance(scene, Recording) else point.name
         groups.setdefault(key, []).append(point)

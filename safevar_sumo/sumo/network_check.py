@@ -189,9 +189,9 @@ def _first_difference(network: Network) -> tuple[str, float]:
     The vehicle under test stays at its start.
     """
     with open_world(copied_network(network, 2), 2) as world:
-        world.insert_at_any_speed()
+        world.enter(None)
         for step in range(1, N_STEPS + 1):
-            world.advance(np.zeros(2))
+            world.step(np.zeros(2), np.ones(2, dtype=bool))
             poses = world.actor_poses()
             for name in sorted({id_.partition(".")[2] for id_ in poses}):
                 if poses.get(f"0.{name}") != poses.get(f"1.{name}"):

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from safevar_sumo.ads.base import DelayLine
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
-from safevar_sumo.scenarios import VUT, Point, Scenario, Scene
+from safevar_sumo.scenarios import Point, Scenario, Scene
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, scene_of
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.recorded_world import DrivenWorld, RecordedWorld
+from safevar_sumo.sumo.bodies import Motion, World
+from safevar_sumo.sumo.recorded_world import RecordedWorld
+from safevar_sumo.sumo.recording import Recording
 
 OCCLUDED_VALUES = np.array([[np.inf], [np.inf], [0.0], [0.0]])
 """Gap and lateral position [m], lateral speed and speed [m/s] of an occluded obstacle."""
+
+
+class Observer(Protocol):
+    """Observes the obstacles of all vehicles."""
+
+    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
+        """The scene now; must be called at every sample."""
 
 
 class Perception:
@@ -54,13 +63,13 @@ class Perception:
 
 
 class SceneObserver:
-    """Observes the obstacle of a scenario in a world, in every step."""
+    """Observes the obstacle of a scenario in a world."""
 
-    def __init__(self, scenario: Scenario, world: DrivenWorld) -> None:
+    def __init__(self, scenario: Scenario, world: World) -> None:
         self._scenario, self._world = scenario, world
         self._memory = world.begin(scenario)
 
-    def observe(self, is_open: BoolArray) -> Scene:
+    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
         scene, self._memory = self._scenario.observe(self._world, self._world.step_length, self._memory)
         return scene
 
@@ -68,11 +77,11 @@ class SceneObserver:
 class TargetObserver:
     """Observes the targets of K recorded scenes with `size` vehicles each, whose motion it computes once."""
 
-    def __init__(self, scenarios: Sequence[TargetTest], world: RecordedWorld, size: int) -> None:
-        self._world, self._size = world, size
+    def __init__(self, scenarios: Sequence[TargetTest], recordings: Sequence[Recording], size: int) -> None:
+        self._step_length, self._size, self._sample = recordings[0].step_length, size, -1
         at_samples = [
-            scenario.at_all_samples(recording, world.step_length)
-            for scenario, recording in zip(scenarios, world.recordings, strict=True)
+            scenario.at_all_samples(RecordedWorld.at_all_samples(recording), recording.step_length)
+            for scenario, recording in zip(scenarios, recordings, strict=True)
         ]
         motions, targets, absences = zip(*at_samples, strict=True)
         coordinates = np.array([(*motion.frame.origin, *motion.frame.direction) for motion in motions]).T.tolist()
@@ -84,32 +93,22 @@ class TargetObserver:
         length = max(map(len, absences))
         self._target = [_table(column, length) for column in zip(*targets, strict=True)]
         self._absence = _table(absences, length)
-        self._has_approached = np.zeros(world.n, dtype=bool)
+        self._has_approached = np.zeros(size * len(recordings), dtype=bool)
 
-    def observe(self, is_open: BoolArray) -> Scene:
+    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
         """The scene of all vehicles now; raises `SimulationError` if the target of an open run is not on the road."""
-        world = self._world
-        absence = self._absence[world.sample]
+        self._sample += 1
+        absence = self._absence[self._sample]
         if absence.any() and (absence & is_open.reshape(-1, self._size).any(axis=1)).any():
             raise SimulationError(
-                f"SUMO failed: the target is not on the road at {world.sample * world.step_length:g} s"
+                f"SUMO failed: the target is not on the road at {self._sample * self._step_length:g} s"
             )
         target = Target._make(
-            column if column.ndim == 0 else column[world.sample].repeat(self._size) for column in self._target
+            column if column.ndim == 0 else column[self._sample].repeat(self._size) for column in self._target
         )
-        front = self._frame.along(world.vehicle_positions(VUT))
-        scene, self._has_approached = scene_of(self._constants, target, front, world.speeds(), self._has_approached)
+        front = self._frame.along(motion.fronts)
+        scene, self._has_approached = scene_of(self._constants, target, front, motion.speeds, self._has_approached)
         return scene
-
-
-def observer_of(points: Sequence[Point], world: DrivenWorld) -> SceneObserver | TargetObserver:
-    """The observer of the points' scenes: of targets that do not react, or else of one point."""
-    scenarios = [point.scenario for point in points]
-    targets = [scenario for scenario in scenarios if isinstance(scenario, TargetTest)]
-    if isinstance(world, RecordedWorld) and len(targets) == len(scenarios):
-        return TargetObserver(targets, world, world.n // len(points))
-    (scenario,) = scenarios
-    return SceneObserver(scenario, world)
 
 
 def encounter_of(points: Sequence[Point], trace: Trace) -> Encounter:

@@ -8,15 +8,16 @@ equal SUMO's to the last bit, because this module repeats the operations of `MSV
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, Scenario
-from safevar_sumo.scenarios.base import ScenarioMemory
+from safevar_sumo.scenarios import VUT, Lane, Scenario
+from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
+from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.recording import Recording
-from safevar_sumo.sumo.world import Body, SumoWorld
 from safevar_sumo.vehicles import SumoType
 
 NUMERICAL_EPS = 0.001
@@ -36,22 +37,20 @@ def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) 
 
 
 class RecordedWorld:
-    """K recorded scenes of one road with `size` vehicles in each, and the methods of `SumoWorld` for all vehicles.
+    """K recorded scenes of one road with `size` vehicles in each; a `World` in which other actors move as recorded.
 
-    Scenarios see the first scene. All actors move as recorded, so that commands to them have no effect.
+    Scenarios see the first scene.
     """
 
     def __init__(self, recordings: Sequence[Recording], size: int) -> None:
-        self.recordings, self._size = recordings, size
+        self._size = size
         self._scene = recordings[0]  # road and vehicle under test are the same in all
-        self.n, self.step_length, self.sample = size * len(recordings), self._scene.step_length, 0
-        self.lane, self.lane_of, self.person_width = self._scene.lane, self._scene.lane_of, self._scene.person_width
-        self.vehicle_length = self._scene.vehicle_length
-        self.walk = self.drive = self.turn_back = self._scene.walk  # do nothing
+        self.n, self.step_length = size * len(recordings), self._scene.step_length
+        self.sample: Any = 0
         self._speeds = np.repeat([recording.speed for recording in recordings], size)
         self._lane_number = np.zeros(self.n, dtype=np.intp)
         self._lane_position = np.repeat([recording.start for recording in recordings], size)
-        self._lanes, self._is_frozen = self._scene.way.at(self._lane_number), np.zeros(self.n, dtype=bool)
+        self._lanes = self._scene.way.at(self._lane_number)
         self._fronts: FloatArray | None = None
         self._struck: dict[int, int] = {}
         """The bodies that vehicles strike in this step, by vehicle: numbers among `_others`, all bodies beside them."""
@@ -60,19 +59,20 @@ class RecordedWorld:
         self._motion, self._sizes = _joined_tracks(recordings)
         self._starts, self._ends = self._extents()
 
-    def insert(self, types: SumoType) -> None:
-        """Do nothing: all vehicles have departed, and their types do not limit the commanded speeds."""
+    @classmethod
+    def at_all_samples(cls, recording: Recording) -> RecordedWorld:
+        """A world of T vehicles that stand, vehicle k at sample k of the scene."""
+        n_samples = max(len(track.motion) for track in recording.tracks.values())
+        world = cls([recording], n_samples)
+        world.sample = np.arange(n_samples)
+        return world
 
-    def begin(self, scenario: Scenario) -> ScenarioMemory:
-        """Start a scenario before the first step, and return its memory."""
-        return scenario.begin(self)
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+        """All vehicles have departed, and their types do not limit the commanded speeds."""
+        return self._moved(np.ones(self.n, dtype=bool))
 
-    def end_runs(self, copies: Sequence[int]) -> None:
-        """Freeze the positions and speeds of vehicles whose runs end."""
-        self._is_frozen[copies] = True
-
-    def advance(self, speeds: FloatArray) -> None:
-        """Simulate one step, in which the vehicles reach `speeds` [m/s] at a constant acceleration.
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+        """Simulate one step, in which the vehicles whose runs are open reach `speeds` [m/s] at a constant acceleration.
 
         Raises
         ------
@@ -81,9 +81,8 @@ class RecordedWorld:
         """
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
         distances = distance_covered(self._speeds, speeds, self.step_length)
-        if np.count_nonzero(self._is_frozen):
-            speeds = np.where(self._is_frozen, self._speeds, speeds)
-            distances = np.where(self._is_frozen, 0.0, distances)
+        if np.count_nonzero(is_open) < self.n:
+            speeds, distances = np.where(is_open, speeds, self._speeds), np.where(is_open, distances, 0.0)
         self._lane_position = self._lane_position + distances
         self._speeds, self._fronts, self.sample = speeds, None, self.sample + 1
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
@@ -92,6 +91,14 @@ class RecordedWorld:
             self._lane_position = np.where(is_beyond, self._lane_position - self._lanes.end, self._lane_position)
             self._lane_number = self._lane_number + is_beyond
             self._lanes = self._scene.way.at(self._lane_number)
+        return self._moved(is_open)
+
+    def _moved(self, is_open: BoolArray) -> Motion:
+        return Motion(self.vehicle_positions(VUT), self._speeds, self._hits(is_open))
+
+    def begin(self, scenario: Scenario) -> ScenarioMemory:
+        """Start a scenario before the first step, and return its memory."""
+        return scenario.begin(self)
 
     def speeds(self) -> FloatArray:
         return self._speeds
@@ -105,7 +112,24 @@ class RecordedWorld:
 
     person_positions = vehicle_positions
 
-    def collisions(self, is_open: BoolArray) -> dict[int, float]:
+    def vehicle_length(self, actor: str) -> float:
+        return self._scene.length if actor == VUT else self._scene.tracks[actor].length
+
+    def person_width(self, actor: str) -> float:
+        return self._scene.tracks[actor].width
+
+    def lane(self, lane: str) -> Lane:
+        return lane_through(lane, self._scene.lanes[lane])
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return self.lane(self._scene.first_lanes[vehicle])
+
+    def walk(self, *_: object) -> None:
+        """Do nothing: actors move as recorded."""
+
+    drive = turn_back = walk
+
+    def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle number.
 
         SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
@@ -181,14 +205,11 @@ class RecordedWorld:
         rearmost = np.where(is_open, last_coordinates, np.inf).reshape(-1, self._size).min(axis=1)
         return np.argwhere((starts < foremost[:, np.newaxis]) & (ends > rearmost[:, np.newaxis]))
 
-    def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in
-        columns.
-        """
-        scene, n = self._scene, len(copies)
+    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
+        scene, n = self._scene, len(vehicles)
         along, length, width = np.tile(scene.along, (n, 1)), np.full(n, scene.length), np.full(n, scene.width)
-        own = Body.behind(self.vehicle_positions(VUT)[copies], along, length, width, self._speeds[copies])
-        struck = [self._struck[copy] for copy in copies]
+        own = Body.behind(self.vehicle_positions(VUT)[vehicles], along, length, width, self._speeds[vehicles])
+        struck = [self._struck[vehicle] for vehicle in vehicles]
         return own, Body._make(column[struck] for column in self._others)
 
 
@@ -212,7 +233,3 @@ def _joined_tracks(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatAr
 def _left_of(direction: FloatArray) -> FloatArray:
     """The unit vectors to the left of directions, in the last axis."""
     return np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
-
-
-DrivenWorld = SumoWorld | RecordedWorld
-"""A world in which vehicles under test drive."""

@@ -17,16 +17,13 @@ import numpy as np
 from msgspec import msgpack, to_builtins
 
 from safevar_sumo.records import FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, Lane, Scenario
-from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.scenarios import VUT, Point, Scenario
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
-from safevar_sumo.sumo.engine import Engine, open_world
+from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.network import Network, copied_network, is_shipped, stage_networks, sumo_version
 from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
 
-MAX_RECORDINGS = 4000
-"""Largest number of recorded scenes that a process keeps; a scene of ten seconds takes about ten kilobytes."""
 SCENES_FILE = "scenes.msgpack"
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
@@ -81,9 +78,6 @@ class Recording:
     The vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s]; `length`
     and `width` are its size [m], `along` is the direction of its way. `lanes` are the shapes of all lanes,
     `first_lanes` each vehicle's first lane.
-
-    The methods are those of a world of T copies, one for each sample: the vehicle under test stands, and all other
-    actors move as recorded, so that commands to them have no effect.
     """
 
     step_length: float
@@ -103,57 +97,36 @@ class Recording:
         way = (column.tobytes() for column in self.way)
         return self.step_length, self.length, self.width, self.along.tobytes(), *way
 
-    def vehicle_positions(self, actor: str) -> FloatArray:
-        """Positions of the actor's front, shape (T, 2) [m]; NaN while it is not on the road."""
-        return self.tracks[actor].motion[:, :2]
 
-    person_positions = vehicle_positions
-
-    def speeds(self) -> FloatArray:
-        return np.zeros(len(next(iter(self.tracks.values())).motion))
-
-    def vehicle_length(self, actor: str) -> float:
-        return self.length if actor == VUT else self.tracks[actor].length
-
-    def person_width(self, actor: str) -> float:
-        return self.tracks[actor].width
-
-    def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self.lanes[lane])
-
-    def lane_of(self, vehicle: str) -> Lane:
-        return self.lane(self.first_lanes[vehicle])
-
-    def walk(self, *_: object) -> None:
-        """Do nothing."""
-
-    drive = turn_back = walk
-
-
-def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
-    """Each scenario's scene, played with additional options of SUMO and recorded, or the reason why SUMO must simulate
-    the scenario.
-
-    SUMO plays a scene once per process; scenes of shipped scenarios are also kept in the user's cache folder.
-
-    Raises
-    ------
-    SimulationError
-        If SUMO fails.
+class Scenes:
+    """The scenes of a study, each recorded when it is first needed, with SUMO's options for the study's time step [s]
+    (None: that of the network).
     """
-    reasons = [_reason_against_recording(scenario) for scenario in scenarios]
-    recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
-    keys: dict[Scenario, _Key] = {
-        scenario: (scenario, network, tuple(options))
-        for scenario, network in zip(recordable, stage_networks(recordable), strict=True)
-    }
-    new_keys = [key for key in keys.values() if key not in _recordings]
-    if len(_recordings) + len(new_keys) > MAX_RECORDINGS:
-        _recordings.clear()
-        new_keys = [*keys.values()]
-    if new_keys:
-        _recordings.update(zip(new_keys, _recordings_of(new_keys), strict=True))
-    return [reason or _recordings[keys[scenario]] for scenario, reason in zip(scenarios, reasons, strict=True)]
+
+    def __init__(self, step_length: float | None = None) -> None:
+        self.options = () if step_length is None else ("--step-length", repr(step_length))
+        self._recorded: dict[Scenario, Recording | str] = {}
+
+    def of(self, points: Sequence[Point]) -> list[Recording | str]:
+        """Each point's scene, or the reason why SUMO must simulate it.
+
+        SUMO plays a scene once; scenes of shipped scenarios are also kept in the user's cache folder.
+
+        Raises
+        ------
+        SimulationError
+            If SUMO fails.
+        """
+        scenarios = dict.fromkeys(point.scenario for point in points if point.scenario not in self._recorded)
+        reasons = {scenario: _reason_against_recording(scenario) for scenario in scenarios}
+        new = [scenario for scenario, reason in reasons.items() if not reason]
+        keys = [(scenario, network, self.options) for scenario, network in zip(new, stage_networks(new), strict=True)]
+        self._recorded |= reasons | dict(zip(new, _recordings_of(keys) if keys else [], strict=True))
+        return [self._recorded[point.scenario] for point in points]
+
+    def reason_for_sumo(self, points: Sequence[Point]) -> str:
+        """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; "" if scenes suffice."""
+        return next((scene for scene in self.of(points) if isinstance(scene, str)), "")
 
 
 def _reason_against_recording(scenario: Scenario) -> str:
@@ -167,8 +140,6 @@ def _reason_against_recording(scenario: Scenario) -> str:
 
 _Key = tuple[Scenario, Network, tuple[str, ...]]
 """A scenario, its network, and additional options of SUMO."""
-_recordings: dict[_Key, Recording | str] = {}
-"""The scenes that this process keeps, or the reasons why scenes cannot be recorded."""
 
 
 def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
@@ -212,8 +183,8 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
 
 def _play(scenario: Scenario, network: Network, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
-    with open_world(copied_network(network, 1), 1, Engine.LIBSUMO, options) as world:
-        world.insert_at_any_speed()
+    with open_world(copied_network(network, 1), 1, options) as world:
+        world.enter(None)
         api, vehicle, vut = world.api, world.api.vehicle, copied_id(0, VUT)
         way = _way_of(api, vut)
         if way is None:
@@ -249,7 +220,7 @@ def _tracks(scenario: Scenario, world: SumoWorld) -> dict[str, Track]:
         else:
             _, memory = scenario.observe(world, world.step_length, memory)
         if sample < length - 1:
-            world.advance(np.zeros(1))
+            world.step(np.zeros(1), np.ones(1, dtype=bool))
     return tracks
 
 

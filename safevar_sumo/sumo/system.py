@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -35,6 +35,7 @@ from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
+from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
 from safevar_sumo.vehicles import (
     CHANGES,
@@ -141,7 +142,7 @@ class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
     - `source` is the study, as errors name it.
-    - `step_length` [s] is None if the network determines the time step.
+    - `scenes` are the recorded scenes of all points, and of points that it is reduced to.
     - `rater` rates results in the matrix of a protocol; None in a study that is not rated.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
@@ -157,9 +158,9 @@ class System:
     measuring: Measuring
     region: FeasibleRegion
     source: str = "study"
-    step_length: float | None = None
     matrix: tuple[Point, ...] = ()
     rater: Rater | None = None
+    scenes: Scenes = field(default_factory=Scenes)
     sees_nobody: bool = False
 
     @property
@@ -288,7 +289,7 @@ def _assemble(study: Study, source: str) -> System:
         measuring=measuring,
         region=region,
         source=source,
-        step_length=study.step_length,
+        scenes=Scenes(study.step_length),
         matrix=matrix,
         rater=rater,
     )

@@ -7,12 +7,13 @@ speeds and accelerations are converted to pedal positions of the vehicle model.
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +23,7 @@ from safevar_sumo.plugins import user_error_of, user_errors
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.traci_view import OWN_LOOP, SensedTraffic, TraciView, Value, real_traci, refused
-from safevar_sumo.sumo.world import current_world
-from safevar_sumo.vehicles import SumoType
+from safevar_sumo.vehicles import Sensors, SumoType
 
 Controller = Callable[..., None]
 """A user's function `step(traci, vehicle_id)`, or an object with such a method and, perhaps, `start`."""
@@ -40,20 +40,28 @@ class TraciController(Ads):
 
     def __init__(self, create: Callable[[], Controller], source: str) -> None:
         self._create, self._source = create, source
+        self._world: Any = None
+        self._sensors: Any = None
+
+    def in_world(self, world: Any, sensors: Sensors) -> TraciController:
+        """The controller in SUMO's world, with the vehicles' sensors in their weather."""
+        controller = copy.copy(self)
+        controller._world, controller._sensors = world, sensors
+        return controller
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        world, drivers = current_world(), []
-        traffic = SensedTraffic(world, step)
+        world, drivers = self._world, []
+        traffic = SensedTraffic(world, self._sensors, step)
         with substitute_traci():
-            for copy in range(n):
-                view, controller = TraciView(world, copy, traffic), self._create()
+            for vehicle in range(n):
+                view, controller = TraciView(world, vehicle, traffic), self._create()
                 if hasattr(controller, "start"):
                     self._call(view, controller.start)
                 drivers.append((view, getattr(controller, "step", controller)))
         return _Memory(nominal, traffic, drivers, initial_trim=None)
 
     @staticmethod
-    def types(nominal: Nominal, types: SumoType) -> SumoType:
+    def known_types(nominal: Nominal, types: SumoType) -> SumoType:
         """The types that controllers may know: those of the original vehicle, with the headways of SUMO's drivers."""
         mass, accel, decel, max_speed, lag = (np.full_like(types.mass, value) for value in nominal[:5])
         return SumoType(mass, accel, decel, max_speed, lag, types.tau)

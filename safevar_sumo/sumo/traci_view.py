@@ -14,9 +14,10 @@ from safevar_sumo.ads.base import STEP_DECIMALS
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
-from safevar_sumo.sumo.engine import Engine, engine_api
+from safevar_sumo.sumo.engine import traci_api
 from safevar_sumo.sumo.traci_commands import COMMANDS, DRIVER_COMMANDS, CommandedSpeed
 from safevar_sumo.sumo.world import Api, SumoWorld
+from safevar_sumo.vehicles import Sensors
 
 Value = Any
 """An argument or a result of a function of TraCI."""
@@ -141,7 +142,7 @@ BYPASS = "it would bypass the vehicle's model or its sensors"
 @cache
 def real_traci() -> Api:
     """The original module traci, not its substitute for controllers; must be called before controllers run."""
-    return engine_api(Engine.TRACI)
+    return traci_api()
 
 
 def refused(domain: str, name: str, problem: str) -> InputError:
@@ -171,9 +172,9 @@ class SensedTraffic:
     `seen` is what the sensors of each vehicle report now: the first snapshot until the latency is over.
     """
 
-    def __init__(self, world: SumoWorld, step: float) -> None:
-        self._world = world
-        ages = (world.sensors.latency / step).tolist()
+    def __init__(self, world: SumoWorld, sensors: Sensors, step: float) -> None:
+        self._world, self._sensors = world, sensors
+        ages = (sensors.latency / step).tolist()
         # Rounded twice, so that the last bits of a quotient do not decide about half a step:
         self._past = [deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS))) for age in ages]
         self.record_step()
@@ -184,7 +185,7 @@ class SensedTraffic:
         for domain in SENSED:
             for copy, name in map(copy_and_name, getattr(self._world.api, domain).getIDList()):
                 names[copy, domain].append(name)
-        self.seen, sensors = list[Snapshot](), self._world.sensors
+        self.seen, sensors = list[Snapshot](), self._sensors
         for copy, (past, reach, scale) in enumerate(zip(self._past, sensors.reach, sensors.scale, strict=True)):
             past.append(self._snapshot(copy, names))
             self.seen.append(_limit_to_range(past[0], float(reach), float(scale)))

@@ -1,21 +1,21 @@
-"""N copies of a network in a running simulation: queries about their actors, and where bodies touch first."""
+"""N copies of a network in a running simulation."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.records import BoolArray, Contact, FloatArray
-from safevar_sumo.scenarios import VUT, Lane, Scenario, Scene
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.scenarios import VUT, Lane, Scenario
 from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
+from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
-from safevar_sumo.vehicles import Sensors, SumoType
+from safevar_sumo.vehicles import SumoType
 
 INSERTION_DECELERATION = 9.0
 """Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that could stop before every
@@ -30,26 +30,6 @@ LANE_CHANGE_MODE = 0
 
 Api = Any
 """The module libsumo or traci, which have the same functions."""
-
-
-class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its direction, a unit vector."""
-
-    middle: FloatArray
-    along: FloatArray
-    length: Any
-    width: Any
-    speed: Any
-
-    @classmethod
-    def behind(cls, front: FloatArray, along: FloatArray, length: Any, width: Any, speed: FloatArray | float) -> Body:
-        """The body whose front's middle is at `front`, or M such bodies."""
-        return cls(front - along * (np.asarray(length)[..., np.newaxis] / 2), along, length, width, speed)
-
-    @classmethod
-    def columns(cls, bodies: Sequence[Body]) -> Body:
-        """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape (M,)."""
-        return cls._make(np.array(column) for column in zip(*bodies, strict=True))
 
 
 class SumoWorld:
@@ -69,67 +49,51 @@ class SumoWorld:
         self._commanded_speeds = np.full(n, np.nan)
         self._struck_ids: dict[int, str] = {}
         """Ids of the actors that the vehicles under test collided with last, by copy."""
-        self.sensors = Sensors.perfect(n)
-        """The vehicles' sensors in their weather, for ADSs that read the world instead of getting observations."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
         return _copied_ids(name, self.n)
 
-    def _set_types(self, types: SumoType) -> None:
-        """Set the attributes of the vehicles under test, except their decelerations."""
-        vehicletype = self.api.vehicletype
-        self._set(vehicletype.setMass, types.mass)
-        self._set(vehicletype.setAccel, types.accel)
-        self._set(vehicletype.setMaxSpeed, types.max_speed)
-        if types.tau is not None:
-            self._set(vehicletype.setTau, types.tau)
-
-    def _set_decelerations(self, decel: FloatArray, emergency_decel: FloatArray | None = None) -> None:
-        """Set the largest decelerations of the vehicles under test, by default the same in emergencies [m/s^2]."""
+    def _set_decelerations(self, decel: FloatArray, emergency_decel: FloatArray) -> None:
+        """Set the largest decelerations of the vehicles under test, usually and in emergencies [m/s^2]."""
         self._set(self.api.vehicletype.setDecel, decel)
-        self._set(self.api.vehicletype.setEmergencyDecel, decel if emergency_decel is None else emergency_decel)
+        self._set(self.api.vehicletype.setEmergencyDecel, emergency_decel)
 
     def _set(self, set_value: Callable[[str, float], None], values: FloatArray) -> None:
         for id_, value in zip(self.ids(VUT), values.tolist(), strict=True):
             set_value(id_, value)
 
-    def insert(self, types: SumoType) -> None:
-        """Insert all actors, the vehicles under test with these types; raises the errors of `depart`."""
-        self._set_types(types)
-        self._set_decelerations(np.maximum(types.decel, INSERTION_DECELERATION))
-        self.depart()
-        self._set_decelerations(types.decel)
-
-    def insert_with_drivers(self, types: SumoType) -> None:
-        """Insert all actors, the vehicles under test with these types, but with the decelerations that the traffic file
-        gives SUMO's drivers; raises the errors of `depart`.
-        """
-        vehicletype = self.api.vehicletype
-        planned = [(vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in self.ids(VUT)]
-        self._set_types(types)
-        self._set_decelerations(np.full(self.n, INSERTION_DECELERATION))
-        self.depart()
-        self._set_decelerations(*np.array(planned).T)
-        for id_ in self.ids(VUT):  # SUMO drew a factor for each vehicle
-            self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
-
-    def insert_at_any_speed(self) -> None:
-        """Insert all actors; the types of the vehicles under test change."""
-        self._set(self.api.vehicletype.setMaxSpeed, np.full(self.n, MAX_DEPARTURE_SPEED))
-        self._set_decelerations(np.full(self.n, INSERTION_DECELERATION))
-        self.depart()
-
-    def depart(self) -> None:
-        """Insert all actors, and take control of the vehicles under test.
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+        """Insert all actors; see `World.enter`.
 
         Raises
         ------
         SimulationError
             If SUMO cannot insert a vehicle under test.
         """
-        global _current_world
-        _current_world = self
+        vehicletype, ids, least = self.api.vehicletype, self.ids(VUT), np.full(self.n, INSERTION_DECELERATION)
+        decelerations = (least if types is None else types.decel,) * 2
+        if keeps_drivers:
+            planned = [(vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in ids]
+            decelerations = tuple(np.array(planned).T)
+        if types is None:
+            self._set(vehicletype.setMaxSpeed, np.full(self.n, MAX_DEPARTURE_SPEED))
+        else:
+            self._set(vehicletype.setMass, types.mass)
+            self._set(vehicletype.setAccel, types.accel)
+            self._set(vehicletype.setMaxSpeed, types.max_speed)
+            if types.tau is not None:
+                self._set(vehicletype.setTau, types.tau)
+        self._set_decelerations(*(np.maximum(values, least) for values in decelerations))
+        self._depart()
+        self._set_decelerations(*decelerations)
+        if keeps_drivers:
+            for id_ in ids:  # SUMO drew a factor for each vehicle
+                self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
+        return self._motion(np.ones(self.n, dtype=bool))
+
+    def _depart(self) -> None:
+        """Insert all actors, and take control of the vehicles under test."""
         self.api.simulationStep()
         departed = set(self.api.vehicle.getIDList())
         for id_ in self.ids(VUT):
@@ -137,7 +101,6 @@ class SumoWorld:
                 raise SimulationError(f"SUMO could not insert vehicle {id_!r}; check the network's traffic file")
             self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
             self.api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
-        self._read()
 
     def begin(self, scenario: Scenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory.
@@ -156,28 +119,25 @@ class SumoWorld:
                 "a network and traffic with the ids that the scenario names",
             ) from None
 
-    def advance(self, speeds: FloatArray) -> None:
-        """Simulate one step, in which the vehicles under test reach `speeds` [m/s]."""
-        for id_, copy in self.driving.items():
-            if speeds[copy] != self._commanded_speeds[copy]:
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+        for id_, copy in [*self.driving.items()]:
+            if not is_open[copy]:
+                self.api.vehicle.remove(id_)
+                del self.driving[id_]
+            elif speeds[copy] != self._commanded_speeds[copy]:
                 self._set_speed(id_, float(speeds[copy]))
         self._commanded_speeds = speeds
         self.api.simulationStep()
-        self._read()
+        return self._motion(is_open)
 
-    def _read(self) -> None:
+    def _motion(self, is_open: BoolArray) -> Motion:
         self._speeds, self._fronts = self._speeds.copy(), self._fronts.copy()
         copies = [*self.driving.values()]
         self._speeds[copies] = [*map(self._get_speed, self.driving)]
         self._fronts[copies] = [*map(self._get_position, self.driving)]
+        return Motion(self._fronts, self._speeds, self._hits(is_open))
 
-    def end_runs(self, copies: Sequence[int]) -> None:
-        """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
-        for copy in copies:
-            self.api.vehicle.remove(self.ids(VUT)[copy])
-            del self.driving[self.ids(VUT)[copy]]
-
-    def collisions(self, is_open: BoolArray) -> dict[int, float]:
+    def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
 
         On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under
@@ -193,13 +153,10 @@ class SumoWorld:
                     speeds[copy], self._struck_ids[copy] = speed, other_id
         return speeds
 
-    def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in
-        columns.
-        """
+    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
         return (
-            Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
-            Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]),
+            Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in vehicles]),
+            Body.columns([self._body_of(self._struck_ids[copy]) for copy in vehicles]),
         )
 
     def _body_of(self, id_: str) -> Body:
@@ -266,15 +223,6 @@ class SumoWorld:
             api.removeStage(id_, 0)
 
 
-_current_world: SumoWorld | None = None
-"""The world that this process simulates; SUMO, too, allows only one per process."""
-
-
-def current_world() -> SumoWorld:
-    assert _current_world is not None
-    return _current_world
-
-
 @lru_cache
 def _copied_ids(name: str, n: int) -> list[str]:
     return [copied_id(copy, name) for copy in range(n)]
@@ -290,72 +238,3 @@ def _vehicle_function(api: Api, name: str) -> Callable[..., Any]:
     compiled = getattr(api, "_libsumo", None)
     function: Callable[..., Any] = getattr(compiled or api.vehicle, f"vehicle_{name}" if compiled else name)
     return function
-
-
-FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
-
-
-class Contacts:
-    """First contacts of N vehicles, `first`.
-
-    In a Euro NCAP test, where `is_tested`, only contacts of the vehicle's front are collisions.
-    """
-
-    def __init__(self, n: int, is_tested: BoolArray) -> None:
-        self._is_tested, self.first = is_tested, Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan))
-
-    def record_collisions(self, world: Any, is_open: BoolArray, scene: Scene) -> dict[int, float]:
-        """Process one sample; returns the speeds [m/s] of the vehicles of open runs that collide, by vehicle number."""
-        speeds = world.collisions(is_open)
-        new_copies = [copy for copy in speeds if not self.first.side[copy]]
-        if new_copies:
-            own, other = world.bodies(new_copies)
-            self._locate(new_copies, own, other, scene)
-        side = self.first.side
-        return {copy: speed for copy, speed in speeds.items() if not self._is_tested[copy] or side[copy] == FRONT}
-
-    def _locate(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
-        side, age, distance_behind_front = find_touches(own, other)
-        lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * age
-        is_at_end = (side == FRONT) | (side == REAR)
-        share = np.where(is_at_end, lateral / own.width + 0.5, distance_behind_front / own.length)
-        self.first.side[copies] = side
-        self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
-
-
-def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:
-    """The first touches of M overlapping pairs, a vehicle's own body and another, if their velocities were constant.
-
-    Returns the touched side of the own body, the time since the touch [s], and how far the other body's middle was then
-    behind the own front [m].
-
-    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin
-    a|) / 2 along the own body and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
-    direction and approach each other at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the
-    direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
-    smaller overlap.
-    """
-    axes = np.stack([own.along, np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)])
-    cosine, sine = np.abs(_dot(other.along, axes))
-    extent = np.stack(
-        [
-            (own.length + other.length * cosine + other.width * sine) / 2,
-            (own.width + other.length * sine + other.width * cosine) / 2,
-        ]
-    )
-    distance = _dot(other.middle - own.middle, axes)
-    speed = _dot(own.along * own.speed[:, np.newaxis] - other.along * other.speed[:, np.newaxis], axes)
-    overlap, closing_speed = extent - np.abs(distance), np.copysign(1.0, distance) * speed
-    is_closing = closing_speed > 0
-    ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)
-    approaches = is_closing.any(axis=0)
-    is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
-    age = np.where(approaches, np.min(ages, axis=0), 0.0)
-    ahead, left = distance > 0
-    side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
-    return side, age, own.length / 2 - (distance[0] + age * speed[0])
-
-
-def _dot(vectors: FloatArray, axes: FloatArray) -> FloatArray:
-    """Components of M vectors along their two axes, shape (2, M)."""
-    return vectors[:, 0] * axes[..., 0] + vectors[:, 1] * axes[..., 1]

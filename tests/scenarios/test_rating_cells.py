@@ -14,9 +14,9 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import batch
+from safevar_sumo.sumo.bodies import Contacts
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.world import Contacts
 from tests.made_up import original_of
 from tests.scenarios.holding import CARLA, Hold, at_contact, driven
 from tests.sumo.test_recording import assert_same

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.records import FloatArray, Outcome, Trace, differences
+from safevar_sumo.records import FloatArray, Outcome, differences
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
 from safevar_sumo.sumo.batch import _Outcomes
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
@@ -107,16 +104,6 @@ def test_the_sample_in_which_the_encounter_ends_is_active_only_at_a_collision() 
 
 def test_the_last_sample_counts() -> None:
     assert judged((3, False, None), (3, False, None))[1] == [True, True]
-
-
-@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
-def test_libsumo_and_traci_give_the_same_trace(study: str) -> None:
-    system = assemble(load_study(study))
-    settings = np.stack([system.characteristics.original, system.characteristics.upper])
-    here, socket = (simulate(system, settings, engine) for engine in (Engine.LIBSUMO, Engine.TRACI))
-    assert here.outcome.tolist() == socket.outcome.tolist()
-    for field in fields(Trace):
-        assert np.array_equal(getattr(here.trace, field.name), getattr(socket.trace, field.name)), field.name
 
 
 STEP = 0.05

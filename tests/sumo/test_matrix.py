@@ -16,9 +16,9 @@ from safevar_sumo.records import Command, FloatArray, Outcome, SimulationRuns, d
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
+from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.world import Body, find_touches
 from tests.made_up import original_of
 from tests.scenarios.holding import Pedals
 

@@ -17,15 +17,16 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Observation, Outcome, differences
 from safevar_sumo.results import read_manifest
-from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.recorded_world import distance_covered
-from safevar_sumo.sumo.recording import record_scenes
+from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.in_process import json_of, run
 from tests.scenarios.holding import Pedals
 
@@ -81,11 +82,10 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 ) -> None:
     """In an empty cache: SUMO plays the scene, and the next process reads the file."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
-    scenario = assemble(load_study("sun")).scenario
+    points = assemble(load_study("sun")).points
 
     def scene() -> str:
-        recording._recordings.clear()
-        return repr(record_scenes([scenario], ()))
+        return repr(Scenes().of(points))
 
     played = scene()
     assert [*tmp_path.glob("networks/scenes-*/scenes.msgpack")]
@@ -105,8 +105,7 @@ def test_contacts_are_those_that_sumo_finds() -> None:
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["crossing"](network="my_town")
-    (scene,) = record_scenes([scenario], ())
-    assert "my_town" in str(scene)
+    assert "my_town" in Scenes().reason_for_sumo([Point(scenario, weather_of("clear", "study"))])
 
 
 @pytest.fixture
@@ -131,6 +130,21 @@ def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reac
     engine = read_manifest(Path("results/it"))["engine"]
     assert engine["name"] == "sumo"
     assert "'reacting'" in engine["reason"]
+
+
+def test_driven_speeds_lead_to_the_same_places_and_collisions_in_sumo(any_system: System) -> None:
+    verify_in_sumo(any_system, drawn(any_system, 20, 7))
+
+
+def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
+    reacting: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(reacting)
+    Path("claims.py").write_text(CLAIM)
+    scenario = {"model": "claims:Claims", "parameters": {"network": "reacting"}}
+    system = assemble(load_study("native", scenario=scenario))
+    with pytest.raises(InputError, match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = "):
+        verify_in_sumo(system, drawn(system, 60, 5))
 
 
 @pytest.mark.slow

@@ -1,0 +1,96 @@
+"""Driven speeds once more in SUMO: what was recorded must be what SUMO simulates, and pictures show all actors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import user_errors
+from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.scenarios.base import Frame
+from safevar_sumo.sumo.batch import drive_all, enter, open_points_world
+from safevar_sumo.sumo.bodies import Contacts
+from safevar_sumo.sumo.matrix import MAX_COPIES
+from safevar_sumo.sumo.perception import SceneObserver
+from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.world import SumoWorld
+
+RATED_POINTS = 8
+"""Number of a rating's cells at which settings are verified, spread over all cells."""
+COMPARED = ("position", "gap", "lateral", "obstacle_speed")
+"""Quantities of a trace that SUMO must repeat [m, m/s]."""
+
+
+def drive_again(
+    system: System, settings: FloatArray, runs: SimulationRuns, watch: Callable[[SumoWorld], None] = lambda world: None
+) -> dict[str, FloatArray]:
+    """Drive N settings at the system's only point in SUMO, with the speeds of `runs`.
+
+    Returns the quantities that `COMPARED` names, shape (T, N), and the `collision` speeds [m/s], NaN without a
+    collision, shape (T, N). `watch` is called with SUMO's world at every sample.
+    """
+    (point,), trace = system.points, runs.trace
+    n = len(runs.outcome)
+    values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
+    with user_errors(system.source), open_points_world(system, n) as world:
+        _, _, motion = enter(system, settings, world)
+        observer, is_open = SceneObserver(point.scenario, world), np.ones(n, dtype=bool)
+        contacts = Contacts(n, np.full(n, point.scenario.test_speed is not None))
+        frame = Frame.through_origin(world.lane_of(VUT))
+        for sample in range(len(trace.time)):
+            watch(world)
+            scene = observer.observe(motion, is_open)
+            collisions = contacts.count(world, motion.hits, scene)
+            values["collision"][sample, [*collisions]] = [*collisions.values()]
+            values["position"][sample] = frame.along(motion.fronts)
+            for name in COMPARED[1:]:
+                values[name][sample] = getattr(scene, name)
+            is_open = is_open & trace.active[sample]
+            is_open[[*collisions]] = False
+            if sample + 1 < len(trace.time):
+                motion = world.step(trace.speed[sample + 1], is_open)
+    return values
+
+
+def verify_in_sumo(system: System, settings: FloatArray) -> None:
+    """Drive settings, shape (M, n), in recorded scenes, and with the same speeds in SUMO, at every point or, of a
+    rating, at some.
+
+    Raises
+    ------
+    InputError
+        If a place or a collision is another one in SUMO, with the first such setting and both values.
+    """
+    points = system.points
+    if system.rater is not None:
+        points = tuple(points[k] for k in np.linspace(0, len(points) - 1, RATED_POINTS).astype(int))
+    for point in points:
+        at_point = system.at(point)
+        for start in range(0, len(settings), MAX_COPIES):
+            batch = settings[start : start + MAX_COPIES]
+            runs = drive_all(at_point, batch)
+            _compare(at_point, batch, runs, drive_again(at_point, batch, runs))
+
+
+def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]) -> None:
+    trace = runs.trace
+    last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
+    collision = np.full(trace.speed.shape, np.nan)
+    collision[last, np.arange(len(last))] = runs.collision_speed
+    recorded = {name: np.broadcast_to(getattr(trace, name), trace.speed.shape) for name in COMPARED}
+    for name, values in {**recorded, "collision": collision}.items():
+        is_compared = trace.active & ((name != "collision") | (runs.outcome != Outcome.INVALID_TEST))
+        differs = is_compared & ~np.isclose(in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True)
+        if differs.any():
+            sample, row = np.argwhere(differs)[0]
+            pairs = zip(system.characteristics.names, settings[row].tolist(), strict=True)
+            raise InputError(
+                system.source,
+                f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g} in the recorded "
+                f"scene and {in_sumo[name][sample, row]:.9g} in SUMO, with "
+                + ", ".join(f"{key} = {value:.17g}" for key, value in pairs),
+                "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
+            )
