@@ -17,15 +17,15 @@ import numpy as np
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.campaign.local import end_if_longer
 from safevar_sumo.campaign.pool import Pool, WorkerLostError
-from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
+from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.protocol.rater import study_for_sumo_check
-from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, Outcome, differences
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_cells, settings_per_batch
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
@@ -223,33 +223,6 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     return " ".join(words)
 
 
-def verify_in_sumo(task: Task, recorded: Evaluations) -> str:
-    """Refuse results of a task from recorded scenes that differ in SUMO; returns a remark on settings that SUMO cannot
-    simulate, "" without any. Of a rating, SUMO repeats a few cells.
-
-    Raises
-    ------
-    InputError
-        With the first setting whose results differ, and both values.
-    """
-    study = task.study
-    sumo_study = study_for_sumo_check(study, system_of(study).weather)
-    if sumo_study is not study:
-        recorded = evaluate_settings(Task(study=sumo_study, batch_size=task.batch_size), recorded.settings)
-    in_sumo = evaluate_settings(Task(study=sumo_study, engine=Engine.LIBSUMO), recorded.settings)
-    is_comparable = ~(recorded.failed | in_sumo.failed)
-    if is_comparable.any():  # evaluations that have failed lack the user's metrics
-        recorded, compared = recorded.take(is_comparable), in_sumo.take(is_comparable)
-        for row, difference in differences(compared.results, recorded.results, ROUNDING):
-            pairs = zip(study.vehicle.characteristics, recorded.settings[row], strict=True)
-            values = ", ".join(f"{name} = {value:.17g}" for name, value in pairs)
-            raise InputError(
-                f"study {study.name!r}",
-                f"{difference} in the recorded scene and in SUMO with {values}",
-                "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
-            )
-    failed_rows = np.flatnonzero(in_sumo.failed)
-    if not len(failed_rows):
-        return ""
-    reason = in_sumo.reason(failed_rows[0])
-    return f"{len(failed_rows)} of {len(in_sumo)} settings could not be verified in SUMO: {reason}"
+def verify_settings(task: Task, settings: FloatArray) -> str:
+    """Verify recorded scenes of a task; see `verify_in_sumo`."""
+    return verify_in_sumo(system_of(task.study), settings)

@@ -22,7 +22,7 @@ from safevar_sumo.campaign.evaluation import (
     carry_out,
     evaluate_settings,
     system_of,
-    verify_in_sumo,
+    verify_settings,
 )
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
@@ -75,7 +75,8 @@ def evaluate_all(
     sample_size = min(verified - pool.verified[packed_study], len(distinct_settings))
     if has_recorded_scene and sample_size > 0 and selection == EVERYTHING:
         sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
-        carry_out(verify_in_sumo, [(task, evaluations.take(sample))], pool)
+        sample = sample[~evaluations.failed[sample]]
+        carry_out(verify_settings, [(task, distinct_settings[sample])], pool)
         pool.verified[packed_study] += sample_size
     return evaluations.take(row_of.ravel())
 

@@ -140,14 +140,15 @@ class Run:
         self._positions += positions
         self._table = Evaluations.concatenate([self._table, evaluations])
 
-    def sample_for_sumo(self, rng: np.random.Generator) -> Evaluations:
-        """Sample the evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
+    def sample_for_sumo(self, rng: np.random.Generator) -> FloatArray:
+        """Sample the settings to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
         _, requested = self._requested()
         solutions = {setting.tobytes() for setting in self.solutions.settings}
         is_solution = np.array([setting.tobytes() in solutions for setting in requested.settings], dtype=bool)
         other_rows = np.flatnonzero(~requested.failed & ~is_solution)
         sample = other_rows[rng.permutation(len(other_rows))[:VERIFIED_SETTINGS]]
-        return requested.take(np.concatenate([np.flatnonzero(~requested.failed & is_solution), sample]))
+        rows = np.concatenate([np.flatnonzero(~requested.failed & is_solution), sample])
+        return requested.take(rows).settings
 
     def finish(self) -> RunResult:
         """Journal the result of a search that has ended, and close the journal."""

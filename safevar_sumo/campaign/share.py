@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.cluster import has_caller
-from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of, verify_in_sumo
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of, verify_settings
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, random_generator_of
 from safevar_sumo.errors import InputError, SafevarError
@@ -138,4 +138,4 @@ def _verify(task: Task, runs: Sequence[Run]) -> str:
         run.sample_for_sumo(random_generator_of(task.study, run.key._replace(algorithm=f"verify {run.key.algorithm}")))
         for run in runs
     ]
-    return verify_in_sumo(task, Evaluations.concatenate(samples)) if any(map(len, samples)) else ""
+    return verify_settings(task, np.concatenate(samples)) if any(map(len, samples)) else ""

@@ -32,8 +32,6 @@ SHARE_DECIMALS = 6
 """Decimals to which the calculator rounds shares before a comparison."""
 SHARED_PARAMETERS = ("vut_length", "vut_width", "grade")
 """Parameters of a study's scenario that apply to every cell."""
-SUMO_CELLS = 8
-"""Number of a protocol's cells that a check in SUMO simulates: all cells would take hours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,14 +177,6 @@ def rater_of(study: Study, source: str) -> Rater | None:
         for claim in (claim for claim in claims if claim not in legal):
             raise unknown_name(source, f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
     return Rater(protocol=protocol, claims=study.rating.claims)
-
-
-def study_for_sumo_check(study: Study, weather: Weather) -> Study:
-    """The study for a check in SUMO; a rated study is reduced to a few of its cells, spread over the matrices."""
-    if not is_rated(study):
-        return study
-    cell_count = len(protocol_of(study.matrix.protocol).cells)  # type: ignore[union-attr]
-    return reduce_to_cells(study, weather, np.linspace(0, cell_count - 1, SUMO_CELLS).astype(int).tolist())
 
 
 def reduce_to_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Study:

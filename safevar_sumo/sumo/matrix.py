@@ -126,7 +126,7 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple
     """
     results = {
         result.point.name: (result.evaluations, rated_quantities(result.runs))
-        for group in _simulate_groups(system, settings, engine)
+        for group in simulate_groups(system, settings, engine)
         for result in group
     }
     at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
@@ -186,7 +186,7 @@ def simulate_all_points(system: System, settings: FloatArray, engine: Engine = E
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of
     `drive_all`.
     """
-    by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine) for result in group}
+    by_name = {result.point.name: result for group in simulate_groups(system, settings, engine) for result in group}
     return [by_name[point.name] for point in system.points]
 
 
@@ -201,7 +201,9 @@ def contact_degree(system: System) -> float:
     return runs.trace.vehicle_length
 
 
-def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> Iterator[list[PointResult]]:
+def simulate_groups(
+    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
+) -> Iterator[list[PointResult]]:
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.scenarios.base import Frame
-from safevar_sumo.sumo.batch import drive_all, enter, open_points_world
+from safevar_sumo.sumo.batch import enter, open_points_world
 from safevar_sumo.sumo.bodies import Contacts
-from safevar_sumo.sumo.matrix import MAX_COPIES
+from safevar_sumo.sumo.matrix import MAX_COPIES, simulate_groups
 from safevar_sumo.sumo.perception import SceneObserver
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
@@ -55,24 +57,27 @@ def drive_again(
     return values
 
 
-def verify_in_sumo(system: System, settings: FloatArray) -> None:
+def verify_in_sumo(system: System, settings: FloatArray) -> str:
     """Drive settings, shape (M, n), in recorded scenes, and with the same speeds in SUMO, at every point or, of a
-    rating, at some.
+    rating, at some. Returns why SUMO could not simulate some of them, "" if it could.
 
     Raises
     ------
     InputError
         If a place or a collision is another one in SUMO, with the first such setting and both values.
     """
-    points = system.points
+    points, failures = system.points, list[str]()
     if system.rater is not None:
         points = tuple(points[k] for k in np.linspace(0, len(points) - 1, RATED_POINTS).astype(int))
-    for point in points:
-        at_point = system.at(point)
-        for start in range(0, len(settings), MAX_COPIES):
-            batch = settings[start : start + MAX_COPIES]
-            runs = drive_all(at_point, batch)
-            _compare(at_point, batch, runs, drive_again(at_point, batch, runs))
+    for start in range(0, len(settings), MAX_COPIES):
+        batch = settings[start : start + MAX_COPIES]
+        for result in chain.from_iterable(simulate_groups(replace(system, matrix=points, rater=None), batch)):
+            at_point = system.at(result.point)
+            try:
+                _compare(at_point, batch, result.runs, drive_again(at_point, batch, result.runs))
+            except SimulationError as error:
+                failures.append(f"up to {len(batch)} settings could not be verified in SUMO: {error}")
+    return failures[0] if failures else ""
 
 
 def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]) -> None:

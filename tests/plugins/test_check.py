@@ -140,7 +140,7 @@ DEFECTS = {
         "vehicle", "alone", VEHICLE, "* command.throttle -", "* np.max(state.speed + 1) -", ALONE
     ),
     "scenario truth values": planted("scenario", "contract", SCENARIO, "gap < -100)", "gap)", "returned over"),
-    "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO and in the recorded scene, with "),
+    "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO, with "),
     "metric over runs": planted(
         "metric", "alone", METRIC, "    return np.max(", "    jerk = jerk - np.mean(jerk)\n    return np.max(", ALONE
     ),

@@ -9,13 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
-from safevar_sumo.records import ROUNDING, FloatArray, Results, differences
+from safevar_sumo.records import FloatArray, Results, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
-from safevar_sumo.sumo import Engine, is_recorded
+from safevar_sumo.sumo import is_recorded
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 SIMULATED, SIMULATED_BY_TRACI = 100, 20
@@ -54,14 +56,12 @@ def try_simulations(study: Study) -> Iterator[Failure]:
     yield from _try(load, region.characteristics, settings)
     system = _system(study)
     if ":" in study.scenario.model and is_recorded(system):
-        recorded, in_sumo = (evaluate(system, settings, engine).results for engine in (Engine.RECORDED, Engine.LIBSUMO))
-        for row, difference in differences(recorded, in_sumo, ROUNDING):
-            yield Failure(
-                "contract",
-                f"{difference} in SUMO and in the recorded scene",
-                "reactive_actors = True where somebody reacts to the vehicle under test",
-                _changes(region.characteristics, settings[row]),
-            )
+        try:
+            verify_in_sumo(system, settings)
+        except InputError as error:
+            found, _, setting = error.problem.partition(", with ")
+            reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
+            yield Failure("contract", found, reacts, setting)
 
 
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
