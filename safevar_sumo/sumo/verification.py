@@ -52,8 +52,9 @@ def drive_again(
                 values[name][sample] = getattr(scene, name)
             is_open = is_open & trace.active[sample]
             is_open[[*collisions]] = False
-            if sample + 1 < len(trace.time):
-                motion = world.step(trace.speed[sample + 1], is_open)
+            if not is_open.any() or sample + 1 == len(trace.time):
+                break
+            motion = world.step(trace.speed[sample + 1], is_open)
     return values
 
 
