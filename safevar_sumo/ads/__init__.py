@@ -10,7 +10,7 @@ from safevar_sumo.ads.base import (
     ScalarAds as ScalarAds,
 )
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
-from safevar_sumo.ads.fmu import Fmu as Fmu, FmuAds as FmuAds
+from safevar_sumo.ads.fmu import MAX_INSTANCES as MAX_INSTANCES, Fmu as Fmu, FmuAds as FmuAds
 from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FullBraking, FuzzySafety, Rss
 

@@ -29,6 +29,8 @@ UNITS: Mapping[str, str] = {
 obstacle is detected. It returns throttle and brake or an acceleration; above 0.5, `warns` is a warning.
 """
 COMMANDS = ("throttle", "brake", "acceleration", "warns")
+MAX_INSTANCES = 200
+"""Largest number of vehicles at once, each with an instance."""
 REAL_TYPES = ("Real", "Float64", "Float32")
 
 

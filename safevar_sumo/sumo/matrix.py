@@ -154,7 +154,7 @@ def settings_per_batch(system: System, engine: Engine) -> int:
 
 def largest_batch(system: System) -> int:
     """Largest number of vehicles in one batch; it is smaller if each vehicle has its own instance of an FMU."""
-    return min(MAX_VEHICLES, *(model.max_vehicles or MAX_VEHICLES for model in (system.vehicle, system.ads)))
+    return min(MAX_VEHICLES, system.ads.max_vehicles or MAX_VEHICLES)
 
 
 def _batch_size(system: System, engine: Engine) -> int:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.metrics import (
     METRIC_OF_OBJECTIVE,
@@ -440,7 +440,9 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         if not path:
             raise InputError(lookup.source, f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
         code = UserCode(lookup.source, f"ads.model = {table.model!r}")
-        return PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
+        fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
+        fleet.max_vehicles = MAX_INSTANCES
+        return fleet
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
     ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
     return PerVehicleAds(create, member.code) if member.code and isinstance(ads, ScalarAds) else ads

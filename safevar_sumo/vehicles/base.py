@@ -186,8 +186,6 @@ class Vehicle:
         Units of the characteristics by name.
     FITTED_UP_TO
         Highest speed at which the parameters were identified [m/s].
-    max_vehicles
-        Largest number of vehicles at once; None if any number will do.
     remarks
         Remarks for the user.
     RETURNS
@@ -207,7 +205,6 @@ class Vehicle:
     }
     UNITS: Mapping[str, str]
     FITTED_UP_TO: ClassVar[float] = np.inf
-    max_vehicles: int | None = None
     remarks: Sequence[str] = ()
 
     @abstractmethod
