@@ -20,8 +20,8 @@ MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic."""
 
 
-class Table(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A table of a study file, without keys that are unknown; its keys with default values are not written."""
+class Table(Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of a study file; a key that is unknown is a mistake."""
 
 
 def mistake(problem: str, legal: str) -> ValueError:

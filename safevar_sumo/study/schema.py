@@ -77,7 +77,7 @@ class VehicleTable(Table, frozen=True, kw_only=True):
     files: list[str] = []
 
 
-class Weather(Table, frozen=True, kw_only=True, omit_defaults=False):
+class Weather(Table, frozen=True, kw_only=True):
     """Weather as data: its `name`, and its effects on the road and on the sensors.
 
     `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose
@@ -292,9 +292,27 @@ class Study(Table, frozen=True, kw_only=True):
 
 
 def tables_of(study: Study) -> Parameters:
-    """A study as plain tables as in a file, without its origin and without defaults."""
-    tables: Parameters = msgspec.to_builtins(study)
-    return {name: value for name, value in tables.items() if name != "origin" and value != {}}
+    """A study as plain tables as in a file, without its origin and without keys that have their default values."""
+    tables: Parameters = _without_defaults(study)
+    tables.pop("origin", None)
+    return tables
+
+
+def _without_defaults(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_defaults(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_without_defaults(inner) for inner in value]
+    if not isinstance(value, Table):
+        return value
+    config = value.__struct_config__
+    table = {} if config.tag_field is None else {config.tag_field: config.tag}
+    for field in msgspec.structs.fields(value):
+        inner = getattr(value, field.name)
+        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        if inner != default:
+            table[field.name] = _without_defaults(inner)
+    return table
 
 
 def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:

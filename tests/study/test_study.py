@@ -5,6 +5,7 @@ shipped JSON schema, as an editor uses it.
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import tomllib
 from pathlib import Path
@@ -18,7 +19,7 @@ from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.manifest import evaluation_keys
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
-from safevar_sumo.study import Limit, limits_of, load_study, study_names, tables_of, write_study
+from safevar_sumo.study import Limit, Origin, limits_of, load_study, study_names, tables_of, write_study
 from safevar_sumo.study.file_schema import schema_text
 
 SUN = load_study("sun").vehicle.characteristics
@@ -307,6 +308,13 @@ def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:
     with pytest.raises(InputError, match=re.escape(f"--promise: {message}")) as caught:
         limits_of(texts.split(", "), ROWS, source="--promise")
     assert len(str(caught.value).splitlines()) <= 2
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_a_study_that_another_process_received_has_the_same_tables(name: str) -> None:
+    study = load_study(name)
+    assert tables_of(pickle.loads(pickle.dumps(study))) == tables_of(study)
+    assert load_study(tables_of(study)) == msgspec.structs.replace(study, origin=Origin())
 
 
 def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> None:
