@@ -1,3 +1,5 @@
+from .analysis.answer import Answer as Answer
+from .analysis.ask import question as question
 from .analysis.compare import compare as compare
 from .analysis.compare.answer import SystemComparison as SystemComparison
 from .analysis.explain import explain as explain
@@ -11,9 +13,7 @@ from .analysis.rating.compute import Rating as Rating
 from .analysis.repair import repair as repair
 from .analysis.repair.answer import Repair as Repair, Repairs as Repairs
 from .analysis.risk import risk as risk
-from .analysis.risk.answer import Risk as Risk
 from .analysis.rules import rules as rules
-from .analysis.rules.compute import Rule as Rule, Rules as Rules
 from .analysis.subject import Results as Results, load as load
 from .analysis.tolerance import tolerance as tolerance
 from .analysis.tolerance.answer import Tolerance as Tolerance

@@ -70,7 +70,7 @@ TYPED = [
     ("repair wear --promise all --out folder.png", "--out"),
     ("repair euro_ncap_rating --promise all", "is rated"),
     ("repair native --promise all --change headway", "no parameter 'headway'"),
-    ("risk sun --confidence nan", "below 1"),
+    ("risk sun --confidence nan", "between 0 and 1"),
     ("risk sun --unsafe points=1", "not rated"),
     ("rating euro_ncap_rating --set treadDepth=1.6..8:3", "one value"),
     ("rating euro_ncap_rating --plot there.txt", ".png"),

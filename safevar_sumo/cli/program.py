@@ -34,7 +34,11 @@ COMMANDS_BY_GROUP = {
             "questions",
             "Find the smallest change of the driving system that survives promised wear, and its price.",
         ),
-        "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
+        "risk": (
+            "ask",
+            "Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which "
+            "characteristics decide it.",
+        ),
         "report": ("handover", "Write one page about results: verdict, causes, replays, tables, figures."),
     },
     "More": {
@@ -51,7 +55,7 @@ COMMANDS_BY_GROUP = {
         ),
         "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
         "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
-        "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
+        "rules": ("ask", "Find rules, in physical units, that say where in the domain a study is unsafe."),
         "rating": (
             "questions",
             "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
@@ -83,9 +87,14 @@ class LazyCommands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        if name in COMMANDS:
-            with _exit_on_interrupt():
-                module, _ = COMMANDS[name]
+        with _exit_on_interrupt():
+            module, _ = COMMANDS.get(name, ("ask" if ":" in name else "", ""))
+            if module == "ask":
+                from safevar_sumo.analysis.ask import find_question
+                from safevar_sumo.cli.ask import command_of
+
+                return command_of(find_question(name))
+            if module:
                 importlib.import_module(f"safevar_sumo.cli.{module}")
         return super().get_command(ctx, name)
 
@@ -93,7 +102,7 @@ class LazyCommands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest the nearest command if the name is unknown."""
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+        if args and args[0] not in COMMANDS and not args[0].startswith("-") and ":" not in args[0]:
             ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)
 
@@ -102,7 +111,7 @@ class LazyCommands(click.Group):
         try:
             return super().invoke(ctx)
         except InputError as error:
-            command = super().get_command(ctx, str(ctx.invoked_subcommand))
+            command = self.get_command(ctx, str(ctx.invoked_subcommand))
             parameters = command.params if command else []
             flags = {option.name: option.opts[-1] for option in parameters if isinstance(option, click.Option)}
             if isinstance(error.source, str):  # a path is no argument

@@ -17,8 +17,6 @@ from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import answer_question, study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
@@ -39,7 +37,7 @@ from safevar_sumo.cli.arguments import (
     point_option,
     read_changes,
 )
-from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
+from safevar_sumo.cli.program import commands, print_json, print_note
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import print_answer, print_parts
@@ -172,25 +170,6 @@ def tolerance(
 
 
 @add_question(
-    RiskOptions, "STUDY|DIR", file_option("--plot", "Draw the sensitivity indices to this file: png, pdf or svg.")
-)
-def risk(
-    source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: OptionValue
-) -> JsonAnswer:
-    """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which
-    characteristics decide it.
-    """
-    from safevar_sumo.analysis.risk.compute import estimate_risk
-
-    options, subject = RiskOptions(**values), load_results_or_study(source, point)
-    check_output(plot, "--plot")
-    result = answer_question(estimate_risk, subject, options, jobs=jobs)
-    if result.errors:
-        print_warning(f"{result.errors} vehicles could not be simulated and are left out")
-    return _show(result, as_json, plot)
-
-
-@add_question(
     RepairOptions,
     "STUDY|RESULTS",
     file_option("--out", "Write a study file with the first repair there, which extends STUDY.", metavar="FILE.toml"),
@@ -210,19 +189,6 @@ def repair(
         write_repair(out, result)
         click.echo(f"The study with it: {out}", err=as_json)
     return answer
-
-
-@add_question(RulesOptions, "STUDY|DIR")
-def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: OptionValue) -> JsonAnswer:
-    """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of
-    a search.
-    """
-    from safevar_sumo.analysis.rules.compute import find_rules
-
-    result = answer_question(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs=jobs)
-    if as_json and result.remark:
-        print_note(result.remark)
-    return _show(result, as_json)
 
 
 @add_question(

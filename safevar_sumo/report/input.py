@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from safevar_sumo.analysis.ask import find_question
 from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
@@ -20,10 +21,6 @@ from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.repair.compute import find_repairs
-from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.risk.compute import estimate_risk
-from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.subject import answer_question, at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
@@ -46,14 +43,12 @@ if TYPE_CHECKING:
 QUESTIONS: Mapping[str, Callable[..., Any]] = {
     "explain": explain_failures,
     "tolerance": find_tolerances,
-    "risk": estimate_risk,
-    "rules": find_rules,
     "repair": find_repairs,
     "rating": rate_variant,
 }
 """The functions that answer the questions of a page, by their commands."""
-SAMPLED_VEHICLES = 4000
-"""Number of vehicles sampled for the section on risk, and for the one on rules."""
+SAMPLES: Mapping[str, JsonObject] = {"risk": {"samples": 4000}, "rules": {"samples": 4000}}
+"""The number of vehicles sampled for these sections; other options are the commands' defaults."""
 EXPLAIN_SIMULATIONS = 30_000
 """Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
 
@@ -91,8 +86,6 @@ class ReportInput:
             ExplainOptions(limit=EXPLAIN_SIMULATIONS),
             OpinionOptions(),
             ToleranceOptions(margin=self.margin),
-            RiskOptions(samples=SAMPLED_VEHICLES),
-            RulesOptions(samples=SAMPLED_VEHICLES),
             CompareOptions(),
             RepairOptions(margin=self.margin),
             RatingOptions(solution=self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None),
@@ -101,11 +94,15 @@ class ReportInput:
 
     def ask(self, question: str, jobs: int | None, progress: Progress) -> Any:
         """The answer to a question of the page."""
+        if question in SAMPLES:
+            return find_question(question).answer([self.case], SAMPLES[question], jobs=jobs, progress=progress)
         options = self.options[question]
         return answer_question(QUESTIONS[question], self.case, options, jobs=jobs, progress=progress)
 
     def command(self, question: str) -> str:
         """The command that prints this answer."""
+        if question in SAMPLES:
+            return find_question(question).command_line([str(self.directory)], self.point, SAMPLES[question])
         return self.options[question].command_line(str(self.directory), self.point)
 
     @cached_property

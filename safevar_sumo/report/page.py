@@ -17,6 +17,7 @@ from urllib.parse import quote
 import pandas as pd
 from markupsafe import Markup
 
+from safevar_sumo.analysis.answer import Answer
 from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.answer import Explained
@@ -296,7 +297,8 @@ def _study_data(
     """The data of one study that the templates of these sections need."""
     explained: Explained | None = answers.get("explain")
     choices, tolerance = explained.choices if explained else [], answers.get("tolerance")
-    about_domain = {name: answer for name, answer in answers.items() if name != "explain"}
+    rendered = {name: answer for name, answer in answers.items() if isinstance(answer, Answer)}
+    about_domain = {name: answer for name, answer in answers.items() if name not in {"explain", *rendered}}
     replays = replay_solutions(data, explained, progress) if "causes" in sections else []
     different = [solution["handle"] for solution in replays if solution["differences"]]
     why = why_different(is_imported=not data.case.has_runs)
@@ -330,10 +332,11 @@ def _study_data(
             name: [part for part in answer.sentences() if isinstance(part, str)]
             for name, answer in about_domain.items()
         },
+        "rendered": {name: Markup(answer.render("html")) for name, answer in rendered.items()},
         "figures": {
             name: figure_data(answer.figure(), answer.to_frame())
             for name, answer in about_domain.items()
-            if name not in ("rules", "repair") and not answer.to_frame().empty  # whose rows are no characteristics
+            if name != "repair" and not answer.to_frame().empty  # whose rows are no characteristics
         },
         **{name: make() for name, make in makers.items() if name in sections},
     }

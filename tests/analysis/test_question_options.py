@@ -9,34 +9,25 @@ import json
 import re
 import shlex
 from dataclasses import fields, replace
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo import Rule, risk, rules
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import commands
 from safevar_sumo.study import load_study
-from safevar_sumo.terminal import WholeTable, answer_as_html
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.analysis.known_regions import Plant, box, made_up_study
 from tests.in_process import InlinePool, refused, run
 
 
-@pytest.mark.parametrize(
-    "options",
-    [ExplainOptions, OpinionOptions, RatingOptions, RepairOptions, RiskOptions, RulesOptions, ToleranceOptions],
-)
+@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, RatingOptions, RepairOptions, ToleranceOptions])
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)
     arguments = inspect.signature(function).parameters
@@ -59,8 +50,6 @@ def test_a_function_takes_and_documents_the_options_of_its_record(options: type[
         ExplainOptions(),
         ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
         ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), margin=0.5),
-        RiskOptions(samples=4000, width=0.01),
-        RulesOptions(samples=4000, unsafe="collision"),
         OpinionOptions(solutions="nsga2:3:0"),
     ],
 )
@@ -109,27 +98,3 @@ def test_limits_are_rounded_to_the_safe_side() -> None:
     assert one.rounded(2.3278, upwards=False) == 2.32
     assert one.rounded(7.999, upwards=True) == 8
     assert replace(one, original=7.9992).rounded(7.999, upwards=True) == 7.9992, "not beyond the original"
-
-
-def test_a_notebook_shows_the_sentences_and_tables_of_the_terminal() -> None:
-    study = load_study(made_up_study(2), title="a < b & <script>")
-    result = risk(study, unsafe="collision", samples=2000, pool=Plant(study, box))
-    page = result._repr_html_()
-    assert page == answer_as_html(result)
-    cells = [("h4", study.title), ("caption", "What decides: share of the variance")]
-    for part in result.sentences():
-        if isinstance(part, str):
-            cells.append(("p", part))
-        elif isinstance(part, WholeTable):
-            for column in part.columns:
-                cells += [("th", column.header), *(("td", cell) for cell in column.cells)]
-    assert len(cells) > 20
-    assert [cell for cell in cells if "<{0}>{1}</{0}>".format(cell[0], escape(str(cell[1]))) not in page] == []
-
-
-def test_rules_have_a_picture() -> None:
-    study = made_up_study(2)
-    result = rules(study, unsafe="collision", pool=Plant(study, box))
-    undefined = Rule({}, None, None, None, None)
-    axis = replace(result, rules=[*result.rules, undefined]).figure().axes[0]
-    assert [label.get_text() for label in axis.get_yticklabels()] == ["a above 7 N m\nb below 3 N m", "everywhere"]

@@ -1,4 +1,4 @@
-"""Intervals, boxes and rules against regions that are known; printed limits against simulations."""
+"""Intervals and boxes against regions that are known; printed limits against simulations."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ import pytest
 import scipy
 from hypothesis import given, settings, strategies as st
 
-from safevar_sumo import risk, rules, simulate, tolerance
-from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.rules.compute import Rule, Rules
+from safevar_sumo import simulate, tolerance
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.tolerance import ToleranceOptions, boxes, compute
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
@@ -28,7 +27,7 @@ from safevar_sumo.study import Limit, load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
+from tests.analysis.known_regions import Plant, Region, made_up_study, nowhere, two_islands
 from tests.in_process import run
 from tests.made_up import case_of
 
@@ -151,66 +150,6 @@ def test_the_promised_record() -> None:
     assert list(record["alone"][0]) == keys
     keys = "characteristic unit original together_low together_high alone_low alone_high specified_low specified_high"
     assert list(record["limits"][0]) == [*keys.split(), "kept", "fails_first", "sentence"]
-
-
-def rules_of(region: Region, n: int = 4, **options: Any) -> Rules:
-    study = made_up_study(n)
-    return rules(study, unsafe="collision", pool=Plant(study, region), **options)
-
-
-def test_a_box_is_one_rule_of_its_two_conditions() -> None:
-    result = rules_of(box)
-    (rule,) = result.rules
-    assert rule.limits == {"a": (pytest.approx(7, abs=0.02), None), "b": (None, pytest.approx(3, abs=0.02))}
-    assert rule.density == pytest.approx(1, abs=0.02)
-    assert rule.coverage == pytest.approx(1, abs=0.02)
-    assert result.unsafe_share == pytest.approx(0.09, abs=0.005)
-    assert rule.density_interval is not None
-    assert rule.density_interval[0] <= rule.density <= rule.density_interval[1]
-
-
-def test_nothing_everything_and_too_little() -> None:
-    assert rules_of(nowhere).to_dict() == []
-    (rule,) = rules_of(everywhere).rules
-    assert (dict(rule.limits), rule.density, rule.coverage) == ({}, 1.0, 1.0)
-    few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
-    assert few.rules == []
-    assert "the command rules --samples N" in few.remark
-
-
-def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:
-    """8 of 10: Clopper and Pearson have 44.4 to 97.5 %."""
-    rule = Rule({"a": (7.0, None)}, 0.8, 0.4, clopper_pearson(8, 10), clopper_pearson(8, 20))
-    assert rule.density_interval == pytest.approx((0.444, 0.975), abs=5e-4)
-    assert [rule.is_denser_than(share) for share in (0.4, 0.5, 0.9)] == [True, False, False]
-
-
-def test_the_promised_record_and_the_same_again() -> None:
-    first, again = (rules_of(box), rules_of(box))
-    assert json.dumps(first.to_dict(), allow_nan=False) == json.dumps(again.to_dict(), allow_nan=False)
-    (record,) = first.to_dict()
-    assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
-    assert list(record["conditions"][0]) == ["characteristic", "at_least", "at_most"]
-
-
-@pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
-def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
-    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the
-    other's interval.
-    """
-    study = made_up_study(2)
-    study = load_study(study, constraints=[constraint]) if constraint else study
-    asked = {number: Plant(study, box) for number in (400, 1000)}
-    shares = {number: rules(study, unsafe="collision", pool=pool, samples=number) for number, pool in asked.items()}
-    estimate = risk(study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000, method="monte_carlo")
-    assert asked[400].seen < asked[1000].seen <= plant.seen
-    assert (shares[1000].unsafe_share, shares[1000].unsafe_interval) == (
-        estimate.probability,
-        pytest.approx(estimate.interval),
-    )
-    for one, other in ((400, 1000), (1000, 400)):
-        low, high = shares[one].unsafe_interval
-        assert low < shares[other].unsafe_share < high
 
 
 LINEAR = np.array([1.0, 2.0, 3.0])

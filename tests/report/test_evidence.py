@@ -111,7 +111,7 @@ def not_same(*arguments: str) -> list[dict[str, str]]:
 def test_a_pack_holds_the_page_and_the_answers_and_verifies(
     slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(report_input, "SAMPLED_VEHICLES", 300)
+    monkeypatch.setattr(report_input, "SAMPLES", {key: {"samples": 300} for key in ("risk", "rules")})
     pack = tmp_path / "pack.zip"
     run("evidence", str(slippery), "--out", str(pack), "--explain", "--risk")
     _, files = read_pack(pack)

@@ -14,7 +14,7 @@ import jsonschema
 import msgspec
 import pytest
 
-from safevar_sumo.analysis.risk.variation import VariationModel
+from safevar_sumo.analysis.variation import VariationModel
 from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.manifest import evaluation_keys

@@ -1,0 +1,97 @@
+"""How the characteristics of real vehicles vary, by a study's `[variation]` and `[[correlations]]`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.study.characteristics import (
+    Distribution,
+    Fixed,
+    Lognormal,
+    Normal,
+    Triangular,
+    Uniform,
+    stated_values,
+)
+from safevar_sumo.vehicles import Characteristic, FeasibleRegion, region_of
+from safevar_sumo.vehicles.region import REJECTIONS
+
+
+class VariationModel:
+    """The random variation of a study's characteristics, by its `[variation]` and `[[correlations]]`.
+
+    Raises
+    ------
+    InputError
+        If the correlations contradict each other.
+    """
+
+    def __init__(self, study: Study) -> None:
+        self.region: FeasibleRegion = region_of(study)
+        self.characteristics = self.region.characteristics
+        distributions = [study.variation.get(name, Uniform()) for name in self.characteristics.names]
+        self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
+        self.is_correlated, correlations = bool(study.correlations), np.eye(len(distributions))
+        for correlation in study.correlations:
+            first, second = map(self.characteristics.names.index, correlation.between)
+            correlations[first, second] = correlations[second, first] = correlation.value
+        try:
+            self._factor = np.linalg.cholesky(correlations)
+        except np.linalg.LinAlgError:
+            pairs = ", ".join(f"{' and '.join(pair.between)} {pair.value:g}" for pair in study.correlations)
+            problem = f"correlations contradict each other: {pairs}"
+            raise InputError(study.source, problem, "a positive definite matrix") from None
+
+    def settings(self, probabilities: FloatArray) -> FloatArray:
+        """Settings at N independent points of the unit cube, shape (N, n), correlated by a Gaussian copula."""
+        if self.is_correlated:
+            probabilities = scipy.stats.norm.cdf(scipy.stats.norm.ppf(probabilities) @ self._factor.T)
+        columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
+        return np.clip(np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper)
+
+    def draw(self, number: int, rng: np.random.Generator, source: object) -> FloatArray:
+        """Random vehicles that satisfy the constraints, shape (number, n)."""
+        settings = self.region.draw_feasible(
+            lambda count: self.settings(rng.random((count, len(self.characteristics)))), number
+        )
+        if len(settings) < number:
+            raise InputError(
+                source,
+                f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: {self.region}",
+                "a [variation] and [[constraints]] that agree",
+            )
+        return settings
+
+
+def _quantile_function(
+    characteristic: Characteristic, distribution: Distribution
+) -> Callable[[FloatArray], FloatArray]:
+    """The function that turns cumulative probabilities into values in the characteristic's unit."""
+    low, high, original = characteristic.lower, characteristic.upper, characteristic.original
+    stated = stated_values(distribution)
+    match distribution:
+        case Fixed():
+            return lambda p: np.full_like(p, stated.get("value", original))
+        case Uniform() | Triangular():
+            lower, upper = stated.get("lower", low), stated.get("upper", high)
+            if isinstance(distribution, Uniform):
+                return lambda p: lower + p * (upper - lower)
+            triangle = scipy.stats.triang(
+                (stated.get("mode", original) - lower) / (upper - lower), lower, upper - lower
+            )
+            return lambda p: triangle.ppf(p)
+        case Normal():
+            mean, deviation = stated.get("mean", original), stated["deviation"]
+            normal = scipy.stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, mean, deviation)
+            return lambda p: normal.ppf(p)
+        case Lognormal():
+            mean, deviation = np.log(stated.get("median", original)), stated["sigma"]
+            ends = (np.log(low) - mean) / deviation, (np.log(high) - mean) / deviation
+            logarithm = scipy.stats.truncnorm(*ends, mean, deviation)
+            return lambda p: np.exp(logarithm.ppf(p))
