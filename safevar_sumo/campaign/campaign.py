@@ -169,9 +169,8 @@ def measure_speed(task: Task, pool: Pool) -> float:
     """
     system = system_of(task.study)
     characteristics, size = system.characteristics, max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
-    drawn = np.random.default_rng(task.study.search.seed).random((pool.workers, size, len(characteristics)))
-    settings = characteristics.lower + drawn * (characteristics.upper - characteristics.lower)
-    jobs = [(task, characteristics.filter(rows)) for rows in settings]
+    rng, shape = np.random.default_rng(task.study.search.seed), (pool.workers, size, len(characteristics))
+    jobs = [(task, rows) for rows in rng.uniform(characteristics.lower, characteristics.upper, shape)]
     carry_out(evaluate_settings, [(task, rows[:1]) for _, rows in jobs], pool)  # workers load the study
     start = time.perf_counter()
     carry_out(evaluate_settings, jobs, pool)

@@ -11,7 +11,7 @@ import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -143,17 +143,12 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
     InputError
         If the scheduler does not answer, or the extra `cluster` is not installed.
     """
-    if cluster is not None:
-        with dask.connect(cluster) as client:
+    with ExitStack() as stack:
+        if cluster is None:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True))
+            pool = Pool(jobs or available_cores(), lambda place: local.ProcessWorker(Path(folder, f"{place}.txt")))
+        else:
+            client = stack.enter_context(dask.connect(cluster))
             pool = Pool(max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client))
-            try:
-                yield pool
-            finally:
-                pool.close()
-        return
-    with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
-        pool = Pool(jobs or available_cores(), lambda place: local.ProcessWorker(Path(folder, f"{place}.txt")))
-        try:
-            yield pool
-        finally:
-            pool.close()
+        stack.callback(pool.close)
+        yield pool
