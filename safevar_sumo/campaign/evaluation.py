@@ -124,6 +124,9 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     """Evaluate settings of n characteristics, and values of the selected parameters, shape (k, n + p), in equal
     batches.
 
+    A batch that fails is halved until the failing settings are alone: a setting that SUMO cannot simulate gets the
+    outcome `simulator-error`.
+
     Raises
     ------
     UserCodeError
@@ -131,39 +134,38 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     EnvironmentFault
         If this machine lacks memory, disk space or files.
     """
-    batches = np.array_split(rows, max(math.ceil(len(rows) / task.batch_size), 1))
-    try:
-        return Evaluations.concatenate([_evaluate_or_halve(task, batch) for batch in batches])
-    except (OSError, MemoryError) as error:
-        raise EnvironmentFault(f"a batch cannot be computed: {str(error) or 'no memory is left'}") from None
-
-
-def _evaluate_or_halve(task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate a batch. One that fails is halved until the failing settings are alone: a setting that SUMO cannot
-    simulate gets the outcome `simulator-error`.
-    """
+    if len(rows) > task.batch_size:
+        batches = np.array_split(rows, math.ceil(len(rows) / task.batch_size))
+        return Evaluations.concatenate([evaluate_settings(task, batch) for batch in batches])
     try:
         return evaluate_batch(task, rows)
     except (SimulationError, UserCodeError) as error:
         failure = error
-    if len(rows) > 1:
-        halves = [_evaluate_or_halve(task, half) for half in np.array_split(rows, 2)]
-        if isinstance(failure, UserCodeError):
-            raise failure
-        return Evaluations.concatenate(halves)
-    characteristics, undefined = CharacteristicSet.of(task.study), np.full(1, np.nan)
-    values = rows[:, : len(characteristics)]  # without the ADS's parameters
+    except (OSError, MemoryError) as error:
+        raise EnvironmentFault(f"a batch cannot be computed: {str(error) or 'no memory is left'}") from None
+    if len(rows) == 1:
+        return _failed_evaluation(task.study, rows, failure)
+    halves = [evaluate_settings(task, half) for half in np.array_split(rows, 2)]
     if isinstance(failure, UserCodeError):
-        command = reproduction_command(task.study, values[0])
+        raise failure
+    return Evaluations.concatenate(halves)
+
+
+def _failed_evaluation(study: Study, row: FloatArray, failure: SimulationError | UserCodeError) -> Evaluations:
+    """The evaluation of a setting that SUMO cannot simulate; raises the error of user code, with a command."""
+    characteristics, undefined = CharacteristicSet.of(study), np.full(1, np.nan)
+    setting = row[:, : len(characteristics)]  # without the ADS's parameters
+    if isinstance(failure, UserCodeError):
+        command = reproduction_command(study, setting[0])
         raise UserCodeError(failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal) from None
     return Evaluations(
-        settings=rows,
+        settings=row,
         outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
         collision_speed=undefined,
         metrics=dict.fromkeys(METRICS, undefined),
-        f_diff=characteristics.largest_change(values),
-        f_num_diff=characteristics.number_changed(values),
-        reasons={rows[0].tobytes(): " ".join(str(failure).split())},
+        f_diff=characteristics.largest_change(setting),
+        f_num_diff=characteristics.number_changed(setting),
+        reasons={row[0].tobytes(): " ".join(str(failure).split())},
     )
 
 

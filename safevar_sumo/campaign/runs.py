@@ -107,7 +107,7 @@ class Run:
         """Number of settings in all earlier requests."""
         self._missing = dict[bytes, int]()
         """The first position in the run of each setting in this request that is not known."""
-        self.is_finished = budget in journal.content.results
+        self.is_finished = self._has_ended = budget in journal.content.results
         if self.is_finished:
             self.solutions = journal.content.take_positions(journal.content.results[budget])
 
@@ -116,14 +116,14 @@ class Run:
         (k, n), none once the search has ended.
         """
         answer = None  # starts a generator
-        while not (self._missing or self.is_finished):
+        while not (self._missing or self._has_ended):
             if len(self._request):
                 answer = self._table.take([self._row_of[setting.tobytes()] for setting in self._request])
                 self._asked += len(answer)
             try:
                 self._request = self._search.send(answer)  # type: ignore[arg-type]
             except StopIteration as end:
-                self.solutions = end.value
+                self.solutions, self._has_ended = end.value, True
                 break
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:

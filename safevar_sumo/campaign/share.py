@@ -16,7 +16,7 @@ from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of,
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, random_generator_of
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import (
     MANIFEST,
     Journal,
@@ -82,10 +82,14 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
     refuse_other_inputs(task, share)
     with ExitStack() as stack:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
-        waiting = [(run, settings) for run in runs if len(settings := run.look_up())]
-        while waiting:
-            _evaluate(task, waiting)
-            waiting = [(run, settings) for run, _ in waiting if len(settings := run.look_up())]
+        while missing := [(run, setting) for run in runs for setting in run.look_up()]:
+            for rows in np.array_split(np.arange(len(missing)), math.ceil(len(missing) / task.batch_size)):
+                if not has_caller():
+                    raise SafevarError("nobody waits for these runs any more")
+                owners = [missing[row][0] for row in rows]
+                evaluations = evaluate_settings(task, np.stack([missing[row][1] for row in rows]))
+                for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
+                    run.receive(evaluations.take([*rows_of_run]))
         remark = _verify(task, [run for run in runs if not run.is_finished]) if share.verifies else ""
         refuse_other_inputs(task, share)
         return [run.finish() for run in runs], remark
@@ -117,19 +121,6 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     )
     search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
     return Run(key, search, Journal(path, head, retry_failed=share.retry_failed), study.search.evaluations)
-
-
-def _evaluate(task: Task, waiting: Sequence[tuple[Run, FloatArray]]) -> None:
-    """Evaluate the settings that runs wait for in equal batches; the runs journal each."""
-    owners = [run for run, settings in waiting for _ in settings]
-    settings, start = np.concatenate([settings for _, settings in waiting]), 0
-    for batch in np.array_split(settings, math.ceil(len(settings) / task.batch_size)):
-        if not has_caller():
-            raise SafevarError("nobody waits for these runs any more")
-        evaluations = evaluate_settings(task, batch)
-        for run, rows in groupby(range(len(batch)), owners[start : start + len(batch)].__getitem__):
-            run.receive(evaluations.take([*rows]))
-        start += len(batch)
 
 
 def _verify(task: Task, runs: Sequence[Run]) -> str:

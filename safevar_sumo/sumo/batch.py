@@ -50,22 +50,18 @@ Listener = Callable[[Observation], None]
 @np.errstate(all="ignore")
 def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     """The metrics and objectives of settings that have been simulated in `runs`."""
-    with user_errors(system.source):
-        return _score(system, settings, runs)
-
-
-def _score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
-    try:
-        metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
-    except InputError as error:
-        if error.source == STUDY_SOURCE:
-            raise InputError(system.source, error.problem, error.legal) from None
-        raise
     is_invalid = runs.outcome == Outcome.INVALID_TEST
-    if is_invalid.any():
-        metrics = {name: np.where(is_invalid, np.nan, values) for name, values in metrics.items()}
-    for name, change in system.measuring.changes.items():
-        metrics[name] = change.function(settings, system.characteristics)
+    with user_errors(system.source):
+        try:
+            metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
+        except InputError as error:
+            if error.source == STUDY_SOURCE:
+                raise InputError(system.source, error.problem, error.legal) from None
+            raise
+        if is_invalid.any():
+            metrics = {name: np.where(is_invalid, np.nan, values) for name, values in metrics.items()}
+        for name, change in system.measuring.changes.items():
+            metrics[name] = change.function(settings, system.characteristics)
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
@@ -130,20 +126,7 @@ def drive(
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
-    outcomes = _Outcomes(len(settings))
-    with check_open_runs(outcomes.is_checked):
-        return _simulate(system, settings, world, outcomes, observer, listen)
-
-
-def _simulate(
-    system: System,
-    settings: FloatArray,
-    world: World,
-    outcomes: _Outcomes,
-    observer: Observer | None,
-    listen: Listener | None,
-) -> SimulationRuns:
-    vehicle, step, n = system.vehicle, world.step_length, len(settings)
+    vehicle, step, n, outcomes = system.vehicle, world.step_length, len(settings), _Outcomes(len(settings))
     prepared, ads, motion = enter(system, settings, world)
     observer = observer or SceneObserver(system.points[0].scenario, world)
     vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
@@ -155,28 +138,31 @@ def _simulate(
     log = _Log(n, int(last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
-    for sample in range(log.length):
-        speed, scene = motion.speeds, observer.observe(motion, outcomes.is_open)
-        if system.sees_nobody:  # the run ends at the place of the encounter
-            scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
-        collisions = contacts.count(world, motion.hits, scene)
-        active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_step)
-        observation = perception.observe(sample * step, speed, scene)._replace(
-            throttle=state.throttle, brake=state.brake
-        )
-        observation, state = vehicle.sense(prepared, state, observation)
-        if listen is not None:
-            listen(observation)
-        command, ads_memory = ads.drive(observation, ads_memory)
-        _note_warnings(warning_ttc, ads.warns(ads_memory), outcomes.is_open, speed, scene)
-        command, state = robot.drive(command, state, outcomes.is_open)
-        log.write(sample, motion.fronts, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
-        if not np.count_nonzero(outcomes.is_open):
-            break
-        np.copyto(outcomes.is_checked, outcomes.is_open)
-        state = vehicle.advance(prepared, state, command)
-        _check_finite(state.speed, settings, system.characteristics)
-        motion = world.step(state.speed, outcomes.is_open)
+    with check_open_runs(outcomes.is_checked):
+        for sample in range(log.length):
+            speed, scene = motion.speeds, observer.observe(motion, outcomes.is_open)
+            if system.sees_nobody:  # the run ends at the place of the encounter
+                scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
+            collisions = contacts.count(world, motion.hits, scene)
+            active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_step)
+            observation = perception.observe(sample * step, speed, scene)._replace(
+                throttle=state.throttle, brake=state.brake
+            )
+            observation, state = vehicle.sense(prepared, state, observation)
+            if listen is not None:
+                listen(observation)
+            command, ads_memory = ads.drive(observation, ads_memory)
+            _note_warnings(warning_ttc, ads.warns(ads_memory), outcomes.is_open, speed, scene)
+            command, state = robot.drive(command, state, outcomes.is_open)
+            log.write(
+                sample, motion.fronts, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake
+            )
+            if not np.count_nonzero(outcomes.is_open):
+                break
+            np.copyto(outcomes.is_checked, outcomes.is_open)
+            state = vehicle.advance(prepared, state, command)
+            _check_finite(state.speed, settings, system.characteristics)
+            motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
         trace=trace,

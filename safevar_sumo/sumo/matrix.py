@@ -105,17 +105,15 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     the result of setting i at its worst point.
     """
     size = _batch_size(system, engine)
-    batches = [settings[start : start + size] for start in range(0, len(settings), size)] or [settings]
-    return Evaluations.concatenate([_evaluate_batch(system, batch, engine) for batch in batches])
-
-
-def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
+    if len(settings) > size:
+        batches = (settings[start : start + size] for start in range(0, len(settings), size))
+        return Evaluations.concatenate([evaluate(system, batch, engine) for batch in batches])
     if system.rater is not None:
         return rate_settings(system, settings, engine)[0]
     if system.matrix:
         results = simulate_all_points(system, settings, engine)
         return evaluations_at_worst_points(system, [result.evaluations for result in results])
-    return score(system, settings, simulate(system, settings, engine))
+    return score(system, settings, drive_all(system, settings, engine))
 
 
 def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple[Evaluations, CellResults]:

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
-from safevar_sumo.campaign import evaluation
+from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, reproduction_command
 from safevar_sumo.campaign.pool import Pool, WorkerLostError, open_pool
 from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
@@ -21,8 +21,10 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import SUN, evaluated
+from tests.campaign.formulas import SUN, evaluated, solutions
+from tests.in_process import searched
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 
@@ -93,6 +95,13 @@ def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
         carry_out(evaluate_settings, [(Task(study=wrong), SUN.original[np.newaxis])], pool)
     assert "expected" in str(caught.value)
     assert carry_out(evaluate_settings, [(Task(study=study), SUN.original[np.newaxis])], pool)[0].valid.all()
+
+
+def test_a_study_in_worker_processes_has_the_solutions_of_this_one(tmp_path: Path) -> None:
+    study = load_study("smoke", search={"algorithms": ["rs"], "evaluations": 20, "runs": 2})
+    with open_pool(2) as pool:
+        run_campaign(study, assemble(study), all_runs(study), tmp_path / "a", pool, show_no_progress, pytest.fail)
+    assert solutions(tmp_path / "a") == solutions(searched(study, tmp_path / "b"))
 
 
 STUDY = load_study("sun")
