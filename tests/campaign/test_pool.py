@@ -83,14 +83,14 @@ def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(poo
     with pytest.raises(SafevarError, match=f"study 'smoke': {why}"):
         carry_out(take, [(Task(study=study), 9)], pool)
     assert not processes(), "it would keep a core busy beside its successor"
-    mine = msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine"))
+    mine = msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine"), spread={})
     with pytest.raises(UserCodeError, match=r"probably in ads\.model = 'my_ads:Mine'"):
         carry_out(take, [(Task(study=mine), 9)], pool)
 
 
 def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
     study = load_study("smoke")
-    wrong = msgspec.structs.replace(study, ads=ModelTable(model="world_on_roads"))
+    wrong = msgspec.structs.replace(study, ads=ModelTable(model="world_on_roads"), spread={})
     with pytest.raises(InputError, match="world_on_roads") as caught:
         carry_out(evaluate_settings, [(Task(study=wrong), SUN.original[np.newaxis])], pool)
     assert "expected" in str(caught.value)
@@ -106,7 +106,7 @@ def test_a_study_in_worker_processes_has_the_solutions_of_this_one(tmp_path: Pat
 
 STUDY = load_study("sun")
 WITH_USER_CODE = msgspec.structs.replace(
-    STUDY, ads=ModelTable(model="my_ads:Mine"), origin=Origin(called="my study.toml")
+    STUDY, ads=ModelTable(model="my_ads:Mine"), spread={}, origin=Origin(called="my study.toml")
 )
 
 
