@@ -185,7 +185,7 @@ def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) 
             verdicts[driver] = verdicts[driver.replace(ANY_LEADER, LETTER)]
             continue
         ads = ModelTable(model=model, parameters={**approach, **parameters})
-        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads))
+        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads, spread={}))
         runs = with_driver.evaluate(with_original, "reference drivers in the same vehicle")
         avoided = np.where(runs.valid, ~runs.collided, np.nan)
         verdicts[driver] = avoided[1:] if avoided[0] == 1 else np.full(len(settings), np.nan)

@@ -16,9 +16,11 @@ from msgspec.structs import replace as replace_in
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
+from safevar_sumo.analysis.evaluator import open_evaluator
 from safevar_sumo.analysis.repair import attack, compute, smallest
 from safevar_sumo.analysis.repair.answer import write_repair
-from safevar_sumo.analysis.repair.problem import Parameter
+from safevar_sumo.analysis.repair.problem import Parameter, RepairProblem
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import FreeParameter
@@ -221,6 +223,14 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
     (summary,) = json.loads(done.stdout)
     assert summary["repairs"] == 0
     assert not out.exists()
+
+
+def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_does_not_have() -> None:
+    study = sv.load_study("rain")
+    assert any(key.startswith("ads.parameters.") for key in study.spread)
+    with open_evaluator(study, InlinePool()) as evaluator:
+        problem: Any = RepairProblem(evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3))  # type: ignore[arg-type]
+        assert problem.repairable(evaluator.characteristics.original[np.newaxis]).all()
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:

@@ -241,7 +241,7 @@ class RepairProblem:
     def best_driver(self) -> Evaluator:
         """Full braking at the first possible moment."""
         ads = ModelTable(model="full_braking", parameters=approach_parameters(assemble(self.study)))
-        return self.evaluator.for_study(replace_in(self.study, ads=ads), verified=0)
+        return self.evaluator.for_study(replace_in(self.study, ads=ads, spread={}), verified=0)
 
     def repairable(self, settings: FloatArray) -> BoolArray:
         """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe."""
