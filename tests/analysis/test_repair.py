@@ -230,7 +230,7 @@ def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_d
     assert any(key.startswith("ads.parameters.") for key in study.spread)
     with open_evaluator(study, InlinePool()) as evaluator:
         problem: Any = RepairProblem(evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3))  # type: ignore[arg-type]
-        assert problem.repairable(evaluator.characteristics.original[np.newaxis]).all()
+        assert problem.best_driver.evaluate(evaluator.characteristics.original[np.newaxis], "").f_safe[0] > 0.3
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
