@@ -269,7 +269,9 @@ def violation(candidate: Any, base: type) -> str:
             return f"has no method {method}"
         # A static or class method takes no `self`.
         takes_self = inspect.isfunction(inspect.getattr_static(candidate, name, getattr(base, name)))
-        if not accepts(attribute, takes_self + len(parameters)):
+        try:
+            inspect.signature(attribute).bind(*[None] * (takes_self + len(parameters)))
+        except TypeError:
             return f"has a method {name} that does not take ({', '.join(parameters)})"
     return ""
 
@@ -295,17 +297,6 @@ def _methods(base: type) -> dict[str, list[str]]:
         for name, method in vars(base).items()
         if inspect.isfunction(method) and not name.startswith("_")
     }
-
-
-def accepts(function: Any, count: int) -> bool:
-    """Whether a function can be called with `count` positional arguments; True if the function has no signature."""
-    try:
-        inspect.signature(function).bind(*[None] * count)
-    except TypeError:
-        return False
-    except ValueError:  # compiled code, without a signature
-        return True
-    return True
 
 
 def read_only(value: UserValue) -> Any:
