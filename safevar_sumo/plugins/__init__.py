@@ -21,9 +21,7 @@ from safevar_sumo.plugins.contract import (
 )
 from safevar_sumo.plugins.files import (
     Files as Files,
-    changed_files as changed_files,
     code_files as code_files,
-    digest_of as digest_of,
     digests as digests,
     file_by_name as file_by_name,
     files_in as files_in,

@@ -8,8 +8,8 @@ import ast
 import os
 import sys
 import sysconfig
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from hashlib import file_digest
+from collections.abc import Iterable, Iterator, Sequence
+from hashlib import sha256
 from pathlib import Path
 
 from safevar_sumo.output import file_beside
@@ -86,16 +86,7 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
         The folders of the study's file and of the files that it extends.
     """
     named = {_name_of(Path(os.path.abspath(path)), folders): path for path in paths}
-    return {name: digest_of(path) for name, path in sorted(named.items())}
-
-
-def digest_of(path: Path | str) -> str:
-    """Digest of a file's bytes; "" for a missing file."""
-    try:
-        with open(path, "rb") as file:
-            return file_digest(file, "sha256").hexdigest()[:DIGEST_LENGTH]
-    except OSError:
-        return ""
+    return {name: sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH] for name, path in sorted(named.items())}
 
 
 def _name_of(path: Path, folders: Sequence[str]) -> str:
@@ -116,8 +107,3 @@ def is_shipped(name: str) -> bool:
 
 def _naming_folders(folders: Sequence[str]) -> list[str]:
     return [str(NETWORKS), *folders, os.getcwd(), *filter(os.path.isabs, sys.path)]
-
-
-def changed_files(before: Mapping[str, str], folders: Sequence[str]) -> list[str]:
-    """Names of files that no longer have the digests `before`."""
-    return [name for name, digest in before.items() if digest_of(file_by_name(name, folders)) != digest]
