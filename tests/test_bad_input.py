@@ -1,11 +1,21 @@
-"""What a user may type wrongly, and what the command says in one or two lines before it ends with code 2."""
+"""What a user may type wrongly, and what the command says in one or two lines before it ends with code 2; whatever is
+in a study file is a study or an error of one kind, never a traceback.
+"""
 
 from __future__ import annotations
 
+import math
+import tempfile
 from pathlib import Path
 
 import pytest
+import tomli_w
+from hypothesis import HealthCheck, given, settings, strategies as st
 
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import JsonObject
+from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.sumo.system import assemble
 from tests.in_process import refused
 
 FILES = {
@@ -120,3 +130,45 @@ def test_bad_input_ends_with_code_2_and_changes_no_file(
     refused(*typed.split(), message=(told,))
     assert (sorted(place.glob("[!_]*/*")), sorted(place.iterdir())) == before
     assert Path("solutions.csv").read_text() == "stored"
+
+
+TABLES = tables_of(load_study("smoke"))
+SCALARS = st.one_of(
+    st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times()
+)
+ANYTHING = st.recursive(
+    SCALARS,
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)),
+    max_leaves=6,
+)
+
+
+def paths(tables: JsonObject, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Every key of nested tables."""
+    inner = [path for key, value in tables.items() if isinstance(value, dict) for path in paths(value, (*before, key))]
+    return [*((*before, key) for key in tables), *inner]
+
+
+def replaced(tables: JsonObject, path: tuple[str, ...], value: object) -> JsonObject:
+    key, *rest = path
+    return {**tables, key: value if not rest else replaced(tables[key], tuple(rest), value)}
+
+
+@pytest.mark.slow
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
+@given(path=st.sampled_from(paths(TABLES)), value=ANYTHING)
+def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, ...], value: object) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mine.toml"
+        try:
+            file.write_text(tomli_w.dumps(replaced(TABLES, path, value)), encoding="utf-8")
+        except (ValueError, UnicodeError):
+            return
+        try:
+            study = load_study(str(file))
+            assemble(study, str(file))
+        except InputError:
+            return
+        assert isinstance(study, Study)
+        numbers = list(study.vehicle.characteristics.values())
+        assert all(math.isfinite(row.original) and row.lower < row.upper for row in numbers)

@@ -1,20 +1,26 @@
-"""Every ADS: vehicles are independent, pedals are in range, a scalar ADS has an instance per vehicle; warnings."""
+"""Every ADS: vehicles are independent, pedals are in range, a scalar ADS has an instance per vehicle; warnings.
+Commands of the shipped ADSs are those of their formulas.
+"""
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import assume, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
+from msgspec.structs import force_setattr
 
 from safevar_sumo.ads import ADS, Ads, PerVehicleAds, ScalarAds
-from safevar_sumo.ads.aeb import Aeb
+from safevar_sumo.ads.aeb import Aeb, AutowareAeb
+from safevar_sumo.ads.car_following import Krauss
+from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation, PedalTables, SimulationRuns
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.study import ModelTable, load_study, study_names
 from safevar_sumo.sumo.system import assemble
@@ -29,7 +35,22 @@ SYSTEMS = {
 }
 TAKE_OVER = {"aeb", "autoware_aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
 """ADSs that keep the initial speed."""
-KNOWN = assemble(load_study("sun")).nominal
+FAR = 1e6
+COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
+SPEEDS = np.arange(0.0, 20.5, 0.5)
+KNOWN = Nominal(
+    mass=1500.0,
+    accel=3.0,
+    decel=8.0,
+    max_speed=50.0,
+    actuator_lag=0.2,
+    tables=lambda: PedalTables(
+        speeds=SPEEDS,
+        full_throttle=np.full(len(SPEEDS), FULL),
+        coasting=np.full(len(SPEEDS), COASTING),
+        braking=BRAKING,
+    ),
+)
 
 
 @pytest.fixture(params=sorted(ADS))
@@ -37,16 +58,19 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def observation(time: float, speed: FloatArray, gap: FloatArray, lateral: FloatArray) -> Observation:
-    return Observation(time, speed, gap, speed, lateral, np.full_like(speed, 1.8), 1.0)
+def seen(
+    time: float, speed: FloatArray | float, gap: FloatArray | float, lateral: float = 0.0, visibility: float = 1.0
+) -> Observation:
+    """What vehicles see of a target that stands in their way and moves across it at 1.8 m/s."""
+    zero = np.zeros(np.size(gap))
+    return Observation(time, zero + speed, zero + gap, zero + speed, zero + lateral, zero + 1.8, visibility)
 
 
 def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> FloatArray:
     """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals are."""
     memory, pedals = ads.start(len(speed), nominal, STEP), []
     for step in range(80):
-        seen = observation(step * STEP, speed, gap - speed * step * STEP, np.zeros_like(speed))
-        command, memory = ads.drive(seen, memory)
+        command, memory = ads.drive(seen(step * STEP, speed, gap - speed * step * STEP), memory)
         pedals.append(np.stack(command))
     return np.stack(pedals)
 
@@ -88,14 +112,14 @@ class Timid(ScalarAds):
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
-    ads = PerVehicleAds(Timid, UserCode("it.toml", "ads"))
-    memory = ads.start(3, KNOWN, STEP)
+    ads, nominal = PerVehicleAds(Timid, UserCode("it.toml", "ads")), SYSTEMS["krauss"].nominal
+    memory = ads.start(3, nominal, STEP)
     gap = np.array([5.0, 50.0, 50.0])
     for expected in ([0.0, 0.1, 0.1], [0.0, 0.2, 0.2]):
-        command, memory = ads.drive(observation(0.0, np.zeros(3), gap, np.zeros(3)), memory)
+        command, memory = ads.drive(seen(0.0, 0.0, gap), memory)
         assert command.throttle.tolist() == pytest.approx(expected)
         assert command.brake.tolist() == [1.0, 0.0, 0.0]
-    assert memory[0].nominal.mass == KNOWN.mass
+    assert memory[0].nominal.mass == nominal.mass
     assert not memory[0].nominal.speeds.flags.writeable
     assert memory[0].step == STEP
 
@@ -144,3 +168,165 @@ def test_an_ads_of_ones_own_warns() -> None:
     for ads in (PerVehicleAds(Near, UserCode("it.toml", "ads")), for_many):
         run = driven(CarToCar(test="CCRs", speed=36), ads, np.stack([original, original]))
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)
+
+
+def world_on_rails(**changes: object) -> WorldOnRails:
+    return WorldOnRails(
+        **{
+            **{
+                "first_command": 0.0,
+                "latency": 0.0,
+                "corridor": 2.5,
+                "brake_gap": 9.0,
+                "brake_gap_per_speed": 0.0,
+                "brake_place": 0.0,
+                "brake_gap_before": 0.0,
+                "brake_gap_past": 0.0,
+                "throttle": (0.9, 0.7, 0.4),
+            },
+            **changes,
+        }
+    )  # type: ignore[arg-type]
+
+
+def apollo(**changes: float) -> Apollo:
+    return Apollo(
+        **{
+            **{
+                "first_command": 0.0,
+                "cruise_speed": 8.0,
+                "cruise_gain": 1.0,
+                "cruise_acceleration": 1.5,
+                "jerk": 5.0,
+                "stop_gap": 5.0,
+                "comfortable_deceleration": 2.0,
+                "largest_deceleration": 3.0,
+                "creep_speed": 0.5,
+                "creep_time": 1.0,
+                "pedal_lag": 0.1,
+            },
+            **changes,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("speed", "throttle"),
+    [
+        (0.0, 0.9),
+        (4 / 3, 0.8),
+        (8 / 3, 0.7),
+        (4.0, 0.55),
+        (16 / 3, 0.4),
+        (20 / 3.6 - 1e-6, 0.4),
+        (20 / 3.6 + 1e-6, 0.0),
+    ],
+)
+def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_kmh(
+    speed: float, throttle: float
+) -> None:
+    ads = world_on_rails()
+    command, _ = ads.drive(seen(1.0, speed, FAR), ads.start(1, KNOWN, STEP))
+    assert command.throttle[0] == pytest.approx(throttle)
+
+
+@pytest.mark.parametrize(("gap", "speed", "brakes"), [(0.6, 1.0, 1), (0.5, 1.0, 0), (0.4, 0.0, 0), (-0.2, 1.0, 0)])
+def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(gap: float, speed: float, brakes: int) -> None:
+    """Though it braked before, and whether it moves or stands."""
+    ads = world_on_rails(release_gap=0.5)
+    memory = ads.start(1, KNOWN, STEP)._replace(is_braking=np.ones(1, dtype=bool))
+    command, _ = ads.drive(seen(1.0, speed, gap), memory)
+    assert (command.brake[0], command.throttle[0] > 0) == (brakes, not brakes)
+
+
+@given(lateral=st.floats(-3, 3), speed=st.floats(0, 8), gap=st.floats(0, 12))
+def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(
+    lateral: float, speed: float, gap: float
+) -> None:
+    ads = world_on_rails(brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0)
+    short, past = max(-0.4 - lateral, 0.0), max(lateral + 0.4, 0.0)
+    limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
+    assume(abs(gap - limit) > 1e-9)
+    now = seen(1.0, speed, gap, lateral, 0.9)
+    command, memory = ads.drive(now, ads.start(1, KNOWN, STEP))
+    assert bool(command.brake[0]) == (gap < limit and abs(lateral) <= 2.5)
+    # Once it brakes, it goes on until the obstacle has left its corridor.
+    farther_command, _ = ads.drive(now._replace(gap=np.full(1, 50.0)), memory)
+    assert farther_command.brake[0] == command.brake[0]
+    free_command, _ = ads.drive(now._replace(lateral=np.full(1, 2.6)), memory)
+    assert free_command.brake[0] == 0
+
+
+def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> None:
+    ads = world_on_rails(first_command=0.2, latency=0.1)
+    memory, throttle = ads.start(1, KNOWN, STEP), []
+    for k in range(9):
+        command, memory = ads.drive(seen(k * STEP, 0.0, FAR), memory)
+        throttle.append(float(command.throttle[0]))
+    assert throttle == [0.0] * 6 + [0.9] * 3, "0.2 s is step 4, the command arrives two steps later"
+
+
+@pytest.mark.parametrize(("speed", "lag"), [(4.0, 0.1), (8.0, 0.1), (8.0, 0.6)])
+def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_jerk_need_it(
+    speed: float, lag: float
+) -> None:
+    """gap = stop gap + v^2 / (2 b) + v (lag + b / (2 jerk))."""
+    expected = 5.0 + speed**2 / (2 * 2.0) + speed * (lag + 0.5 * 2.0 / 5.0)
+    ads = apollo(pedal_lag=lag, cruise_speed=speed)
+    memory = ads.start(1, KNOWN, STEP)
+    for time in np.arange(0.0, 60.0 / speed, STEP).tolist():
+        command, memory = ads.drive(seen(time, speed, 60.0 - speed * time), memory)
+        if command.brake[0] > 0:
+            break
+    assert expected - 2.5 * speed * STEP < 60.0 - speed * time < expected + 1e-9
+
+
+def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
+    """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest; pedal = (b - coasting) /
+    braking.
+    """
+    ads = apollo(jerk=1e4)
+    memory = ads.start(1, KNOWN, STEP)
+    _, memory = ads.drive(seen(0.0, 8.0, 20.0), memory)
+    for gap, deceleration in ((18.0, 64 / 26), (17.0, 64 / 24), (12.0, 3.0)):
+        command, memory = ads.drive(seen(STEP, 8.0, gap), memory)
+        assert command.brake[0] == pytest.approx((deceleration - COASTING) / BRAKING)
+        assert command.throttle[0] == 0
+
+
+@given(speed=st.floats(0, 20), gap=st.floats(0, 100))
+def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap: float) -> None:
+    """v tau + v^2 / (2 b) = gap - standing gap, reached within a step and the vehicle's lag; at the end 0.5 m/s^2."""
+    ads = Krauss()
+    command, _ = ads.drive(seen(0.0, speed, gap), ads.start(1, KNOWN, STEP))
+    b = 0.6 * KNOWN.decel
+    room = max(gap - 2.5, 0.0)
+    safe_speed = float(np.roots([1 / (2 * b), 1.0, -room]).max()) if room else 0.0
+    safe_speed = max(safe_speed, room**0.5)
+    acceleration = (min(safe_speed, 13.89) - speed) / (STEP + KNOWN.actuator_lag)
+    assert command.throttle[0] == pytest.approx(min(max(acceleration / KNOWN.accel, 0), 1), abs=1e-6)
+    assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)
+
+
+def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
+    speed = np.repeat([30, 40, 60], 2) / 3.6
+    deceleration, jerk = np.tile([3.0, 2.5], 3), np.tile([3.0, 1.5], 3)
+    ads = copy.copy(AutowareAeb())
+    force_setattr(ads, "target_acceleration", deceleration)
+    force_setattr(ads, "target_jerk", jerk)
+    ramp = deceleration / jerk
+    while_ramp = speed * ramp - jerk * ramp**3 / 6
+    after = speed - jerk * ramp**2 / 2
+    stop = speed * ads.command_delay + while_ramp + after**2 / (2 * deceleration)
+    margins = speed * ads.t_response + speed**2 / (2 * ads.a_ego_min) + ads.longitudinal_offset_margin - stop
+    assert margins == pytest.approx([3.6, -1.3, 4.5, -3.2, 6.1, -8.5], abs=0.06)
+    gap, step = ads.distance(speed, np.zeros(6)) - 1e-9, 0.001
+    memory = ads.start(6, KNOWN, step)
+    for sample in range(12_000):
+        held = COASTING / (FULL + COASTING) + 0 * speed
+        now = Observation(sample * step, speed, gap, speed, 0 * speed, 0 * speed, 1.0, throttle=held)
+        command, memory = ads.drive(now, memory)
+        pull = command.throttle * (FULL + COASTING) - COASTING - command.brake * BRAKING
+        following = np.maximum(speed + pull * step, 0.0)
+        gap, speed = gap - (speed + following) / 2 * step, following
+    assert gap == pytest.approx(margins, abs=0.01)

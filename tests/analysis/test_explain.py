@@ -38,7 +38,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of
 from safevar_sumo.sumo import assemble, evaluate
 from safevar_sumo.terminal import print_answer
-from tests.analysis.known_regions import (
+from tests.analysis.conftest import (
     ORIGINAL,
     Plant,
     box,

@@ -34,7 +34,7 @@ from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
-from tests.analysis.known_regions import box, made_up_evaluator
+from tests.analysis.conftest import box, made_up_evaluator
 from tests.in_process import InlinePool
 from tests.made_up import made_up_runs, original_of
 

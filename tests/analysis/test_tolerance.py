@@ -27,7 +27,7 @@ from safevar_sumo.study import Limit, load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.analysis.known_regions import Plant, Region, made_up_study, nowhere, two_islands
+from tests.analysis.conftest import Plant, Region, made_up_study, nowhere, two_islands
 from tests.in_process import run
 from tests.made_up import case_of
 

@@ -10,7 +10,7 @@ from safevar_sumo.analysis.case import Case
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.campaign import local
 from safevar_sumo.report import input as report_input, report
-from tests.analysis.known_regions import Plant
+from tests.analysis.conftest import Plant
 
 
 @pytest.fixture(scope="session")

@@ -40,8 +40,7 @@ from safevar_sumo.analysis.research_questions.statistics import (
     signed_rank_test,
 )
 from safevar_sumo.study import CharacteristicTable
-from tests.research_questions.made_up import made_up, made_up_study, row
-from tests.research_questions.test_questions import three_algorithms
+from tests.research_questions.test_questions import made_up, made_up_study, row, three_algorithms
 
 FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
 
