@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -69,6 +70,7 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
     the test's folder.
     """
     out, err, code = io.StringIO(), io.StringIO(), None
+    handler = signal.getsignal(signal.SIGINT)  # a command that fails ignores Ctrl-C, and so would later processes
     loaded_modules = set(sys.modules)
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
@@ -77,6 +79,7 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
             main()
         except SystemExit as end:
             code = end.code
+    signal.signal(signal.SIGINT, handler)
     for name in set(sys.modules) - loaded_modules:
         file = str(getattr(sys.modules[name], "__file__", None) or "")
         if file.startswith(os.getcwd()) and not file.startswith(sys.prefix):

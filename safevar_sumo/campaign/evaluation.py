@@ -23,7 +23,7 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_cells, settings_per_batch
+from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_cells
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
@@ -188,7 +188,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     settings, values = rows[:, :n], rows[:, n:]
     if not values.size:
         return evaluate(system, settings, task.engine)
-    if selection.arrays and len(rows) <= settings_per_batch(system, task.engine):
+    if selection.arrays:
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
         return replace(evaluate(system, settings, task.engine), settings=rows)
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)

@@ -12,7 +12,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol
@@ -24,10 +23,6 @@ SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two looks at the jobs under way [s]."""
 MAX_DEATHS = 1
 """Number of workers that may die of a job: another process may have killed one."""
-
-
-Ended = SimpleQueue[tuple[int, int, Future[Any]]]
-"""The place of a worker, the number of its job, and the future that has ended."""
 
 
 class WorkerLostError(SafevarError):
@@ -84,17 +79,19 @@ class Pool:
         """
         results, deaths = dict[int, Any](), Counter[int]()
         waiting, idle = deque(range(len(jobs))), deque(range(self.workers))
-        ended: Ended = SimpleQueue()
+        ended, under_way = SimpleQueue[Future[Any]](), dict[Future[Any], tuple[int, int]]()
         while len(results) < len(jobs):
             while waiting and idle:
                 place, number = idle.popleft(), waiting.popleft()
-                begun = self._begin(place, function, jobs[number])
-                begun.add_done_callback(partial(_put, ended, place, number))
+                future = self._begin(place, function, jobs[number])
+                under_way[future] = place, number
+                future.add_done_callback(ended.put)
             try:
-                place, number, future = ended.get(timeout=SECONDS_BETWEEN_LOOKS)
+                future = ended.get(timeout=SECONDS_BETWEEN_LOOKS)
             except Empty:
                 look([])
                 continue
+            place, number = under_way.pop(future)
             idle.appendleft(place)
             error = future.exception()
             if error is None:
@@ -122,10 +119,6 @@ class Pool:
             self._started.pop(place).end()
         self._started[place] = self._start(place)
         return self._started[place].submit(function, *job)
-
-
-def _put(ended: Ended, place: int, number: int, future: Future[Any]) -> None:
-    ended.put((place, number, future))
 
 
 def available_cores() -> int:

@@ -13,7 +13,7 @@ from safevar_sumo.campaign.evaluation import VERIFIED_SETTINGS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results import Failure, Journal, run_name
+from safevar_sumo.results import Failure, Journal, failures_of, run_name
 from safevar_sumo.search import ALGORITHMS, Algorithm, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -99,10 +99,9 @@ class Run:
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, budget: int) -> None:
         self.key, self._search, self._journal, self._budget = key, search, journal, budget
-        self._positions, self._table = list(journal.content.positions), journal.content.evaluations
-        self._journaled = set(self._positions)
-        self._row_of = {setting.tobytes(): row for row, setting in enumerate(self._table.settings)}
-        self._request = self._table.settings[:0]
+        self._content, self._journaled = journal.content, set(journal.content.positions)
+        settings = journal.content.evaluations.settings
+        self._row_of, self._request = {setting.tobytes(): row for row, setting in enumerate(settings)}, settings[:0]
         self._asked = 0
         """Number of settings in all earlier requests."""
         self._missing = dict[bytes, int]()
@@ -118,7 +117,7 @@ class Run:
         answer = None  # starts a generator
         while not (self._missing or self._has_ended):
             if len(self._request):
-                answer = self._table.take([self._row_of[setting.tobytes()] for setting in self._request])
+                answer = self._content.evaluations.take([self._row_of[setting.tobytes()] for setting in self._request])
                 self._asked += len(answer)
             try:
                 self._request = self._search.send(answer)  # type: ignore[arg-type]
@@ -136,13 +135,15 @@ class Run:
         if not self._journaled.isdisjoint(positions):
             raise InputError(self._journal.path, "holds other settings than this search requests", "another `out`")
         self._journal.append(positions, evaluations)
-        self._row_of |= {setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(self._table))}
-        self._positions += positions
-        self._table = Evaluations.concatenate([self._table, evaluations])
+        known = self._content.evaluations
+        self._row_of |= {setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(known))}
+        self._content = self._content._replace(
+            positions=[*self._content.positions, *positions], evaluations=Evaluations.concatenate([known, evaluations])
+        )
 
     def sample_for_sumo(self, rng: np.random.Generator) -> FloatArray:
         """Sample the settings to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
-        _, requested = self._requested()
+        _, requested = self._content.requested_within(self._budget)
         solutions = {setting.tobytes() for setting in self.solutions.settings}
         is_solution = np.array([setting.tobytes() in solutions for setting in requested.settings], dtype=bool)
         other_rows = np.flatnonzero(~requested.failed & ~is_solution)
@@ -154,14 +155,13 @@ class Run:
         """Journal the result of a search that has ended, and close the journal."""
         if not self.is_finished:
             rows = [self._row_of[setting.tobytes()] for setting in self.solutions.settings]
-            self._journal.finish([self._positions[row] for row in rows], self._budget)
+            self._journal.finish([self._content.positions[row] for row in rows], self._budget)
         self.close()
-        positions, requested = self._requested()
-        failed_rows = np.flatnonzero(requested.failed).tolist()
+        positions, requested = self._content.requested_within(self._budget)
         return RunResult(
             self.key,
             self.solutions,
-            [Failure(*self.key, positions[row], requested.reason(row)) for row in failed_rows],
+            failures_of(self.key, positions, requested),
             simulated=len(requested),
             collisions=int(np.count_nonzero(requested.collided)),
             invalid_tests=int(np.count_nonzero(requested.outcome == Outcome.INVALID_TEST.value)),
@@ -170,11 +170,3 @@ class Run:
     def close(self) -> None:
         """Leave the run to another process."""
         self._journal.close()
-
-    def _requested(self) -> tuple[list[int], Evaluations]:
-        """Positions and evaluations of the known settings within the run's budget, in the order of their positions.
-
-        A journal may hold more: those of a search with a larger budget.
-        """
-        rows = [row for row in np.argsort(self._positions).tolist() if self._positions[row] < self._budget]
-        return [self._positions[row] for row in rows], self._table.take(rows)

@@ -12,6 +12,7 @@ from safevar_sumo.results.load import (
     StoredResults as StoredResults,
     choose_handle as choose_handle,
     failure_lines as failure_lines,
+    failures_of as failures_of,
     handles_of as handles_of,
     load_runs as load_runs,
     row_of_handle as row_of_handle,

@@ -61,7 +61,10 @@ class JournalContent(NamedTuple):
         return self.evaluations.take([row_of[position] for position in positions])
 
     def requested_within(self, budget: int) -> tuple[list[int], Evaluations]:
-        """Positions and evaluations that a run with this budget requested, in the order of its requests."""
+        """Positions and evaluations that a run with this budget requested, in the order of its requests.
+
+        A journal may hold more: those of a search with a larger budget.
+        """
         positions = sorted(position for position in self.positions if position < budget)
         return positions, self.take_positions(positions)
 

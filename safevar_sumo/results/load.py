@@ -14,7 +14,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.records import JsonObject
+from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.journal import journal_head, read_journal
 from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
@@ -34,6 +34,12 @@ class Failure(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.algorithm}:{self.run}, evaluation {self.evaluation}: {self.reason}"
+
+
+def failures_of(key: tuple[str, int], positions: Sequence[int], evaluations: Evaluations) -> list[Failure]:
+    """The settings of a run that could not be simulated."""
+    rows = np.flatnonzero(evaluations.failed).tolist()
+    return [Failure(*key, positions[row], evaluations.reason(row)) for row in rows]
 
 
 def failure_lines(failures: Sequence[Failure]) -> list[str]:
@@ -98,10 +104,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
-        failures += [
-            Failure(algorithm, run, positions[row], evaluations.reason(row))
-            for row in np.flatnonzero(evaluations.failed).tolist()
-        ]
+        failures += failures_of((algorithm, run), positions, evaluations)
         if budget in content.results:
             solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget])))
     frame = evaluations_frame(characteristics, evaluations_of_runs)

@@ -235,13 +235,11 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
     import pandas as pd
 
     file = path / SOLUTIONS
-    numeric_columns = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
+    numbers = dict.fromkeys([*characteristics, "f_safe", "f_diff", *METRICS], float)
+    columns = ["algorithm", *characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS, "outcome"]
     try:
-        frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numeric_columns, "outcome"]]
-        numbers = frame.replace({name: {"": "nan"} for name in numeric_columns}).astype(
-            dict.fromkeys(numeric_columns, float)
-        )
-        return numbers.astype({"f_num_diff": int})
+        frame = pd.read_csv(file, keep_default_na=False, na_values=[""], float_precision="round_trip")
+        return frame[columns].astype({**numbers, "f_num_diff": int})
     except (OSError, KeyError, ValueError) as error:
         problem = f"holds no imported solutions: {str(error).splitlines()[0]}"
         raise InputError(file, problem, "what the command `import` has written") from None
