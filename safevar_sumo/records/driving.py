@@ -170,7 +170,7 @@ class Trace:
     obstacle_speed: FloatArray = field(default_factory=lambda: ZERO)
     pedal: FloatArray = field(default_factory=lambda: ZERO)
 
-    def of(self, vehicles: slice) -> Trace:
+    def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
         return replace(self, **{name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2})
@@ -212,7 +212,7 @@ class SimulationRuns:
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
 
-    def of(self, vehicles: slice) -> SimulationRuns:
+    def of(self, vehicles: slice | IntArray) -> SimulationRuns:
         """The runs of some of the vehicles."""
 
         def select(values: np.ndarray) -> np.ndarray:

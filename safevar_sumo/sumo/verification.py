@@ -70,14 +70,15 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
     points, failures = system.points, list[str]()
     if system.rater is not None:
         points = tuple(points[k] for k in np.linspace(0, len(points) - 1, RATED_POINTS).astype(int))
-    for start in range(0, len(settings), MAX_COPIES):
-        batch = settings[start : start + MAX_COPIES]
-        for result in chain.from_iterable(simulate_groups(replace(system, matrix=points, rater=None), batch)):
-            at_point = system.at(result.point)
+    for result in chain.from_iterable(simulate_groups(replace(system, matrix=points, rater=None), settings)):
+        at_point, order = system.at(result.point), np.argsort(np.count_nonzero(result.runs.trace.active, axis=0))
+        for start in range(0, len(settings), MAX_COPIES):
+            rows = order[start : start + MAX_COPIES]  # runs of similar length, so that few copies wait for the longest
+            runs = result.runs.of(rows)
             try:
-                _compare(at_point, batch, result.runs, drive_again(at_point, batch, result.runs))
+                _compare(at_point, settings[rows], runs, drive_again(at_point, settings[rows], runs))
             except SimulationError as error:
-                failures.append(f"up to {len(batch)} settings could not be verified in SUMO: {error}")
+                failures.append(f"up to {len(rows)} settings could not be verified in SUMO: {error}")
     return failures[0] if failures else ""
 
 

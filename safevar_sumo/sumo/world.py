@@ -39,8 +39,9 @@ class SumoWorld:
         self.api, self.n = api, n
         self.step_length: float = api.simulation.getDeltaT()
         self._set_speed, self._get_speed, self._get_position = (
-            _vehicle_function(api, name) for name in ("setSpeed", "getSpeed", "getPosition")
+            _function(api, "vehicle", name) for name in ("setSpeed", "getSpeed", "getPosition")
         )
+        self._get_person_position = _function(api, "person", "getPosition")
         self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
         self.driving = dict(self._copy_of)
         """Copies whose vehicle under test is on the road, by the vehicle's id."""
@@ -174,10 +175,10 @@ class SumoWorld:
     def vehicle_positions(self, actor: str) -> FloatArray:
         if actor == VUT:
             return self._fronts
-        return np.array([self._get_position(id_) for id_ in self.ids(actor)])
+        return np.array([*map(self._get_position, self.ids(actor))])
 
     def person_positions(self, actor: str) -> FloatArray:
-        return np.array([self.api.person.getPosition(id_) for id_ in self.ids(actor)])
+        return np.array([*map(self._get_person_position, self.ids(actor))])
 
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """All actors on the road, by id: x and y of front or person [m], heading clockwise from north [degrees]."""
@@ -233,8 +234,8 @@ def direction_of(angle: float) -> FloatArray:
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
-def _vehicle_function(api: Api, name: str) -> Callable[..., Any]:
+def _function(api: Api, domain: str, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
-    function: Callable[..., Any] = getattr(compiled or api.vehicle, f"vehicle_{name}" if compiled else name)
+    function: Callable[..., Any] = getattr(compiled or getattr(api, domain), f"{domain}_{name}" if compiled else name)
     return function
