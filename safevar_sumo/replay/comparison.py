@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +20,11 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, S
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike, unit_text
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.copies import copy_and_name
+from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
 from safevar_sumo.sumo.network import Network, built_network, stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.verification import drive_again
-from safevar_sumo.sumo.world import SumoWorld
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -37,21 +37,6 @@ class LaneLine(NamedTuple):
     kind: str
     line: FloatArray
     width: float
-
-
-class ActorTrack(NamedTuple):
-    """The track of one actor: front bumper of a vehicle or middle of a person [m], heading clockwise from north
-    [degrees].
-
-    Arrays of shape (T, N) for T samples of N simulations, NaN while the actor was absent; `length` and `width` in m.
-    """
-
-    is_person: bool
-    length: float
-    width: float
-    x: FloatArray
-    y: FloatArray
-    angle: FloatArray
 
 
 class Moments(NamedTuple):
@@ -95,7 +80,7 @@ class Comparison:
     road: tuple[LaneLine, ...]
     evaluations: Evaluations
     runs: SimulationRuns
-    tracks: Mapping[str, ActorTrack]
+    tracks: Mapping[str, Track]
     objectives: tuple[MetricFacts, ...] = ()
     point: str = ""
 
@@ -203,27 +188,12 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     )
 
 
-ABSENT = (np.nan, np.nan, np.nan)
-"""The pose of an actor that is not there."""
-
-
-def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, ActorTrack]]:
+def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, Track]]:
     """Simulate N settings, shape (N, n), and record in SUMO how all actors move, by name in alphabetical order."""
-    frames, sizes = list[dict[str, tuple[float, float, float]]](), dict[str, tuple[bool, float, float]]()
-
-    def record(world: SumoWorld) -> None:
-        frames.append(world.actor_poses())
-        sizes.update({actor: world.actor_size(actor) for actor in frames[-1].keys() - sizes.keys()})
-
-    runs, tracks = simulate(system, settings), dict[str, ActorTrack]()
-    drive_again(system, settings, runs, record)
-    for actor in sorted(sizes):
-        copy, name = copy_and_name(actor)
-        absent = np.full((3, len(frames), len(settings)), np.nan)
-        track = tracks.setdefault(name, ActorTrack(*sizes[actor], *absent))
-        poses = np.array([frame.get(actor, ABSENT) for frame in frames])
-        track.x[:, copy], track.y[:, copy], track.angle[:, copy] = poses.T
-    return runs, tracks
+    runs, tracks, samples = simulate(system, settings), dict[str, Track](), count()
+    length = len(runs.trace.time)
+    drive_again(system, settings, runs, lambda world: world.film(tracks, next(samples), length))
+    return runs, dict(sorted(tracks.items()))
 
 
 def read_road(network: Network) -> tuple[LaneLine, ...]:

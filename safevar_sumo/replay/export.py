@@ -99,7 +99,7 @@ def poses_of(comparison: Comparison) -> list[Poses]:
         is_present = np.isfinite(x)
         if not is_present.any():
             continue
-        heading = np.deg2rad(90.0 - track.angle[:end, row])
+        heading = track.heading[:end, row]
         kind, to_middle = "bicycle" if track.width < BICYCLE_WIDTH else "car", track.length / 2
         if track.is_person:
             kind, to_middle = "pedestrian", 0.0

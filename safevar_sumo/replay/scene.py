@@ -102,7 +102,7 @@ class FlatScene:
 def lay_out_scene(comparison: Comparison) -> FlatScene:
     """Lay out a comparison for drawing, with the actors that ever come near the vehicle under test."""
     vut = comparison.tracks[VUT]
-    turn = np.deg2rad(90 - vut.angle[0, 0])
+    turn = vut.heading[0, 0]
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
     sample_count = max(moments.end for moments in comparison.moments) + 1
@@ -114,7 +114,7 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
             distance = np.hypot(track_x - vut.x[samples, row], track_y - vut.y[samples, row])
             if np.any(distance < MAX_DISTANCE + track.length):
                 x, y = rotation @ (np.stack([track_x, track_y]) - start[:, np.newaxis])
-                heading = np.deg2rad(90 - track.angle[samples, row]) - turn
+                heading = track.heading[samples, row] - turn
                 body = FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y, heading)
                 bodies.append(body)
     lanes = (lane._replace(line=(lane.line - start) @ rotation.T) for lane in comparison.road)

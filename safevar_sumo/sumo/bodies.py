@@ -45,6 +45,32 @@ class Body(NamedTuple):
         return cls._make(np.array(column) for column in zip(*bodies, strict=True))
 
 
+class Track(NamedTuple):
+    """How an actor moves: at every sample the position of its front bumper, or of a person [m], its direction, a unit
+    vector, and its speed [m/s]; shape (T, 5), or (T, N, 5) in N copies.
+
+    Values are NaN while the actor is not on the road; `length` and `width` are in m.
+    """
+
+    motion: FloatArray
+    is_person: bool
+    length: float
+    width: float
+
+    @property
+    def x(self) -> FloatArray:
+        return self.motion[..., 0]
+
+    @property
+    def y(self) -> FloatArray:
+        return self.motion[..., 1]
+
+    @property
+    def heading(self) -> FloatArray:
+        """Direction, counter-clockwise from east [rad]."""
+        return np.asarray(np.arctan2(self.motion[..., 3], self.motion[..., 2]))
+
+
 class World(ScenariosWorld, Protocol):
     """N vehicles under test in a scene that SUMO simulates or that was recorded; scenarios see it as theirs."""
 

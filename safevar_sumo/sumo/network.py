@@ -262,15 +262,9 @@ def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
     `stage_network`.
     """
     networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
-
-    def stage(scenario: Scenario) -> Network:
-        may_vary = scenario.is_user_code  # a user's scenario may return different changes in each call
-        return (_stage.__wrapped__ if may_vary else _stage)(scenario, networks[scenario.network])
-
-    return [stage(scenario) for scenario in scenarios]
+    return [_stage(scenario, networks[scenario.network]) for scenario in scenarios]
 
 
-@lru_cache(maxsize=10_000)
 def _stage(scenario: Scenario, network: Network) -> Network:
     network = network._replace(lane_changes=_frozen(scenario.lanes(_BuiltRoads(network))))
     return network._replace(traffic_changes=_frozen(scenario.actors(_BuiltRoads(network))))

@@ -19,6 +19,7 @@ from msgspec import msgpack, to_builtins
 from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Point, Scenario
 from safevar_sumo.scenarios.target import TargetTest
+from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.network import Network, copied_network, is_shipped, stage_networks, sumo_version
@@ -32,18 +33,6 @@ STRAIGHTNESS = 1e-6
 NEXT_LANE, INTERNAL_LANE = 0, 4
 """Positions in a link of `getLinks`: the lane that it leads to, and the lane on the junction, "" if there is none."""
 NOT_STRAIGHT = "the vehicle under test does not depart in the middle of a lane and drive straight on"
-
-
-class Track(NamedTuple):
-    """An actor at T samples: in rows its position [m], its direction, a unit vector, and its speed [m/s]; shape (T, 5).
-
-    Values are NaN while the actor is not on the road; `length` and `width` are in m.
-    """
-
-    motion: FloatArray
-    is_person: bool
-    length: float
-    width: float
 
 
 class LaneSequence(NamedTuple):
@@ -208,20 +197,14 @@ def _tracks(scenario: Scenario, world: SumoWorld) -> dict[str, Track]:
     """How all actors except the vehicle under test move."""
     length, tracks, memory = round(scenario.duration / world.step_length) + 1, dict[str, Track](), world.begin(scenario)
     for sample in range(length):
-        for id_, (x, y, angle) in world.actor_poses().items():
-            _, name = copy_and_name(id_)
-            if name == VUT:
-                continue
-            if name not in tracks:
-                tracks[name] = Track(np.full((length, 5), np.nan), *world.actor_size(id_))
-            tracks[name].motion[sample] = x, y, *direction_of(angle), world.actor_speed(id_)
+        world.film(tracks, sample, length)
         if isinstance(scenario, TargetTest):
             memory = scenario.move(world, world.step_length, memory)
         else:
             _, memory = scenario.observe(world, world.step_length, memory)
         if sample < length - 1:
             world.step(np.zeros(1), np.ones(1, dtype=bool))
-    return tracks
+    return {name: track._replace(motion=track.motion[:, 0]) for name, track in tracks.items() if name != VUT}
 
 
 def _way_of(api: Api, vut: str) -> LaneSequence | None:

@@ -13,7 +13,7 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Lane, Scenario
 from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
-from safevar_sumo.sumo.bodies import Body, Motion
+from safevar_sumo.sumo.bodies import Body, Motion, Track
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
@@ -187,13 +187,18 @@ class SumoWorld:
             id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
         }
 
+    def film(self, tracks: dict[str, Track], sample: int, length: int) -> None:
+        """Write the motion of all actors on the road, by name, at one of `length` samples."""
+        for id_, (x, y, angle) in self.actor_poses().items():
+            copy, name = copy_and_name(id_)
+            if name not in tracks:
+                tracks[name] = Track(np.full((length, self.n, 5), np.nan), *self.actor_size(id_))
+            tracks[name].motion[sample, copy] = x, y, *direction_of(angle), self._domain_of(id_).getSpeed(id_)
+
     def actor_size(self, id_: str) -> tuple[bool, float, float]:
         """Whether an actor is a person, and its length and width [m]."""
         domain = self._domain_of(id_)
         return domain is self.api.person, domain.getLength(id_), domain.getWidth(id_)
-
-    def actor_speed(self, id_: str) -> float:
-        return float(self._domain_of(id_).getSpeed(id_))
 
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))

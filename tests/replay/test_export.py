@@ -92,13 +92,13 @@ def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[P
     road, row = carla.Map("road", (out / "road.xodr").read_text()), comparison.rows[-1]
     track, lanes = comparison.tracks["vut"], [lane for lane in comparison.road if lane.kind == "road"]
     for sample in range(comparison.moments[row].end + 1):
-        x, y, angle = (float(values[sample, row]) for values in (track.x, track.y, track.angle))
+        x, y, heading = (float(values[sample, row]) for values in (track.x, track.y, track.heading))
         place = carla.Location(x, -y, 0.0)
         waypoint = road.get_waypoint(place, project_to_road=False)
         assert waypoint is not None
         assert waypoint.lane_type == carla.LaneType.Driving
         assert any(np.isclose(waypoint.lane_width, lane.width, atol=0.01) for lane in lanes)
-        assert np.isclose(np.cos(np.deg2rad(waypoint.transform.rotation.yaw - (angle - 90))), 1, atol=1e-3)
+        assert np.isclose(np.cos(np.deg2rad(waypoint.transform.rotation.yaw) + heading), 1, atol=1e-3)
 
 
 @pytest.mark.slow
