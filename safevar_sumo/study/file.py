@@ -26,6 +26,7 @@ from safevar_sumo.study.schema import (
     Study,
     StudyLike,
     Tables,
+    locate_parameter,
     study_path,
     tables_of,
 )
@@ -95,6 +96,10 @@ def _checked_study(raw: _RawStudy) -> Study:
         raise InputError(raw.source, "origin: there is no such key")
     tables = _with_parameters(_with_parameters(raw.tables, "search", SearchTable), "repair", RepairTable)
     study = convert_table(raw.source, tables, Study)
+    if study.rating.claims and not (study.matrix and study.matrix.protocol):
+        raise InputError(raw.source, "rating.claims: the study is not rated", "matrix.protocol, or no claims")
+    for name in study.spread:
+        locate_parameter(msgspec.to_builtins(study), name, raw.source)
     return msgspec.structs.replace(study, origin=raw.origin)
 
 

@@ -278,12 +278,8 @@ class Study(Table, frozen=True, kw_only=True):
         if len({len(values) for values in self.spread.values()}) > 1 or not all(self.spread.values()):
             problem = "spread: its lists differ in length or are empty"
             raise InputError("", problem, "a list for each parameter, all of one length")
-        for name in self.spread:
-            locate_parameter(msgspec.to_builtins(self), name)
         if 0 in self.published.values():
             raise InputError("", f"published = {self.published}", "numbers other than 0")
-        if self.rating.claims and not (self.matrix and self.matrix.protocol):
-            raise InputError("", "rating.claims: the study is not rated", "matrix.protocol, or no claims")
 
     @property
     def source(self) -> str:
@@ -315,7 +311,7 @@ def _without_defaults(value: Any) -> Any:
     return table
 
 
-def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
+def locate_parameter(tables: Any, name: str, source: object = "study") -> tuple[Any, int | str]:
     """The table or list that holds a parameter of a study, and the parameter's key or index in it.
 
     Raises
@@ -335,7 +331,7 @@ def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
         key_or_index = last
     if not (is_number and name.startswith(SPREAD_TABLES)):
         expected = f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in SPREAD_TABLES)}"
-        raise InputError("study", f"spread.{name!r} is no parameter of the study", expected)
+        raise InputError(source, f"spread.{name!r} is no parameter of the study", expected)
     return table, key_or_index
 
 
