@@ -134,7 +134,6 @@ class Answer:
 
     def print(self, console: Console) -> None:
         """Print the verdict, the tables and the numbers."""
-        print_text(console, self.study.title)
         print_text(console, self.verdict)
         print_parts(console, (table for table in map(_terminal_table, self.tables.values()) if table.row_count))
         print_text(console, "; ".join(f"{name}: {_text(value)}" for name, value in self.numbers.items()))

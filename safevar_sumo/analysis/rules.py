@@ -86,8 +86,8 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
         f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
     )
     for row in table[table["density_low"] > failures / total].head(1).to_dict("records"):
-        shares_in_words = f"{100 * row['density']:.0f} % are unsafe, {100 * row['coverage']:.0f} % of all that are"
-        verdict += f" Most of them lie where {row['rule']}: there {shares_in_words}."
+        density, coverage = (f"{100 * row[name]:.0f} %" for name in ("density", "coverage"))
+        verdict += f" {coverage} of them have {row['rule']}; of all vehicles like that {density} are unsafe."
     numbers = {
         "unsafe": str(criterion),
         "samples": total,

@@ -21,6 +21,7 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from safevar_sumo import cli
+from safevar_sumo.analysis.ask import QUESTIONS
 from safevar_sumo.cli.arguments import Condition, read_changes
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
@@ -46,7 +47,7 @@ def loaded(code: str) -> set[str]:
 def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
     for module in pkgutil.iter_modules(cli.__path__):
         importlib.import_module(f"safevar_sumo.cli.{module.name}")
-    assert set(commands.commands) == set(COMMANDS)
+    assert set(commands.commands) | set(QUESTIONS) == set(COMMANDS)
     output = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
     assert all(f" {name} {sentence}" in output for name, (_, sentence) in COMMANDS.items())
 

@@ -87,6 +87,11 @@ class LimitRow:
         return self.scan.characteristic
 
     @property
+    def specified_ends(self) -> tuple[float | None, float | None]:
+        """The ends of the user's limit; None where there is none."""
+        return (None, None) if self.specified is None else (self.specified.at_least, self.specified.at_most)
+
+    @property
     def alone(self) -> Interval | None:
         """The limits alone, rounded inwards; None if nothing is safe."""
         if self.scan.safe is None:
@@ -102,9 +107,9 @@ class LimitRow:
         """How far the specified limit is outside the limit alone [unit]; None if nothing is safe."""
         if self.scan.safe is None:
             return None
-        (low, high), limit = self.scan.safe, self.specified or Limit()
-        below = 0.0 if limit.at_least is None else low - limit.at_least
-        above = 0.0 if limit.at_most is None else limit.at_most - high
+        (low, high), (at_least, at_most) = self.scan.safe, self.specified_ends
+        below = 0.0 if at_least is None else low - at_least
+        above = 0.0 if at_most is None else at_most - high
         return max(below, above, 0.0)
 
     @property
@@ -119,7 +124,7 @@ class LimitRow:
 
     def to_dict(self) -> JsonObject:
         """A row of `limits` in the JSON."""
-        limit, item, nowhere = self.specified or Limit(), self.characteristic, (None, None)
+        item, nowhere = self.characteristic, (None, None)
         (alone_low, alone_high), (low, high) = self.alone or nowhere, self.together or nowhere
         return {
             "characteristic": item.name,
@@ -129,8 +134,8 @@ class LimitRow:
             "together_high": high,
             "alone_low": alone_low,
             "alone_high": alone_high,
-            "specified_low": limit.at_least,
-            "specified_high": limit.at_most,
+            "specified_low": self.specified_ends[0],
+            "specified_high": self.specified_ends[1],
             "kept": self.kept,
             "fails_first": self.fails_first,
             "sentence": self.sentence or None,
@@ -141,8 +146,8 @@ class LimitRow:
 
         The original, and what the user specified, have their own digits.
         """
-        item, (low, high), limit = self.characteristic, ends, self.specified or Limit()
-        own = (item.original, limit.at_least, limit.at_most)
+        item, (low, high) = self.characteristic, ends
+        own = (item.original, *self.specified_ends)
         lower, upper = (f"{end:g}" if end in own else item.text(end) for end in ends)
         return ("" if low <= item.lower else lower, "" if high >= item.upper else upper)
 
@@ -195,7 +200,7 @@ class LimitRow:
         """Draw a bar for the limits alone and one for those together, with values at their ends; 0 to 1 is the
         domain.
         """
-        item, specified = self.characteristic, self.specified or Limit()
+        item = self.characteristic
         domain = (item.lower, item.upper)
         axis.plot([0, 1], [height] * 2, color="0.8", linewidth=1, zorder=1)
         for ends, offset, width, alpha in ((self.alone, 0.2, 11, 0.35), (self.together, -0.36, 5, 1.0)):
@@ -207,7 +212,7 @@ class LimitRow:
                 if text and (offset > 0 or ends != self.alone):  # the same values are not written twice
                     label = f"{text}{as_formula(item.suffix)}"
                     axis.text(place, height + offset, label, ha=side, fontsize=FONT_SIZE - 1.5)
-        for value in (specified.at_least, specified.at_most):
+        for value in self.specified_ends:
             place = np.interp(math.nan if value is None else value, domain, (0, 1))
             axis.plot([place] * 2, [height - 0.3, height + 0.3], color=VERMILION, linewidth=1.5, zorder=3)
         axis.plot(np.interp(item.original, domain, (0, 1)), height, marker="o", color="black", markersize=4, zorder=4)
