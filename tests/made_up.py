@@ -1,4 +1,4 @@
-"""Made-up records: runs of vehicles by their speeds and gaps, and evaluations by their safety degrees."""
+"""Made-up records: what vehicles see, their runs by speeds and gaps, and evaluations by safety degrees."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.analysis.case import Case, build_case
-from safevar_sumo.records import Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import Encounter, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
 
@@ -37,6 +37,25 @@ def made_up_runs(
     outcome = np.where(np.isnan(crash), Outcome.STOPPED.value, Outcome.COLLISION.value)
     encounter = Encounter(gaps, gaps, speed, gaps > 0)
     return SimulationRuns(trace=trace, encounter=encounter, outcome=outcome, collision_speed=crash)
+
+
+def seen(
+    time: float,
+    speed: Any,
+    gap: Any,
+    lateral: float = 0.0,
+    visibility: float = 1.0,
+    *,
+    lateral_speed: float = 0.0,
+    leader: float = 0.0,
+    throttle: float = 0.0,
+) -> Observation:
+    """What vehicles observe of an obstacle with the speed `leader` ahead of them."""
+    zero = np.zeros(np.size(gap))
+    across, across_speed, ahead = zero + lateral, zero + lateral_speed, zero + leader
+    return Observation(
+        time, zero + speed, zero + gap, speed - ahead, across, across_speed, visibility, ahead, zero + throttle
+    )
 
 
 def original_of(system: Any) -> FloatArray:

@@ -24,6 +24,7 @@ from safevar_sumo.records import Command, FloatArray, Nominal, Observation, Peda
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.study import ModelTable, load_study, study_names
 from safevar_sumo.sumo.system import assemble
+from tests.made_up import seen
 from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
 
@@ -58,19 +59,11 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def seen(
-    time: float, speed: FloatArray | float, gap: FloatArray | float, lateral: float = 0.0, visibility: float = 1.0
-) -> Observation:
-    """What vehicles see of a target that stands in their way and moves across it at 1.8 m/s."""
-    zero = np.zeros(np.size(gap))
-    return Observation(time, zero + speed, zero + gap, zero + speed, zero + lateral, zero + 1.8, visibility)
-
-
 def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> FloatArray:
     """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals are."""
     memory, pedals = ads.start(len(speed), nominal, STEP), []
     for step in range(80):
-        command, memory = ads.drive(seen(step * STEP, speed, gap - speed * step * STEP), memory)
+        command, memory = ads.drive(seen(step * STEP, speed, gap - speed * step * STEP, lateral_speed=1.8), memory)
         pedals.append(np.stack(command))
     return np.stack(pedals)
 
@@ -323,8 +316,7 @@ def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     gap, step = ads.distance(speed, np.zeros(6)) - 1e-9, 0.001
     memory = ads.start(6, KNOWN, step)
     for sample in range(12_000):
-        held = COASTING / (FULL + COASTING) + 0 * speed
-        now = Observation(sample * step, speed, gap, speed, 0 * speed, 0 * speed, 1.0, throttle=held)
+        now = seen(sample * step, speed, gap, throttle=COASTING / (FULL + COASTING))
         command, memory = ads.drive(now, memory)
         pull = command.throttle * (FULL + COASTING) - COASTING - command.brake * BRAKING
         following = np.maximum(speed + pull * step, 0.0)

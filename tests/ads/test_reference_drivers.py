@@ -13,10 +13,11 @@ import pytest
 
 from safevar_sumo.ads.car_following import Acc, Idm
 from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FuzzySafety, Rss
-from safevar_sumo.records import Nominal, Observation, PedalTables
+from safevar_sumo.records import Nominal, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.network import CopiedNetwork
+from tests.made_up import seen
 
 STEP = 0.05
 TABLE = np.arange(0.0, 20.5, 0.5)
@@ -86,23 +87,14 @@ def braking(
     driver: Any, speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0, lateral_speed: float = 0.0
 ) -> tuple[float, np.ndarray]:
     """Gap at which a driver first brakes, at constant speed towards an obstacle, and the decelerations from then on."""
-    one, memory, first, decelerations = np.ones(1), driver.start(1, KNOWN, STEP), np.nan, []
+    memory, first, decelerations = driver.start(1, KNOWN, STEP), np.nan, []
     for k in range(400):
         now = gap - (speed - leader) * k * STEP
         if now <= 0:
             break
-        seen = Observation(
-            k * STEP,
-            speed * one,
-            now * one,
-            (speed - leader) * one,
-            (lateral + lateral_speed * k * STEP) * one,
-            lateral_speed * one,
-            1.0,
-            leader * one,
-            0 * one,
-        )
-        command, memory = driver.drive(seen, memory)
+        across = lateral + lateral_speed * k * STEP
+        one = seen(k * STEP, speed, now, across, lateral_speed=lateral_speed, leader=leader)
+        command, memory = driver.drive(one, memory)
         if command.brake[0] > 0.05 and np.isnan(first):  # more than the accelerator let go
             first = now
         if not np.isnan(first):
@@ -123,10 +115,9 @@ def test_who_reacts_releases_the_accelerator_and_brakes_by_what_is_missing(drive
     """The vehicle coasts with 1 m/s^2; the tables are those of a gear in which the original coasts with 3 m/s^2."""
     first_gear = KNOWN.tables()._replace(coasting=np.full(len(TABLE), 3.0))
     memory = driver.start(1, KNOWN._replace(tables=lambda: first_gear), STEP)
-    one, speed, gap, commands = np.ones(1), 12.0, 40.0, []
+    speed, gap, commands = 12.0, 40.0, []
     for k in range(80):
-        seen = Observation(k * STEP, speed * one, gap * one, speed * one, 0 * one, 0 * one, 1.0, 0 * one, 0.25 * one)
-        command, memory = driver.drive(seen, memory)
+        command, memory = driver.drive(seen(k * STEP, speed, gap, throttle=0.25), memory)
         commands.append((float(command.throttle[0]), float(command.brake[0])))
         gap, speed = gap - speed * STEP, max(speed - (0.0 if commands[-1][0] else 1 + 10 * commands[-1][1]) * STEP, 0.0)
         if not speed or gap <= 0:
@@ -201,11 +192,10 @@ def least_gap(speed: float, headway: float, let_go: float = 0.0, leader_braking:
 
 def behind_a_braking_leader(driver: Any, speed: float, headway: float, leader_braking: float = 7.0) -> float:
     """As `least_gap`, with a driver in a vehicle without delays, and a leader that brakes after a second."""
-    one, memory, v, gap = np.ones(1), driver.start(1, KNOWN, STEP), speed, speed * headway
+    memory, v, gap = driver.start(1, KNOWN, STEP), speed, speed * headway
     least, leader = gap, [max(speed - leader_braking * max(k * STEP - 1, 0.0), 0.0) for k in range(500)]
     for k, (u, next_u) in enumerate(pairwise(leader)):
-        seen = Observation(k * STEP, v * one, gap * one, (v - u) * one, 0 * one, 0 * one, 1.0, u * one)
-        command, memory = driver.drive(seen, memory)
+        command, memory = driver.drive(seen(k * STEP, v, gap, leader=u), memory)
         next_v = max(v + (3 * float(command.throttle[0]) - 10 * float(command.brake[0])) * STEP, 0.0)
         gap += (u + next_u - v - next_v) / 2 * STEP
         v, least = next_v, min(least, gap)

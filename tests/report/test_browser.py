@@ -35,7 +35,13 @@ TOO_WIDE = """return [...document.querySelectorAll(".wide")].filter((one) => one
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
-    result = chromium(tmp_path_factory.mktemp("profile"))
+    """A browser with a profile of its own, that takes down what its pages say and ask for."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = program("chromium", "chromium-browser", "google-chrome")
+    for one in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(one)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    result = Chrome(options=options, service=Service(program("chromedriver")))
     yield result
     result.quit()
 
@@ -47,11 +53,11 @@ def report(page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def opened(browser: Chrome, page: Path, anchor: str = "") -> None:
+def opened(browser: Chrome, page: Path) -> None:
     browser.get("about:blank")
     browser.get_log("browser")
     browser.get_log("performance")
-    browser.get(page.as_uri() + anchor)
+    browser.get(page.as_uri())
     browser.execute_script("document.querySelectorAll('details.section').forEach((one) => { one.open = true; })")
 
 
@@ -152,7 +158,13 @@ def test_it_fits_the_screen_and_everybody_can_read_it(
 
 @pytest.fixture(scope="module")
 def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return axe_core(tmp_path_factory.mktemp("axe"))
+    """The script of axe-core, from npm's registry."""
+    folder = tmp_path_factory.mktemp("axe")
+    subprocess.run([program("npm"), "pack", AXE, "--silent"], check=True, cwd=folder)
+    with tarfile.open(next(folder.glob("axe-core-*.tgz"))) as archive:
+        member = archive.extractfile("package/axe.min.js")
+        assert member is not None
+        return member.read().decode()
 
 
 @pytest.mark.slow
@@ -221,16 +233,6 @@ def program(*names: str) -> str:
     return result
 
 
-def chromium(profile: Path) -> webdriver.Chrome:
-    """A browser with a profile of its own, that takes down what its pages say and ask for."""
-    options = webdriver.ChromeOptions()
-    options.binary_location = program("chromium", "chromium-browser", "google-chrome")
-    for one in (*OPTIONS, f"--user-data-dir={profile}"):
-        options.add_argument(one)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    return webdriver.Chrome(options=options, service=Service(program("chromedriver")))
-
-
 def resized(browser: webdriver.Chrome, width: int, scheme: str = "light") -> None:
     """Make it a screen of that width, in light or dark."""
     browser.execute_cdp_cmd(
@@ -240,22 +242,6 @@ def resized(browser: webdriver.Chrome, width: int, scheme: str = "light") -> Non
         "Emulation.setDeviceMetricsOverride",
         {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500},
     )
-
-
-def axe_core(folder: Path) -> str:
-    """The script of axe-core, from npm's registry."""
-    done = subprocess.run(
-        [program("npm"), "pack", AXE, "--silent", "--pack-destination", str(folder)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=folder,
-    )
-    assert done.returncode == 0, done.stderr
-    with tarfile.open(next(folder.glob("axe-core-*.tgz"))) as archive:
-        member = archive.extractfile("package/axe.min.js")
-        assert member is not None
-        return member.read().decode()
 
 
 def violations(browser: webdriver.Chrome, axe: str) -> list[dict[str, Any]]:

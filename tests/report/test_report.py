@@ -29,7 +29,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, input as report_input, report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
-from safevar_sumo.report.sections import make_verdict
 from safevar_sumo.results.manifest import read_manifest, write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
@@ -92,6 +91,7 @@ def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(
     worst = case.solutions["f_safe"].min()
     words = words_of(page)
     assert "^2" not in words
+    assert '<div class="card verdict bad">' in page
     for sentence in (*explained.verdict, explained.counts):
         assert sentence.replace("^2", "²") in words
     for failure in explained.choices:
@@ -162,13 +162,6 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
     assert Outline(other).open == []
 
 
-def test_a_verdict_is_bad_from_the_first_failure_on() -> None:
-    data: Any = SimpleNamespace(directory=Path("its results"), point="")
-    for failures in (0, 1):
-        explained: Any = SimpleNamespace(no_verdict="", verdict=["So."], choices=[], counts="All.", failures=failures)
-        assert make_verdict(data, explained)["is_bad"] is bool(failures)
-
-
 def test_only_some_sections(slippery: Path) -> None:
     page = report(slippery, only=["reproduce", "tested"])
     assert re.findall(r'<h2 id="(.*?)">', page) == ["tested", "reproduce"]
@@ -204,6 +197,7 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
     )
     page = report(tmp_path / "begun", only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1)
     assert "No solution was found" in page
+    assert '<div class="card verdict">' in page, "nothing is unsafe"
     assert Outline(page).open == []
 
 

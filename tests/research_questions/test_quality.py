@@ -26,8 +26,6 @@ from safevar_sumo.analysis.research_questions.formats import as_json, as_latex, 
 from safevar_sumo.analysis.research_questions.fronts import (
     compute_convergence,
     compute_indicators,
-    hypervolume,
-    nondominated_points,
     normalised,
     points_of,
     reference_front,
@@ -41,25 +39,6 @@ from safevar_sumo.analysis.research_questions.statistics import (
 )
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.test_questions import made_up, made_up_study, row, three_algorithms
-
-FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
-
-
-def test_hypervolume_of_boxes() -> None:
-    assert hypervolume(np.zeros((1, 3))) == pytest.approx(1.1**3)
-    assert hypervolume(np.array([[0.0, 1], [1, 0]])) == pytest.approx(2 * 1.1 * 0.1 - 0.1**2)
-    assert hypervolume(np.full((1, 3), 1.2)) == 0
-
-
-def test_nondominated_points_are_those_that_none_dominates() -> None:
-    points = np.random.default_rng(7).integers(0, 5, size=(60, 3)).astype(float)
-    kept = {tuple(one) for one in points if not any((other <= one).all() and (other < one).any() for other in points)}
-    assert sorted(map(tuple, nondominated_points(points))) == sorted(kept)
-
-
-def test_a_scale_goes_from_ideal_to_nadir() -> None:
-    assert (normalised(FRONT, FRONT).min(), normalised(FRONT, FRONT).max()) == (0, 1)
-    assert np.isfinite(normalised(np.array([[1.0, 5, 7]]), np.array([[1.0, 5, 3], [2, 4, 3]]))).all()
 
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:

@@ -250,32 +250,6 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     assert contents(copied) == before
 
 
-@pytest.mark.parametrize(
-    ("keys", "value", "told"),
-    [
-        ("study", None, "study is missing"),
-        ("versions", None, "'versions'"),
-        ("versions.safevar_sumo", 3, "versions.safevar_sumo = 3"),
-        ("study.vehicle", None, "study: vehicle is missing"),
-        ("study.ads", 3, "study.ads = 3"),
-        ("study.search.algorithms", [None], "study.search.algorithms[0] = None"),
-        ("study.vehicle.characteristics.mass.lower", "x", "study.vehicle.characteristics.mass.lower = 'x'"),
-    ],
-)
-def test_an_edited_manifest_is_refused_with_its_key(keys: str, value: object, told: str, copied: Path) -> None:
-    """A value of None deletes the key."""
-    manifest = table = read_manifest(copied)
-    *parents, key = keys.split(".")
-    for parent in parents:
-        table = table[parent]
-    if value is None:
-        del table[key]
-    else:
-        table[key] = value
-    (copied / "manifest.json").write_text(json.dumps(manifest))
-    refused("status", str(copied), message=(f"{copied}/manifest.json: ", told))
-
-
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     return {
         str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in sorted(place.rglob("*")) if path.is_file()
@@ -306,11 +280,3 @@ def test_a_study_under_way(copied: Path) -> None:
     assert json_of("status", str(copied))["algorithms"]["nsga2"]["simulated"] == 0
     assert load_cases([copied])[0].evaluations.empty
     assert "collisions" in run("status", str(copied)).stdout
-
-
-def test_a_torn_run_is_unfinished(copied: Path) -> None:
-    journal = copied / "runs/nsga2-00.jsonl"
-    journal.write_bytes(journal.read_bytes()[:-7])
-    (case,) = load_cases([copied])
-    assert ("nsga2", 0) not in case.finished_runs
-    assert "nsga2 0 of 1 runs" in case.shortfall

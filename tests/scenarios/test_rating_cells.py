@@ -18,7 +18,7 @@ from safevar_sumo.sumo.bodies import Contacts
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.made_up import original_of
-from tests.scenarios.holding import CARLA, Hold, at_contact, driven
+from tests.scenarios.holding import CARLA, Hold, Pedals, at_contact, driven
 from tests.sumo.test_recording import assert_same
 
 KMH = 1 / 3.6
@@ -200,23 +200,10 @@ def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direc
         corner = 40 * KMH * before + reach - 1.0
         y = 10 * KMH * before * math.cos(turned)
         hidden = (corner > 0) & (y * corner / x > scenario.vut_width / 2 + 1.0)
-        recorder = _GapRecorder()
-        driven(scenario, recorder)
-        seen = np.array(recorder.gaps)
-        assert np.isinf(seen).tolist() == hidden[: len(seen)].tolist()
+        gaps: list[float] = []
+        driven(scenario, Pedals(lambda seen: (gaps.append(seen.gap[0]) or seen.throttle, seen.brake)))  # noqa: B023
+        assert np.isinf(gaps).tolist() == hidden[: len(gaps)].tolist()
         assert 0.5 < before[np.argmin(hidden)] < 3.0
-
-
-class _GapRecorder(Hold):
-    """Holds the pedals and records the observed gaps."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.gaps: list[float] = []
-
-    def drive(self, seen: Any, memory: Any) -> Any:
-        self.gaps.append(seen.gap[0])
-        return super().drive(seen, memory)
 
 
 BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxBrakeTorque", "wear": "brakeTorque"}

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search import ALGORITHMS, Problem
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-from tests.search.problems import evaluated
+from tests.search.test_algorithms import evaluated
 
 EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 

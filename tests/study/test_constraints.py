@@ -18,7 +18,7 @@ from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import region_of
 from tests.in_process import json_of, run
-from tests.search.problems import SUN
+from tests.search.test_algorithms import SUN
 
 BOUND = """
 extends = "smoke"

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from scipy.integrate import solve_ivp
 
-from safevar_sumo.records import GRAVITY, Command, Observation
-from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, Carla
+from safevar_sumo.records import GRAVITY, Command
+from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
+from tests.made_up import seen
 from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original, prepare
 
+CARLA: Any = SYSTEMS["carla"].vehicle
 
-def prepared(model: str, **changes: float) -> object:
+
+def prepared(model: str, **changes: float) -> Any:
     """The constants of one vehicle: the original with some characteristics changed."""
     characteristics = SYSTEMS[model].characteristics
     values = {member.name: np.full(1, changes.get(member.name, float(member.original))) for member in characteristics}
     return SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
 
 
-def step(model: str, state: object, throttle: float = 0.0, brake: float = 0.0) -> object:
+def step(model: str, state: Any, throttle: float = 0.0, brake: float = 0.0) -> Any:
     return SYSTEMS[model].vehicle.advance(prepared(model), state, Command(np.full(1, throttle), np.full(1, brake)))
 
 
@@ -28,17 +33,17 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
     """In neutral, wheels rolling without damping: rho = 1.2 kg/m^3, A = 2.2 m^2."""
     slowed = []
     for drag in (0.2, 0.5):
-        vehicle, p = SYSTEMS["carla"].vehicle, prepared("carla", dragCoeff=drag)
-        state = vehicle.at_rest(p)._replace(speed=np.full(1, 20.0), wheel_speed=np.full(1, 20.0 / 0.355))
-        slowed.append(20.0 - float(vehicle.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0]))
+        p = prepared("carla", dragCoeff=drag)
+        state = CARLA.at_rest(p)._replace(speed=np.full(1, 20.0), wheel_speed=np.full(1, 20.0 / 0.355))
+        slowed.append(20.0 - float(CARLA.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0]))
     # The wheels' inertia takes part: four wheels of 20 kg, I / r^2 = 40 kg.
     assert slowed[1] - slowed[0] == pytest.approx(0.5 * 1.2 * 2.2 * 0.3 * 400 / (2404 + 40) * STEP, rel=0.02)
 
 
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
     # The values of sun are fitted.
-    vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
-    p = prepare("carla", original("carla"))  # of which shifting reads the engine's maximum alone
+    vehicle = replace(CARLA, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
+    p = prepared("carla")  # of which shifting reads the engine's maximum alone
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
@@ -66,40 +71,38 @@ def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> 
     """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no
     latency afterwards.
     """
-    vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla"), np.ones(1)
+    p, one = prepared("carla"), np.ones(1)
     rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
-    state = vehicle.at_rest(p)._replace(
+    state = CARLA.at_rest(p)._replace(
         gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one, engine_speed=rim * 2.85 * 4 * one
     )
     for _ in range(100):
-        state = step("carla", vehicle.hold_gear(p, state, one > 0), throttle=1.0)  # type: ignore[attr-defined]
+        state = step("carla", CARLA.hold_gear(p, state, one > 0), throttle=1.0)
         assert state.target_gear[0] == 1
-    held = vehicle.hold_gear(p, state, one < 0)
-    assert step("carla", held, throttle=1.0).target_gear[0] == 2  # type: ignore[attr-defined]
+    held = CARLA.hold_gear(p, state, one < 0)
+    assert step("carla", held, throttle=1.0).target_gear[0] == 2
 
 
 def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
-    vehicle = SYSTEMS["carla"].vehicle
     one = np.ones(1)
-    state = vehicle.at_rest(prepared("carla"))._replace(throttle=one, brake=one)
+    state = CARLA.at_rest(prepared("carla"))._replace(throttle=one, brake=one)
     released = step("carla", state)
-    assert released.throttle[0] == pytest.approx(1 - vehicle.throttle_fall * STEP)  # type: ignore[attr-defined]
-    assert released.brake[0] == pytest.approx(max(1 - vehicle.brake_fall * STEP, 0.0))  # type: ignore[attr-defined]
-    pressed = step("carla", vehicle.at_rest(prepared("carla")), 1.0, 1.0)
-    assert pressed.throttle[0] == pytest.approx(vehicle.throttle_rise * STEP)  # type: ignore[attr-defined]
-    assert pressed.brake[0] == pytest.approx(min(vehicle.brake_rise * STEP, 1.0))  # type: ignore[attr-defined]
+    assert released.throttle[0] == pytest.approx(1 - CARLA.throttle_fall * STEP)
+    assert released.brake[0] == pytest.approx(max(1 - CARLA.brake_fall * STEP, 0.0))
+    pressed = step("carla", CARLA.at_rest(prepared("carla")), 1.0, 1.0)
+    assert pressed.throttle[0] == pytest.approx(CARLA.throttle_rise * STEP)
+    assert pressed.brake[0] == pytest.approx(min(CARLA.brake_rise * STEP, 1.0))
 
 
 def test_sumo_is_told_what_carlas_vehicle_can_do() -> None:
-    vehicle = SYSTEMS["carla"].vehicle
-    result = vehicle.sumo_type(prepared("carla"))
-    grip = vehicle.tyre_friction * 3.5 * GRAVITY
+    result = CARLA.sumo_type(prepared("carla"))
+    grip = CARLA.tyre_friction * 3.5 * GRAVITY
     assert result.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), (
         "the highest gear is 1.0, the final drive 4.0"
     )
-    assert result.accel[0] == pytest.approx(min(vehicle.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
+    assert result.accel[0] == pytest.approx(min(CARLA.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
     assert result.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
-    assert result.actuator_lag[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
+    assert result.actuator_lag[0] == pytest.approx(STEP + 1 / CARLA.brake_rise)
     assert result.mass[0] == 2404
 
 
@@ -145,16 +148,16 @@ def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
     """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2 N of downforce."""
     p, rim, one = prepared("lgsvl"), 10.0, np.ones(1)
     speed = rim * (1 - slip)
-    stiffness = _tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)  # type: ignore[arg-type]
+    stiffness = _tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)
     force = float(stiffness[0]) * (rim - speed)
     assert force == pytest.approx(share * (2120 * GRAVITY + 2 * speed * speed))
 
 
-@pytest.mark.parametrize(("visibility", "seen"), [(1.0, True), (0.8, True), (0.7, False)])
-def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, seen: bool) -> None:
-    vehicle, p, one = SYSTEMS["sumo"].vehicle, prepared("sumo"), np.ones(1)
-    result, _ = vehicle.sense(p, vehicle.at_rest(p), Observation(0.0, one, 60 * one, one, 0 * one, 0 * one, visibility))
-    assert bool(np.isfinite(result.gap[0])) == seen, "80 m in clear sight"
+@pytest.mark.parametrize(("visibility", "is_seen"), [(1.0, True), (0.8, True), (0.7, False)])
+def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, is_seen: bool) -> None:
+    vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo")
+    result, _ = vehicle.sense(p, vehicle.at_rest(p), seen(0.0, 1.0, 60.0, visibility=visibility))
+    assert bool(np.isfinite(result.gap[0])) == is_seen, "80 m in clear sight"
 
 
 def test_who_brakes_sumos_vehicle_does_not_go_on_speeding_up_until_the_lag_of_its_actuators_is_over() -> None:
@@ -175,16 +178,10 @@ def test_a_calibration_drive_finds_what_the_brake_adds_to_coasting() -> None:
     assert SYSTEMS["sumo"].nominal.braking == pytest.approx(9.0, rel=0.02)
 
 
-def carla() -> Carla:
-    vehicle = SYSTEMS["carla"].vehicle
-    assert isinstance(vehicle, Carla)
-    return vehicle
-
-
-def tyre_force(vehicle: Carla, friction: float, load: float, speed: float, rim: float) -> float:
+def tyre_force(friction: float, load: float, speed: float, rim: float) -> float:
     """Force of four tyres [N], from the shader's cubic as PhysX writes it."""
-    slip = (rim - speed) / (max(rim, speed) + vehicle.slip_offset)
-    k = min(4 * GRAVITY * vehicle.longitudinal_stiffness * abs(slip) / (friction * load), 3.0)
+    slip = (rim - speed) / (max(rim, speed) + CARLA.slip_offset)
+    k = min(4 * GRAVITY * CARLA.longitudinal_stiffness * abs(slip) / (friction * load), 3.0)
     return float(np.sign(slip) * friction * load * (k - k * k / 3 + k**3 / 27))
 
 
@@ -193,25 +190,24 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
     """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first gear on until
     0.5 m/s.
     """
-    vehicle, pedals = carla(), braking_after(1.4)
     values = dict(zip(SYSTEMS["carla"].characteristics.names, setting, strict=True))
-    run = drive("carla", setting[np.newaxis], pedals, 2.8)
+    run = drive("carla", setting[np.newaxis], braking_after(1.4), 2.8)
     radius, mass, limit = values["radius"] / 100, values["mass"], values["max_rpm"] * RPM
-    ratio, friction = GEAR_RATIOS[1] * FINAL_RATIO, vehicle.tyre_friction * values["tireFric"]
+    ratio, friction = GEAR_RATIOS[1] * FINAL_RATIO, CARLA.tyre_friction * values["tireFric"]
 
     def changes(time: float, state: np.ndarray) -> list[float]:
         speed, wheel, engine = state
-        throttle = max(1 - vehicle.throttle_fall * max(time - 1.4, 0), 0.0)
-        brake = min(vehicle.brake_rise * max(time - 1.4, 0), 1.0)
+        throttle = max(1 - CARLA.throttle_fall * max(time - 1.4, 0), 0.0)
+        brake = min(CARLA.brake_rise * max(time - 1.4, 0), 1.0)
         x = engine / limit
         torque = (
-            vehicle.engine_torque
+            CARLA.engine_torque
             * min(400 + 100 * x * 5800 / 1890, 500 - 100 * (x * 5800 - 1890) / (5730 - 1890))
             * (x <= 1)
         )
         damping = values["dampRateZeroT_CE"] + (values["dampRateFullT"] - values["dampRateZeroT_CE"]) * throttle
         clutch = values["clutchStrength"] * (engine - ratio * wheel)
-        force = tyre_force(vehicle, friction, mass * GRAVITY, speed, radius * wheel)
+        force = tyre_force(friction, mass * GRAVITY, speed, radius * wheel)
         braking = brake * 4 * values["maxBrakeTorque"] * np.tanh(wheel / 0.01)
         return [
             (force - 0.5 * AIR_DENSITY * FRONTAL_AREA * values["dragCoeff"] * speed * speed) / mass,
@@ -240,11 +236,8 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
 
 
 def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
-    vehicle, population, nothing = carla(), ends("carla", "radius"), np.zeros(5)
-    scene, constants = (
-        Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0),
-        prepare("carla", population),
-    )
-    seen, _ = vehicle.sense(constants, vehicle.at_rest(constants), scene)
-    assert np.all(np.diff(seen.gap) < 0)
-    assert np.interp(35.5, population[:, 10], seen.gap) == pytest.approx(8.0, rel=1e-3)
+    population = ends("carla", "radius")
+    constants = prepare("carla", population)
+    result, _ = CARLA.sense(constants, CARLA.at_rest(constants), seen(0.0, 0.0, np.full(5, 8.0)))
+    assert np.all(np.diff(result.gap) < 0)
+    assert np.interp(35.5, population[:, 10], result.gap) == pytest.approx(8.0, rel=1e-3)

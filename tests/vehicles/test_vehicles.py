@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import Command, FloatArray
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
@@ -21,6 +21,7 @@ from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.base import DelayedSignal
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
+from tests.made_up import seen
 from tests.vehicles.runs import (
     STEP,
     SYSTEMS,
@@ -179,12 +180,11 @@ def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
     """
     vehicle, population = SYSTEMS[model].vehicle, ends(model, name)
     prepared = prepare(model, population)
-    state, gaps, nothing = vehicle.at_rest(prepared), [], np.zeros(5)
+    state, gaps = vehicle.at_rest(prepared), []
     for k in range(240):
         gap = np.full(5, 130.0 - 10 * k * STEP)
-        observation = Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0)
-        seen, state = vehicle.sense(prepared, state, observation)
-        gaps.append(seen.gap)
+        sensed, state = vehicle.sense(prepared, state, seen(k * STEP, 0.0, gap))
+        gaps.append(sensed.gap)
     return population[:, SYSTEMS[model].characteristics.names.index(name)], np.stack(gaps)
 
 
