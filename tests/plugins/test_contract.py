@@ -71,10 +71,6 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
         ("mine:Scalar", "has a method drive that does not take (seen)"),
         ("mine:Odd", "has no method drive(seen, memory)"),
         ("mine:nothing", "has no 'nothing'"),
-        ("__main__:Mine", "cannot import from __main__"),
-        ("mine:", "mine:"),
-        (":Mine", ":Mine"),
-        ("no where:Mine", "no where:Mine"),
         ("mine:Mine.Inner", "mine:Mine.Inner"),
     ],
 )
@@ -134,10 +130,8 @@ def failing(system: object) -> str:
     [
         ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"),
         ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
-        ("raise BaseException(1, 2)", "raised in drive: BaseException: (1, 2) ("),
         (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("),
         ("pass", "returned None from drive"),
-        ("return 0.5", "returned 0.5 from drive"),
         ("return 0, 2", "returned brake = 2.0 from drive"),
         ("return float('nan'), 0", "returned throttle = nan"),
     ],
@@ -152,14 +146,9 @@ def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder
 
 
 def test_ctrl_c_passes(mine: Mine) -> None:
-    ctrl_c, handler = (
-        mine(
-            SCALAR + "    def drive(self, seen):\n        import signal\n        signal.raise_signal(signal.SIGINT)\n"
-        ),
-        None,
-    )
+    pressed = "    def drive(self, seen):\n        import signal\n        signal.raise_signal(signal.SIGINT)\n"
+    ctrl_c, handler = mine(SCALAR + pressed), signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        handler = signal.signal(signal.SIGINT, signal.default_int_handler)
         with pytest.raises(KeyboardInterrupt):
             evaluate(ctrl_c, original_of(ctrl_c))
     finally:
@@ -177,11 +166,9 @@ ARRAYS += (
     [
         ("seen.speed[:] = 0", "ValueError: assignment destination is read-only"),
         ("return seen.speed", "from drive"),
-        ("return (seen.speed * 0, 0)", "from drive"),
         ("return (seen.speed * 0, seen.speed), memory", "an object with the attributes throttle, brake"),
         ("return Command(seen.speed * 0, seen.speed[:2]), memory", "brake of shape (2,)"),
         ("return Command(seen.speed * 0, 0.5), memory", "brake of shape ()"),
-        ("return Command(0, 10**400), memory", "returned throttle"),
     ],
 )
 def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) -> None:

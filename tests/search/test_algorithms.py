@@ -13,12 +13,11 @@ from deap import tools
 from hypothesis import given, strategies as st
 
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
+from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.search.baselines import _Ranges
 from safevar_sumo.search.genetic import Individual, fitness_class, run_tournament, select_survivors
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-from safevar_sumo.vehicles.region import FeasibleRegion
 from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
@@ -44,25 +43,6 @@ def sphere(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluati
     return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
 
 
-def begun(
-    name: str,
-    seed: int,
-    evaluations: int,
-    characteristics: CharacteristicSet = SUN,
-    algorithm: Algorithm | None = None,
-    region: FeasibleRegion | None = None,
-) -> Search:
-    original = sphere(characteristics, characteristics.original[np.newaxis])
-    problem = Problem(
-        characteristics=characteristics,
-        original=original,
-        evaluations=evaluations,
-        population=POPULATION,
-        region=region,
-    )
-    return (algorithm or ALGORITHMS[name]()).search(problem, np.random.default_rng(seed))
-
-
 def searched(
     name: str,
     seed: int,
@@ -70,10 +50,13 @@ def searched(
     characteristics: CharacteristicSet = SUN,
     evaluate: Evaluate = sphere,
     algorithm: Algorithm | None = None,
-    region: FeasibleRegion | None = None,
 ) -> tuple[Evaluations, list[FloatArray]]:
     """Run an algorithm to its end; returns its result and all populations that it requested."""
-    search = begun(name, seed, evaluations, characteristics, algorithm, region)
+    original = sphere(characteristics, characteristics.original[np.newaxis])
+    problem = Problem(
+        characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION
+    )
+    search = (algorithm or ALGORITHMS[name]()).search(problem, np.random.default_rng(seed))
     populations = [next(search)]
     while True:
         try:

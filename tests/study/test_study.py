@@ -38,7 +38,6 @@ MISTAKES = [
     ('name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
     ('title = "x"', "name is missing"),
     ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
-    ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
     (
         "[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300",
         "variation.mass.deviation = 1e+300\nexpected: a number <= 1000000",
@@ -53,7 +52,6 @@ MISTAKES = [
     ),
     ("[search]\nevaluatons = 5", "search.evaluatons: there is no such key; did you mean 'evaluations'?"),
     ("evaluatons = 5", "evaluatons: there is no such key; did you mean 'search.evaluations'?"),
-    ("\n".join(f"x{i} = 1" for i in range(20_000)), "x0: there is no such key"),
     ('[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1', "weather.road_friction = 0\nexpected: a number > 0"),
     ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, constraints"),
     ("[origin]\nplaces = []", "origin"),
@@ -174,11 +172,6 @@ MISTAKES = [
         "two characteristics, each pair once",
     ),
     (
-        '[[correlations]]\nbetween = ["mass", "radius"]\nvalue = 0.5\n'
-        '[[correlations]]\nbetween = ["mass", "radius"]\nvalue = -0.5',
-        "two characteristics, each pair once",
-    ),
-    (
         "[[correlations]]\nbetween = ['mass', 'radius']\nvalue = -0.9\n"
         "[[correlations]]\nbetween = ['mass', 'tireFric']\nvalue = -0.9\n"
         "[[correlations]]\nbetween = ['radius', 'tireFric']\nvalue = -0.9",
@@ -284,16 +277,8 @@ def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> No
         ("", "''"),
         ("decl >= 6", "decl: there is no such characteristic; did you mean 'decel'?"),
         ("decel >= 6, decel >= 7", "decel >= is given twice\nexpected: each limit once"),
-        (
-            "decel >= 9, decel <= 8",
-            "decel >= 9, decel <= 8: at_least = 9 and at_most = 8\nexpected: at_least <= at_most",
-        ),
         ("decel >= 4", "decel.at_least = 4 is outside its domain\nexpected: a number in [4.5, 9] m/s^2"),
         ("actuatorLag <= 1e999", "actuatorLag.at_most = inf is outside its domain"),
-        (
-            "decel >= 9.2",
-            "decel.at_least = 9.2: the original, 9 m/s^2, does not keep it\nexpected: a number in [4.5, 9] m/s^2",
-        ),
         (
             "actuatorLag <= 0.15",
             "actuatorLag.at_most = 0.15: the original, 0.2 s, does not keep it\nexpected: a number in [0.2, 0.6] s",
