@@ -131,11 +131,11 @@ class Answer:
         return answer_as_html(self)
 
 
-def answer_as_html(answer: Any, heading: str = "h4") -> str:
-    """The sentences and tables that a terminal shows, as HTML for a notebook, or with another `heading` for a page."""
+def answer_as_html(answer: Any) -> str:
+    """The sentences and tables that a terminal shows, as HTML for a notebook."""
     lines = [
         f"<p>{escape(answer.no_verdict)}</p>" if answer.no_verdict else "",
-        f"<{heading}>{escape(answer.study.title)}</{heading}>",
+        f"<h4>{escape(answer.study.title)}</h4>",
     ]
     for part in answer.sentences():
         lines += [f"<p>{escape(part)}</p>"] if isinstance(part, str) else _table_as_html(part)

@@ -84,7 +84,6 @@ TYPED = [
     ("risk sun --unsafe points=1", "not rated"),
     ("rating euro_ncap_rating --set treadDepth=1.6..8:3", "one value"),
     ("rating euro_ncap_rating --plot there.txt", ".png"),
-    ("rating euro_ncap_rating --format csv --table layers", "cells"),
     ("check mine:Nothing", "has no 'Nothing'"),
     ("check broken:Mine", "ZeroDivisionError: division by zero"),
     ("check smokee", "did you mean 'smoke'?"),

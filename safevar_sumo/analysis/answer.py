@@ -24,16 +24,21 @@ if TYPE_CHECKING:
 LOW, HIGH = "_low", "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
 FORMATS = ("text", "json", "csv", "latex", "html")
+MAX_ROWS = 200
+"""Number of rows up to which readers see a table; JSON and CSV have them all."""
 WIDTH = 80
 """Width of text that is not printed to a terminal [characters]."""
 
 
 class Column(NamedTuple):
-    """A column of a table: its unit, its meaning, and how its numbers are written for readers."""
+    """A column of a table: its unit, its meaning, and how its numbers are written for readers, or whether JSON and CSV
+    alone have it.
+    """
 
     unit: str
     meaning: str
     number_format: str = ".4g"
+    is_shown: bool = True
 
 
 def tabulate(title: str, columns: Mapping[str, Column], rows: pd.DataFrame | Iterable[Sequence[Any]]) -> pd.DataFrame:
@@ -95,7 +100,9 @@ class Answer:
         """
         tables = {
             name: {
-                "columns": {name: {"unit": unit, "meaning": text} for name, (unit, text, _) in _columns(frame).items()},
+                "columns": {
+                    name: {"unit": unit, "meaning": text} for name, (unit, text, *_) in _columns(frame).items()
+                },
                 "rows": [_plain(row) for row in frame.to_dict("records")],
             }
             for name, frame in self.tables.items()
@@ -124,9 +131,10 @@ class Answer:
         if form == "csv":
             return self.table(table).to_csv(index=False, lineterminator="\n")
         if form == "latex":
-            return "\n".join(_latex(f"{self.question}-{name}", frame) for name, frame in self.tables.items())
+            return "\n".join(_latex(f"{self.question}-{name}", frame) for name, frame in self._short_tables.items())
         if form == "html":
-            return "\n".join([f"<p>{escape(self.verdict)}</p>", *map(_html, self.tables.values())])
+            sentences = [f"<p>{escape(text)}</p>" for text in (self.verdict, self._long_tables) if text]
+            return "\n".join([sentences[0], *map(_html, self._short_tables.values()), *sentences[1:]])
         console = Console(width=WIDTH, no_color=True, force_terminal=False)
         with console.capture() as capture:
             self.print(console)
@@ -135,8 +143,19 @@ class Answer:
     def print(self, console: Console) -> None:
         """Print the verdict, the tables and the numbers."""
         print_text(console, self.verdict)
-        print_parts(console, (table for table in map(_terminal_table, self.tables.values()) if table.row_count))
+        print_parts(console, map(_terminal_table, self._short_tables.values()))
+        print_text(console, self._long_tables)
         print_text(console, "; ".join(f"{name}: {_text(value)}" for name, value in self.numbers.items()))
+
+    @property
+    def _short_tables(self) -> dict[str, pd.DataFrame]:
+        return {name: frame for name, frame in self.tables.items() if len(frame) <= MAX_ROWS}
+
+    @property
+    def _long_tables(self) -> str:
+        """The tables that readers do not see, in a sentence."""
+        long = [f"{name} ({len(frame):,} rows)" for name, frame in self.tables.items() if len(frame) > MAX_ROWS]
+        return f"By --format csv --table NAME: {', '.join(long)}." if long else ""
 
     def _repr_html_(self) -> str:
         return self.render("html")
@@ -220,6 +239,8 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         if len(frame) and frame[name].isna().all():  # undefined in every row
             continue
         column = columns.get(name, Column("", ""))
+        if not column.is_shown:
+            continue
         texts = [_text(value, column.number_format) for value in frame[name]]
         if f"{name}{LOW}" in frame:
             ends = zip(frame[f"{name}{LOW}"], frame[f"{name}{HIGH}"], strict=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, update_wrapper
 from importlib import import_module
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.case import Case
     from safevar_sumo.campaign.pool import Pool
 
-QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("risk", "rules")}
+QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("rating", "risk", "rules")}
 """The module of each question, whose function has the question's name."""
 
 
@@ -78,8 +78,12 @@ class Option(NamedTuple):
     meaning: str
 
     def check(self, value: Any) -> Any:
-        """The value; refuses one of another type or outside the range."""
+        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has another type or is
+        outside the range.
+        """
         if self.is_repeated:
+            if isinstance(value, Mapping):
+                value = [f"{name}={inner}" for name, inner in value.items()]
             return (value,) if isinstance(value, str) else tuple(value)
         if value is None or self.kind not in (int, float):
             return value
@@ -165,7 +169,8 @@ class Question:
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
             answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
-            reason = evaluator.no_verdict
+            about = evaluator if answer.study is study else evaluator.for_study(answer.study)
+            reason = about.no_verdict
         verdict = f"{reason} {answer.verdict}".strip()
         return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 

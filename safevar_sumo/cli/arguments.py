@@ -19,6 +19,7 @@ import click
 import numpy as np
 from click.shell_completion import CompletionItem
 
+from safevar_sumo.analysis.changes import NUMBER_PATTERN
 from safevar_sumo.analysis.options import Option, Options
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.cli.program import print_note, print_warning
@@ -57,54 +58,6 @@ def check_study_output(path: Path | None, flag: str, studies: Sequence[Study]) -
         raise InputError(flag, f"{path} is an input of the command", "another file")
 
 
-NUMBER_PATTERN = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-SIGNED_NUMBER = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
-PERCENTAGE = re.compile(rf"({SIGNED_NUMBER.pattern})%")
-SWEEP = re.compile(rf"({NUMBER_PATTERN})\.\.({NUMBER_PATTERN})(?::(\d{{1,6}}))?")
-DEFAULT_SWEEP_LENGTH = 11
-"""Number of values of a sweep without `:NUMBER`."""
-MAX_SETTINGS = 10_000
-"""Maximum number of settings that all --set together may produce."""
-SINGLE_VALUE_FORMS = "one value for each: NAME=VALUE in the characteristic's unit, or NAME=+10% of the original"
-CHANGE_FORMS = (
-    "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
-)
-
-
-def read_changes(
-    changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
-) -> dict[str, list[float]]:
-    """Parse --set into the values of each named characteristic; `single` refuses sweeps, without suggesting --beyond.
-
-    Raises
-    ------
-    InputError
-        If a change cannot be parsed, a name is unknown or given twice, or a value is outside its domain.
-    """
-    values_by_name: dict[str, list[float]] = {}
-    forms = SINGLE_VALUE_FORMS if single else CHANGE_FORMS
-    for change in changes:
-        name, equals, text = (text.strip() for text in change.partition("="))
-        if not equals:
-            raise InputError("--set", repr(change), forms)
-        if name in values_by_name:
-            raise InputError("--set", f"{name} is set twice", "each characteristic once")
-        if name not in characteristics.names:
-            raise unknown_name("--set", f"there is no characteristic {name!r}", name, characteristics.names)
-        characteristic = characteristics.members[characteristics.names.index(name)]
-        values_by_name[name] = _parse_values(change, text, characteristic.original, forms)
-        if single and len(values_by_name[name]) > 1:
-            raise InputError("--set", f"{change!r} is a sweep", forms)
-        for value in values_by_name[name]:
-            hint = f", or {name}={text}% of the original" if SIGNED_NUMBER.fullmatch(text) else ""
-            characteristic.check(value, "--set", beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
-    if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
-        raise InputError(
-            "--set", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER"
-        )
-    return values_by_name
-
-
 def combine_values(
     values_by_name: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet
 ) -> FloatArray:
@@ -113,21 +66,6 @@ def combine_values(
     settings = np.tile(base, (len(combinations), 1))
     settings[:, [characteristics.names.index(name) for name in values_by_name]] = combinations
     return settings
-
-
-def _parse_values(change: str, text: str, original: float, forms: str) -> list[float]:
-    if percentage := PERCENTAGE.fullmatch(text):
-        return [original + abs(original) * float(percentage[1]) / 100]
-    if sweep := SWEEP.fullmatch(text):
-        count = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
-        if count < 2:
-            raise InputError(
-                "--set", f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2"
-            )
-        return np.linspace(float(sweep[1]), float(sweep[2]), count).tolist()  # type: ignore[no-any-return]
-    if re.fullmatch(NUMBER_PATTERN, text):
-        return [float(text)]
-    raise InputError("--set", repr(change), forms)
 
 
 def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:

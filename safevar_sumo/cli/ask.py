@@ -15,7 +15,8 @@ from rich.console import Console
 
 from safevar_sumo.analysis.answer import FORMATS, Answer
 from safevar_sumo.analysis.ask import COMMON_OPTIONS, Option, Question
-from safevar_sumo.cli.arguments import GATE_EXIT_CODE, NUMBER_PATTERN, check_output, complete_study
+from safevar_sumo.analysis.changes import NUMBER_PATTERN
+from safevar_sumo.cli.arguments import GATE_EXIT_CODE, check_output, complete_study
 from safevar_sumo.errors import InputError
 
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}

@@ -57,8 +57,9 @@ COMMANDS_BY_GROUP = {
         "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
         "rules": ("ask", "Find rules, in physical units, that say where in the domain a study is unsafe."),
         "rating": (
-            "questions",
-            "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
+            "ask",
+            "Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as Euro NCAP "
+            "does in 2026.",
         ),
         "compare": (
             "questions",

@@ -15,7 +15,6 @@ from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.subject import answer_question, study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -35,13 +34,11 @@ from safevar_sumo.cli.arguments import (
     json_option,
     load_results_or_study,
     point_option,
-    read_changes,
 )
 from safevar_sumo.cli.program import commands, print_json, print_note
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import print_answer, print_parts
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.terminal import print_answer
 
 
 def add_question(
@@ -215,62 +212,3 @@ def compare(
     check_output(plot, "--plot")
     compute = partial(compare_systems, other=subjects[1])
     return _show(answer_question(compute, subjects[0], CompareOptions(**values), jobs=jobs), as_json, plot)
-
-
-@commands.command(name="rating")
-@click.argument("source", metavar="STUDY|DIR")
-@add_flags(RatingOptions)
-@click.option(
-    "--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells."
-)
-@file_option("--plot", "Draw the matrices to this file: png, pdf or svg.")
-@click.option(
-    "--format",
-    "format_name",
-    type=click.Choice(["text", "json", "csv"]),
-    default="text",
-    show_default=True,
-    help="Format of the answer; csv prints one table, without notes.",
-)
-@click.option(
-    "--table",
-    type=click.Choice(["tests", "cells"]),
-    default="tests",
-    show_default=True,
-    help="The table that csv prints.",
-)
-@as_it_is_now_option
-@jobs_option
-@json_option
-@gated
-def rating(
-    source: str,
-    changes: tuple[str, ...],
-    solution: str | None,
-    matrix: bool,
-    plot: Path | None,
-    format_name: str,
-    table: str,
-    jobs: int | None,
-    as_json: bool,
-) -> JsonAnswer:
-    """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
-    from safevar_sumo.analysis.rating.compute import rate_variant
-    from safevar_sumo.analysis.rating.vehicles import matrix_tables
-
-    subject = load_results_or_study(source)
-    characteristics = CharacteristicSet.of(study_in(subject))
-    values = read_changes(changes, characteristics, beyond=False, single=True)
-    options = RatingOptions(changes={name: value for name, (value,) in values.items()}, solution=solution)
-    check_output(plot, "--plot")
-    result = answer_question(rate_variant, subject, options, jobs=jobs)
-    for remark in result.remarks:
-        print_note(remark)
-    if format_name == "csv":
-        frame = result.cells if table == "cells" else result.to_frame()
-        click.echo(frame.to_csv(index=False, lineterminator="\n"), nl=False)
-        return _show(result, None, plot)
-    answer = _show(result, as_json or format_name == "json", plot)
-    if matrix and not as_json and format_name == "text":
-        print_parts(Console(), matrix_tables(result.vehicles))
-    return answer

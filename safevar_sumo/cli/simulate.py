@@ -11,8 +11,9 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from safevar_sumo.analysis.ask import find_question
+from safevar_sumo.analysis.changes import read_changes
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, remarks_on_sets, studies_of_sets
-from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
@@ -28,7 +29,6 @@ from safevar_sumo.cli.arguments import (
     json_option,
     load_target,
     point_option,
-    read_changes,
 )
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
@@ -114,7 +114,7 @@ def simulate_command(
     system = assemble(target.study, target.source)
     if point is not None:
         system = system_at_point(system, point, source="--point")
-    values_by_name = read_changes(changes, system.characteristics, beyond)
+    values_by_name = read_changes(changes, system.characteristics, "--set", beyond=beyond)
     base = system.characteristics.original if target.setting is None else target.setting
     requested_settings = combine_values(values_by_name, base, system.characteristics)
     if not beyond and changes:
@@ -259,13 +259,13 @@ def _rating_command(target: CommandTarget, system: System, simulation: Simulatio
     original.
     """
     base = system.characteristics.original if target.setting is None else target.setting
-    changes = {
-        name: simulation.setting[name]
+    changes = [
+        f"{name}={simulation.setting[name]!r}"
         for name, value in zip(system.characteristics.names, base.tolist(), strict=True)
         if simulation.setting[name] != value
-    }
+    ]
     solution = None if target.handle is None else str(target.handle)
-    return f"{RatingOptions(changes=changes or None, solution=solution).command_line(target.source)} --matrix"
+    return find_question("rating").command_line([target.source], None, {"set": tuple(changes), "solution": solution})
 
 
 def print_simulation(console: Console, simulation: Simulation) -> None:

@@ -17,8 +17,6 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.analysis.rating.compute import rate_variant
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.subject import answer_question, at_point, changes_since
@@ -44,11 +42,10 @@ QUESTIONS: Mapping[str, Callable[..., Any]] = {
     "explain": explain_failures,
     "tolerance": find_tolerances,
     "repair": find_repairs,
-    "rating": rate_variant,
 }
 """The functions that answer the questions of a page, by their commands."""
 SAMPLES: Mapping[str, JsonObject] = {"risk": {"samples": 4000}, "rules": {"samples": 4000}}
-"""The number of vehicles sampled for these sections; other options are the commands' defaults."""
+"""The number of vehicles sampled for these sections."""
 EXPLAIN_SIMULATIONS = 30_000
 """Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
 
@@ -79,30 +76,35 @@ class ReportInput:
 
     @cached_property
     def options(self) -> Mapping[str, Options]:
-        """Each question's options on the page: smaller samples than the commands take; a rated study's variant is the
-        solution with the fewest changes that loses a point.
-        """
+        """Each question's options on the page: smaller samples than the commands take."""
         all_options: tuple[Options, ...] = (
             ExplainOptions(limit=EXPLAIN_SIMULATIONS),
             OpinionOptions(),
             ToleranceOptions(margin=self.margin),
             CompareOptions(),
             RepairOptions(margin=self.margin),
-            RatingOptions(solution=self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None),
         )
         return {options.question: options for options in all_options}
 
+    @cached_property
+    def values(self) -> Mapping[str, JsonObject]:
+        """The values of options that are not the commands' defaults; a rated study's variant is the solution with the
+        fewest changes that loses a point.
+        """
+        solution = self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None
+        return {**SAMPLES, "rating": {"solution": solution}}
+
     def ask(self, question: str, jobs: int | None, progress: Progress) -> Any:
         """The answer to a question of the page."""
-        if question in SAMPLES:
-            return find_question(question).answer([self.case], SAMPLES[question], jobs=jobs, progress=progress)
+        if question in self.values:
+            return find_question(question).answer([self.case], self.values[question], jobs=jobs, progress=progress)
         options = self.options[question]
         return answer_question(QUESTIONS[question], self.case, options, jobs=jobs, progress=progress)
 
     def command(self, question: str) -> str:
         """The command that prints this answer."""
-        if question in SAMPLES:
-            return find_question(question).command_line([str(self.directory)], self.point, SAMPLES[question])
+        if question in self.values:
+            return find_question(question).command_line([str(self.directory)], self.point, self.values[question])
         return self.options[question].command_line(str(self.directory), self.point)
 
     @cached_property

@@ -21,7 +21,6 @@ from safevar_sumo.analysis.answer import Answer
 from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.rating.compute import Rating
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.figures import draw_figures
 from safevar_sumo.analysis.research_questions.tables import lay_out
@@ -48,7 +47,7 @@ from safevar_sumo.report.sections import (
 from safevar_sumo.results import write_whole
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.terminal import Progress, answer_as_html, open_progress
+from safevar_sumo.terminal import Progress, open_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -359,18 +358,14 @@ def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: 
     }
 
 
-def rated_study_data(data: ReportInput, rating: Rating) -> JsonObject:
+def rated_study_data(data: ReportInput, rating: Answer) -> JsonObject:
     """The page's data about one rated study: the points of the original vehicle and of its variant."""
-    directory = str(data.directory)
+    further = [question_command(question, str(data.directory)) for question in ("tolerance", "explain")]
     return {
-        "answer": Markup(answer_as_html(rating, "h2")),
-        "notes": rating.remarks,
+        "title": data.case.study.title,
+        "answer": Markup(rating.render("html")),
         "picture": _picture("matrices", rating.figure()),
-        "names": [vehicle.name for vehicle in rating.vehicles],
-        "commands": [
-            data.command("rating"),
-            *(question_command(question, directory) for question in ("tolerance", "explain")),
-        ],
+        "commands": [data.command("rating"), *further],
     }
 
 

@@ -24,7 +24,6 @@ from safevar_sumo.analysis.ask import QUESTIONS, Question, find_question
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import COMMANDS, commands
@@ -143,7 +142,7 @@ def test_a_question_from_outside_is_a_command(tmp_path: Path, monkeypatch: pytes
     assert "a whole number from 1 to 100,000,000" in str(refused.exception)
 
 
-@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, RatingOptions, RepairOptions, ToleranceOptions])
+@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, RepairOptions, ToleranceOptions])
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)
     arguments = inspect.signature(function).parameters
@@ -154,7 +153,7 @@ def test_a_function_takes_and_documents_the_options_of_its_record(options: type[
         "jobs": None,
         "progress": False,
         "as_it_is_now": False,
-        **({} if options is RatingOptions else {"point": None}),
+        "point": None,
     }
     heads = re.findall(r"^(\w+)\n    \w", inspect.getdoc(function) or "", re.MULTILINE)
     assert sorted(heads) == sorted([*arguments, "InputError", "SimulationError"])

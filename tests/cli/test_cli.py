@@ -22,7 +22,8 @@ from rich.console import Console
 
 from safevar_sumo import cli
 from safevar_sumo.analysis.ask import QUESTIONS
-from safevar_sumo.cli.arguments import Condition, read_changes
+from safevar_sumo.analysis.changes import read_changes
+from safevar_sumo.cli.arguments import Condition
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study, load_study
@@ -145,7 +146,7 @@ def test_a_gate_ends_with_code_3(condition: str, code: int, words: str, capfd: p
     ],
 )
 def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]) -> None:
-    (result,) = read_changes((change,), SUN, beyond=False).values()
+    (result,) = read_changes((change,), SUN, "--set").values()
     assert result == pytest.approx(values)
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.rating.vehicles import RatedVehicle
-from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Rater
 from safevar_sumo.records import CellResults
 from tests.rating.calculator import Calculator
@@ -30,27 +29,26 @@ def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -
     return calculator.template(tmp_path_factory.mktemp("template"))
 
 
-def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: Path) -> None:
+def agrees(rater: Rater, cells: CellResults, calculator: Calculator, template: Path, place: Path) -> None:
     """Asserts that the calculator's points of every simulated test and its colour of every cell that it draws equal
     this package's.
     """
     place.mkdir(exist_ok=True)
-    fill_template(template, place / "predicted.xlsx", rated)
+    fill_template(template, place / "predicted.xlsx", rater, cells)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")
-    fill_drawn_cells(drawn, place / "measured.xlsx", rated)
+    fill_drawn_cells(drawn, place / "measured.xlsx", rater, cells)
     theirs = calculator.scores(place / "measured.xlsx", place / "scored")
-    ours: dict[str, np.ndarray] = {}
-    for test in rated.tests:
-        ours[test.matrix.test_name] = ours.get(test.matrix.test_name, np.zeros(3)) + np.array(test.points)
-    for name, points in ours.items():
-        assert theirs.points[name] == pytest.approx(points, abs=0.01), name
+    scores = rater.points(cells)
+    for test, matrices in PROTOCOL.tests.items():
+        ours = sum(scores.tests[matrix.name][0] for matrix in matrices)
+        assert theirs.points[test] == pytest.approx(ours, abs=0.01), test
     simulated = {matrix.name for matrix in PROTOCOL.matrices}
     verified = [row for row in theirs.verified if row["Scenario"] in simulated]
-    assert verified or rated.points == 0
+    assert verified or scores.total[0] == 0
     for row in verified:
         across, down = map(int, str(row["Test point"]).strip("()").split(","))
         number = PROTOCOL.matrix_cell_numbers[str(row["Scenario"]), across, down]
-        assert str(row["Colour"]).lower() == rated.colours[number], row
+        assert str(row["Colour"]).lower() == COLOURS[scores.colours[0, number]], row
 
 
 def test_the_protocols_data_is_what_the_calculator_has(calculator: Calculator) -> None:
@@ -78,6 +76,6 @@ def test_vehicles_with_any_colours_score_alike(
         CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)),
         CLAIMS if seed % 3 else {},
     )
-    rated = RatedVehicle(name="any", setting={}, rater=Rater(protocol=PROTOCOL, claims=claims), cells=cells)
-    assert rated.scores.fails[0] == (seed == 0)
-    agrees(rated, calculator, template, tmp_path)
+    rater = Rater(protocol=PROTOCOL, claims=claims)
+    assert rater.points(cells).fails[0] == (seed == 0)
+    agrees(rater, cells, calculator, template, tmp_path)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from safevar_sumo.analysis.rating.compute import Rating
-from safevar_sumo.analysis.rating.vehicles import RatedVehicle
+from safevar_sumo.analysis.answer import Answer
+from safevar_sumo.analysis.rating import rate
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Points, Rater, colours_of, darken
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
 
 STUDY = load_study("euro_ncap_rating")
 PROTOCOL = protocol_of(EURO_NCAP_2026)
@@ -52,13 +53,8 @@ def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
     ]
 
 
-def rated(cells: CellResults, claims: dict[str, list[str]] | None = None, **changes: float) -> RatedVehicle:
-    setting = {name: row.original for name, row in STUDY.vehicle.characteristics.items()} | changes
-    return RatedVehicle(name="it", setting=setting, rater=Rater(protocol=PROTOCOL, claims=claims or {}), cells=cells)
-
-
 def points_of(cells: CellResults, claims: dict[str, list[str]] | None = None) -> Points:
-    return rated(cells, claims=claims).scores
+    return Rater(protocol=PROTOCOL, claims=claims or {}).points(cells)
 
 
 @pytest.mark.parametrize("vut", BANDS)
@@ -125,31 +121,52 @@ def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() ->
     assert darken(WEATHERS["clear"]) == WEATHERS["night"]
 
 
+def answer_about(*impacts: Any, claims: dict[str, list[str]] | None = None) -> Answer:
+    """The answer about the original and a variant with worn tyres, from the impacts of both."""
+    characteristics = CharacteristicSet.of(STUDY)
+    vehicles = {"original": characteristics.original, "variant": characteristics.setting({"treadDepth": 3.0}, "it")}
+    cells = CellResults(*(np.concatenate(values) for values in zip(*map(results, impacts), strict=True)))
+    return rate(STUDY, Rater(protocol=PROTOCOL, claims=claims or {}), dict([*vehicles.items()][: len(impacts)]), cells)
+
+
+def hits(cells: list[int], speed: float) -> Any:
+    impact = np.full(N, np.nan)
+    impact[cells] = speed
+    return impact
+
+
 def test_a_claim_is_shown_as_a_claim() -> None:
-    claimed = rated(results(), claims={"CPNA": ["Type"]})
-    sentences = Rating(study=STUDY, vehicles=[claimed]).failed_layers
-    assert sentences[0] == "Robustness layers claimed, not simulated: CPNA: Type."
+    table = answer_about(np.nan, claims={"CPNA": ["Type"]}).tables["tests"]
+    assert table.set_index("test")["claimed_layers"].dropna().to_dict() == {"CPNA day": "Type", "CPNA night": "Type"}
 
 
 def test_the_verdict_names_what_is_lost_and_where() -> None:
-    impact = np.full(N, np.nan)
-    impact[numbers("CPNCO", "standard", "night")] = 40.0
-    result = Rating(study=STUDY, vehicles=[rated(results()), rated(results(impact), treadDepth=3.0)])
-    assert result.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
-    assert result.verdict.endswith(" of them in CPNCO by night.")
-    impact = np.full(N, np.nan)
-    impact[numbers("CBNA") + numbers("CBFA")] = 60.0
-    equal = Rating(study=STUDY, vehicles=[rated(results()), rated(results(impact), treadDepth=3.0)])
-    assert equal.verdict.endswith(" of them in each of CBNA and CBFA.")
-    record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
-    assert set(record) == {"study", "variants", "not_simulated"}
-    assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}
-    assert set(record["variants"][0]["tests"][0]["cells"][0]) == {
-        "range",
-        "vut_speed",
-        "target_speed",
-        "impact_location",
-        "colour",
-        "relative_impact_speed",
-        "warning_ttc",
-    }
+    answer = answer_about(np.nan, hits(numbers("CPNCO", "standard", "night"), 40.0))
+    assert answer.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
+    assert " of them in CPNCO night. Euro NCAP tests on a dry road; this rating has the weather" in answer.verdict
+    equal = answer_about(np.nan, hits(numbers("CBNA") + numbers("CBFA"), 60.0))
+    assert " of them in each of CBNA and CBFA." in equal.verdict
+
+
+def test_numbers_and_tables_say_the_same() -> None:
+    answer = answer_about(np.nan, hits(numbers("CPNCO"), 40.0), claims={"CPNCO": ["Type"]})
+    points, tests = answer.numbers, answer.tables["tests"]
+    sums = tests.groupby("variant")[["points", "possible", "lost"]].sum()
+    assert sums.loc["original"].tolist() == pytest.approx([points["points"], points["possible"], 0])
+    assert sums["lost"]["variant"] == pytest.approx(points["lost"])
+    assert answer.tables["vehicles"]["changes"].tolist() == [{}, {"treadDepth": 3.0}]
+    assert points["possible"] + points["not_simulated"] == 100
+    assert points["points"] + points["layers_not_simulated"] == pytest.approx(points["possible"])
+    cells = answer.tables["cells"].query("variant == 'variant' and colour == 'red'")
+    assert set(cells["test"]) == {"CPNCO day", "CPNCO night"}
+    assert len(cells) == len(numbers("CPNCO"))
+    failing = tests.set_index(["variant", "test"])["failing_layers"].dropna()
+    assert set(failing.index) == {("variant", "CPNCO day"), ("variant", "CPNCO night")}
+    json.dumps(answer.to_dict(), allow_nan=False)
+
+
+def test_what_costs_everything_and_what_the_calculator_does_not_check_is_remarked() -> None:
+    answer = answer_about(hits(numbers("CCRs", "standard"), 9.0), hits(numbers("CPNA", "standard"), 9.0))
+    remarks = answer.tables["vehicles"]["remark"]
+    assert "earns nothing" in remarks[0]
+    assert "does not check this" in remarks[1]

@@ -11,7 +11,6 @@ from safevar_sumo.analysis.case import Case, UnanswerableError
 from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.compare.answer import Side, SystemComparison
 from safevar_sumo.analysis.evaluator import Evaluator, sobol_points
-from safevar_sumo.analysis.rating.compute import rate
 from safevar_sumo.analysis.repair.price import benign_scenes, needless_braking
 from safevar_sumo.analysis.research_questions.changes import compare_weathers
 from safevar_sumo.analysis.research_questions.statistics import FEWEST_RUNS, compare_samples, signed_rank_test
@@ -102,7 +101,7 @@ def _side(evaluator: Evaluator, original: Evaluations, unsafe: Unsafe, both_rate
         study=evaluator.study,
         original=original,
         limits=scan(evaluator, range(len(evaluator.characteristics)), unsafe),
-        points=rate(evaluator, {}).original.points if both_rated else None,
+        points=float(original.column(RATING_POINTS.name)[0]) if both_rated else None,
         no_verdict=evaluator.no_verdict,
     )
 
