@@ -1,7 +1,6 @@
 from .analysis.answer import Answer as Answer
 from .analysis.ask import question as question
 from .analysis.compare import compare as compare
-from .analysis.compare.answer import SystemComparison as SystemComparison
 from .analysis.explain import explain as explain
 from .analysis.explain.answer import Explained as Explained
 from .analysis.explain.causes import Cause as Cause

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.case import Case
     from safevar_sumo.campaign.pool import Pool
 
-QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("rating", "risk", "rules")}
+QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("compare", "rating", "risk", "rules")}
 """The module of each question, whose function has the question's name."""
 
 

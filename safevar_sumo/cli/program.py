@@ -62,8 +62,8 @@ COMMANDS_BY_GROUP = {
             "does in 2026.",
         ),
         "compare": (
-            "questions",
-            "Compare two studies or results: what is unsafe in one of them only, limits, ratings.",
+            "ask",
+            "Compare two studies or results, A and B: what is unsafe in one of them only, limits, ratings.",
         ),
         "tables": ("handover", "Answer the research questions as tables."),
         "figures": ("handover", "Draw the figures of results."),

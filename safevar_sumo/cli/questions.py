@@ -1,17 +1,15 @@
-"""Commands that simulate many settings to answer a question, such as explain, tolerance, risk and compare."""
+"""Commands that simulate many settings to answer a question, such as explain, tolerance and repair."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
-from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
@@ -186,29 +184,3 @@ def repair(
         write_repair(out, result)
         click.echo(f"The study with it: {out}", err=as_json)
     return answer
-
-
-@add_question(
-    CompareOptions,
-    "A",
-    click.argument("other", metavar="B"),
-    file_option("--plot", "Draw safety degrees and limits of both to this file: png, pdf or svg."),
-)
-def compare(
-    source: str,
-    other: str,
-    point: str | None,
-    jobs: int | None,
-    as_json: bool,
-    plot: Path | None,
-    **values: OptionValue,
-) -> JsonAnswer:
-    """Compare two systems, A and B, studies or results directories: simulate the same settings in both, and say which
-    are unsafe in one of them only.
-    """
-    from safevar_sumo.analysis.compare.compute import compare_systems
-
-    subjects = [load_results_or_study(system, point) for system in (source, other)]
-    check_output(plot, "--plot")
-    compute = partial(compare_systems, other=subjects[1])
-    return _show(answer_question(compute, subjects[0], CompareOptions(**values), jobs=jobs), as_json, plot)

@@ -108,7 +108,7 @@ class Packed:
             self.answer(question)
         shown = chain.from_iterable(SECTIONS_OF_QUESTION[question] for question in self.packed.questions)
         sections = [*SECTIONS_WITHOUT_QUESTION, *shown]
-        return make_page([self.data], sections, [self._answers], {}, self.progress).encode()
+        return make_page([self.data], sections, [self._answers], self.progress).encode()
 
     def study_file(self) -> bytes:
         """A study file with all that the study extends."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from safevar_sumo.analysis.ask import find_question
 from safevar_sumo.analysis.case import Case, load_cases
-from safevar_sumo.analysis.compare import CompareOptions
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
@@ -81,7 +80,6 @@ class ReportInput:
             ExplainOptions(limit=EXPLAIN_SIMULATIONS),
             OpinionOptions(),
             ToleranceOptions(margin=self.margin),
-            CompareOptions(),
             RepairOptions(margin=self.margin),
         )
         return {options.question: options for options in all_options}
@@ -92,12 +90,13 @@ class ReportInput:
         fewest changes that loses a point.
         """
         solution = self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None
-        return {**SAMPLES, "rating": {"solution": solution}}
+        return {**SAMPLES, "compare": {}, "rating": {"solution": solution}}
 
-    def ask(self, question: str, jobs: int | None, progress: Progress) -> Any:
-        """The answer to a question of the page."""
+    def ask(self, question: str, jobs: int | None, progress: Progress, *others: Case) -> Any:
+        """The answer to a question of the page, `others` beside its study."""
         if question in self.values:
-            return find_question(question).answer([self.case], self.values[question], jobs=jobs, progress=progress)
+            subjects, values = [self.case, *others], self.values[question]
+            return find_question(question).answer(subjects, values, jobs=jobs, progress=progress)
         options = self.options[question]
         return answer_question(QUESTIONS[question], self.case, options, jobs=jobs, progress=progress)
 

@@ -8,10 +8,9 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import quote
 
 import pandas as pd
@@ -19,12 +18,11 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.answer import Answer
 from safevar_sumo.analysis.case import Case, UnanswerableError
-from safevar_sumo.analysis.compare.compute import compare_systems
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.figures import draw_figures
 from safevar_sumo.analysis.research_questions.tables import lay_out
-from safevar_sumo.analysis.subject import Results, answer_question
+from safevar_sumo.analysis.subject import Results
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
@@ -233,8 +231,9 @@ def report(
     sections = only or [name for name in SECTIONS if is_possible.get(name, True)]
     with open_progress(progress) as show_progress:
         answers = [answer_sections(data, sections, jobs, show_progress) for data in inputs]
-        comparison = _comparison_data(inputs, jobs, show_progress) if "compare" in sections else {}
-        page = make_page(inputs, sections, answers, comparison, show_progress)
+        if "compare" in sections:
+            answers[0]["compare"] = _compare(inputs, jobs, show_progress)
+        page = make_page(inputs, sections, answers, show_progress)
     if out is not None:
         write_whole(Path(out), page)
     return page
@@ -261,11 +260,7 @@ def answer_sections(
 
 
 def make_page(
-    inputs: Sequence[ReportInput],
-    sections: Collection[str],
-    answers: Sequence[Mapping[str, Any]],
-    comparison: JsonObject,
-    progress: Progress,
+    inputs: Sequence[ReportInput], sections: Collection[str], answers: Sequence[Mapping[str, Any]], progress: Progress
 ) -> str:
     """The page with these sections, from the answers about each study."""
     names = ", ".join(data.case.name for data in inputs)
@@ -280,7 +275,6 @@ def make_page(
         title=f"Safety report: {names}",
         sections={name: heading for name, heading in SECTIONS.items() if name in sections},
         studies=studies,
-        comparison=comparison,
         tables=list_tables(cases) if cases else [],
         figures=embed_figures(cases) if cases else [],
         commands=commands_to_reproduce(inputs, sections) if "reproduce" in sections else [],
@@ -341,21 +335,14 @@ def _study_data(
     }
 
 
-def _comparison_data(inputs: Sequence[ReportInput], jobs: int | None, progress: Progress) -> JsonObject:
-    """The page's data about two studies side by side, or the reason why they cannot be compared."""
-    first, second = (data.case for data in inputs)
-    compare, options = partial(compare_systems, other=second), inputs[0].options["compare"]
+def _compare(inputs: Sequence[ReportInput], jobs: int | None, progress: Progress) -> Answer:
+    """Two studies side by side, or the reason why they cannot be compared."""
+    first, second = inputs
     try:
-        result = answer_question(compare, first, options, jobs=jobs, progress=progress)
+        return cast(Answer, first.ask("compare", jobs, progress, second.case))
     except InputError as error:
-        return {"sentences": [f"{error.problem}."]}
-    return {
-        "sentences": [part for part in result.sentences() if isinstance(part, str)],
-        "figure": {
-            **_picture("compare", result.figure()),
-            "table": table_data(result.limits_frame().set_index("characteristic"), "Limits side by side"),
-        },
-    }
+        verdict = f"{error.problem}."
+        return Answer(question="compare", study=first.case.study, verdict=verdict, numbers={}, tables={})
 
 
 def rated_study_data(data: ReportInput, rating: Answer) -> JsonObject:
