@@ -104,7 +104,7 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds
     the result of setting i at its worst point.
     """
-    size = _batch_size(system, engine)
+    size = batch_size(system, engine)
     if len(settings) > size:
         batches = (settings[start : start + size] for start in range(0, len(settings), size))
         return Evaluations.concatenate([evaluate(system, batch, engine) for batch in batches])
@@ -155,7 +155,7 @@ def largest_batch(system: System) -> int:
     return min(MAX_VEHICLES, system.ads.max_vehicles or MAX_VEHICLES)
 
 
-def _batch_size(system: System, engine: Engine) -> int:
+def batch_size(system: System, engine: Engine) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest network."""
     if is_recorded(system, engine):
         return largest_batch(system)

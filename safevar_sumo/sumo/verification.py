@@ -15,7 +15,8 @@ from safevar_sumo.scenarios import VUT
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.batch import enter, open_points_world
 from safevar_sumo.sumo.bodies import Contacts
-from safevar_sumo.sumo.matrix import MAX_COPIES, simulate_groups
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import batch_size, simulate_groups
 from safevar_sumo.sumo.perception import SceneObserver
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
@@ -67,19 +68,25 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
     InputError
         If a place or a collision is another one in SUMO, with the first such setting and both values.
     """
-    points, failures = system.points, list[str]()
+    points = system.points
     if system.rater is not None:
         points = tuple(points[k] for k in np.linspace(0, len(points) - 1, RATED_POINTS).astype(int))
-    for result in chain.from_iterable(simulate_groups(replace(system, matrix=points, rater=None), settings)):
-        at_point, order = system.at(result.point), np.argsort(np.count_nonzero(result.runs.trace.active, axis=0))
-        for start in range(0, len(settings), MAX_COPIES):
-            rows = order[start : start + MAX_COPIES]  # runs of similar length, so that few copies wait for the longest
-            runs = result.runs.of(rows)
+    reduced, remark, size = replace(system, matrix=points, rater=None), "", batch_size(system, Engine.RECORDED)
+    for batch in (settings[start : start + size] for start in range(0, len(settings), size)):
+        for result in chain.from_iterable(simulate_groups(reduced, batch)):
             try:
-                _compare(at_point, settings[rows], runs, drive_again(at_point, settings[rows], runs))
+                _verify_point(system.at(result.point), batch, result.runs)
             except SimulationError as error:
-                failures.append(f"up to {len(rows)} settings could not be verified in SUMO: {error}")
-    return failures[0] if failures else ""
+                remark = f"some of {len(batch)} settings could not be verified in SUMO: {error}"
+    return remark
+
+
+def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
+    """Verify runs at the only point; runs of similar length together, so that few copies wait for the longest."""
+    order, size = np.argsort(np.count_nonzero(runs.trace.active, axis=0)), batch_size(system, Engine.LIBSUMO)
+    for rows in (order[start : start + size] for start in range(0, len(order), size)):
+        chosen = runs.of(rows)
+        _compare(system, settings[rows], chosen, drive_again(system, settings[rows], chosen))
 
 
 def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]) -> None:
