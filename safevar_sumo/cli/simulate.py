@@ -36,7 +36,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, Outcome, finite_or_none
 from safevar_sumo.results import record
-from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
+from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.empty_road import summary_entry, why_no_verdict
 from safevar_sumo.sumo.matrix import (
@@ -331,9 +331,7 @@ def print_sweep(
             end_section=row == 0,
         )
     console.print(table)
-    print_text(
-        console, "First row: the original vehicle. SD: least distance in m, or minus the collision speed in m/s."
-    )
+    print_text(console, f"First row: the original vehicle. {degree_note(contact)}")
 
 
 COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))

@@ -22,8 +22,11 @@ from safevar_sumo.cli.program import commands, print_json, print_remarks, print_
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject, Outcome, finite_or_none
 from safevar_sumo.results import evaluations_frame, failure_lines, record, solutions_frame
+from safevar_sumo.scenarios import degree_note
 from safevar_sumo.study import Study, label_of, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo.matrix import contact_degree
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
 
 if TYPE_CHECKING:
@@ -173,11 +176,8 @@ def status(directory: str, as_json: bool) -> None:
         *counts, best = row.values()
         table.add_row(algorithm, *map(str, counts), two_decimals(best))
     Console().print(table)
-
-
-SAFETY_NOTE = (
-    "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
-)
+    sd = "SD: least distance in m, behind lead vehicles from centre to centre, or minus the collision's speed in m/s."
+    print_text(Console(), sd)
 
 
 def print_forecast(console: Console, study: Study, runs: int, rate: float, engine: str) -> None:
@@ -218,7 +218,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     for line in [campaign.no_verdict] if campaign.no_verdict else study_verdict(case, campaign.original):
         print_text(console, line)
     console.print(_summary_table(study, campaign, solutions))
-    lines = SAFETY_NOTE.splitlines()
+    lines = [degree_note(contact_degree(assemble(study))), "TET, TIT: over solutions without collision."]
     if failures := [failure for run in campaign.runs for failure in run.failures]:
         lines.append(f"{len(failures)} settings could not be simulated (simulator-error); no result contains them:")
         lines += [f"  {line}" for line in failure_lines(failures)]

@@ -18,7 +18,7 @@ from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
 from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import Cause, Robustness
-from safevar_sumo.analysis.opinion.compute import Verdict, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.opinion.compute import RunEnd, Verdict, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.opinion.multi_body import (
     MultiBodyState,
     Plant,
@@ -167,6 +167,12 @@ class Made(WornVehicle, frozen=True, kw_only=True):
 
 """
 ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
+
+
+def test_the_gap_stands_beside_a_safety_degree_from_centre_to_centre() -> None:
+    assert str(RunEnd("stopped", 4.7, 0.0)) == "stops, safety degree 4.70 m from centre to centre (gap 0.00 m)"
+    assert str(RunEnd("stopped", 0.87)) == "stops, safety degree 0.87 m"
+    assert str(RunEnd("collision", -2.0, 0.0)) == "collides at 2.00 m/s"
 
 
 @pytest.mark.slow

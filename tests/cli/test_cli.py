@@ -166,6 +166,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     lead, gap = simulate("native", "--set", "decel=8").stdout, stop["gap"]
     assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): less safe" in lead
     assert f"gap {gap:.2f} against " in lead
+    assert "from centre to centre: bodies touch at 4.70 m" in simulate("native", "--set", "decel=8..9:2").stdout
 
 
 def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import contact_degree, evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Answer, Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
@@ -44,14 +44,20 @@ Verdict = Literal["outside", "confirmed", "contradicted", "borderline"]
 
 
 class RunEnd(msgspec.Struct, frozen=True):
-    """How a run ends: outcome, and safety degree [m, or -m/s]; None if there is none, or the run was not simulated."""
+    """How a run ends: outcome, safety degree [m, or -m/s], and where that is from centre to centre, gap between bodies
+    [m]; None if there is none, or the run was not simulated.
+    """
 
     outcome: str | None = None
     safety_degree: float | None = None
+    gap: float | None = None
 
     def __str__(self) -> str:
         """Such as `collides at 3.21 m/s`."""
-        return ending_in_words(self.outcome, self.safety_degree) if self.outcome else "was not driven"
+        if not self.outcome:
+            return "was not driven"
+        contact = 0.0 if self.safety_degree is None or self.gap is None else self.safety_degree - self.gap
+        return ending_in_words(self.outcome, self.safety_degree, contact)
 
 
 class Opinion(msgspec.Struct, frozen=True, kw_only=True):
@@ -225,7 +231,8 @@ def judge_causes(
     # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
     ours, theirs = evaluate(system, settings), evaluate(second_system, np.concatenate([settings, scaled]))
-    here, there, fails_there = _run_ends(ours), _run_ends(theirs), unsafe.of(theirs)
+    contact = contact_degree(system)
+    here, there, fails_there = *(_run_ends(runs, contact) for runs in (ours, theirs)), unsafe.of(theirs)
     fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
 
     def judge(row: int, cause: Cause) -> tuple[Verdict, str]:
@@ -284,6 +291,10 @@ def _why_borderline(
     return f"with the second model only {share:.0%} of the neighbours are {result}, too"
 
 
-def _run_ends(runs: Evaluations) -> list[RunEnd]:
-    pairs = zip(runs.outcome, runs.f_safe, strict=True)
-    return [RunEnd(str(outcome), finite_or_none(degree)) for outcome, degree in pairs]
+def _run_ends(runs: Evaluations, contact: float) -> list[RunEnd]:
+    """How runs end; bodies touch at a safety degree of `contact` [m]."""
+    gaps = runs.gaps(contact) if contact else np.full(len(runs), np.nan)
+    return [
+        RunEnd(str(outcome), finite_or_none(degree), finite_or_none(gap))
+        for outcome, degree, gap in zip(runs.outcome, runs.f_safe, gaps, strict=True)
+    ]
