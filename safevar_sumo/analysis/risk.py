@@ -25,6 +25,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
+from safevar_sumo.terminal import constraints_in_words
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.case import Case
@@ -94,6 +95,7 @@ def risk(
         verdict += f" {samples - total:,} vehicles could not be simulated and are left out."
     if len(table):
         verdict += f" {table.iloc[0]['characteristic']} decides most of the safety degree's variance."
+    verdict = " ".join([verdict, *constraints_in_words(study)])
     return Answer(question="risk", study=study, verdict=verdict, numbers=numbers, tables={"sensitivity": table})
 
 

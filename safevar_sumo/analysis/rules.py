@@ -20,6 +20,7 @@ from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
+from safevar_sumo.terminal import constraints_in_words
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -95,6 +96,7 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
         "share": failures / total,
         "interval": [low, high],
     }
+    verdict = " ".join([verdict, *constraints_in_words(study)])
     return Answer(question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table})
 
 

@@ -94,7 +94,11 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     reported = [*settings_in([one for one in explained if "summary" not in one]), *alone]
     assert [values for values in reported if not is_feasible(values)] == []
     assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
-    for question in ("tolerance bound.toml --fits 0 --characteristics mass", "rules bound.toml --samples 200"):
+    for question in (
+        "tolerance bound.toml --fits 0 --characteristics mass",
+        "rules bound.toml --samples 200",
+        "risk bound.toml --samples 200",
+    ):
         said = run(*question.split(), "--unsafe", "below=2.5").stdout
         assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in said, question
 
