@@ -27,7 +27,7 @@ from .campaign.pool import Pool as Pool
 from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
 from .metrics import Criterion as Criterion, Unsafe as Unsafe
 from .records import Outcome as Outcome
-from .reference.agreement import Agreement as Agreement, validate as validate
+from .reference.agreement import validate as validate
 from .reference.rows import import_published as import_published
 from .replay.animation import animate as animate
 from .replay.comparison import Comparison as Comparison, compare_with_original as compare_with_original

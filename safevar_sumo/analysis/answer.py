@@ -144,7 +144,8 @@ class Answer:
         """Print the verdict, the tables and the numbers."""
         print_text(console, self.verdict)
         print_parts(console, map(_terminal_table, self._short_tables.values()))
-        print_text(console, self._long_tables)
+        if self._long_tables:
+            print_text(console, self._long_tables)
         print_text(console, "; ".join(f"{name}: {_text(value)}" for name, value in self.numbers.items()))
 
     @property

@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cached_property, update_wrapper
 from importlib import import_module
 from numbers import Integral, Real
+from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin
 
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.case import Case
     from safevar_sumo.campaign.pool import Pool
 
-QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("compare", "rating", "risk", "rules")}
+QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("compare", "rating", "risk", "rules")} | {
+    "validate": "safevar_sumo.reference.agreement"
+}
 """The module of each question, whose function has the question's name."""
 
 
@@ -102,7 +105,12 @@ class Question:
         self.compute, self.name = compute, compute.__name__
         parameters = list(inspect.signature(compute).parameters.values())
         self.takes_results_only = str(parameters[0].annotation) == "Case"
-        self.others = [parameter.name for parameter in parameters[2:] if parameter.kind is not parameter.KEYWORD_ONLY]
+        self.others = {
+            parameter.name: str(parameter.annotation) == "Path"
+            for parameter in parameters[2:]
+            if parameter.kind is not parameter.KEYWORD_ONLY
+        }
+        """Further positional parameters, and whether each is a file instead of a subject."""
         common = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in COMMON_OPTIONS]
         shown = [parameters[0], *(parameter for parameter in parameters[2:]), *common]
         self.__signature__ = inspect.Signature(shown)
@@ -151,19 +159,21 @@ class Question:
             return reduce_to_point(subject, point)
 
         command = self.command_line([_name(source), *map(_name, others)], point, values)
-        subjects = [subject_of(source), *map(subject_of, others)]
+        subjects: list[Any] = [subject_of(source)]
+        for other, is_file in zip(others, self.others.values(), strict=True):
+            subjects.append(Path(str(other)) if is_file else subject_of(other))
         return replace(self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress), command=command)
 
     def answer(
         self,
-        subjects: Sequence[Study | Case],
+        subjects: Sequence[Any],
         values: JsonObject,
         *,
         pool: Pool | None = None,
         jobs: int | None = None,
         progress: bool | Progress = False,
     ) -> Answer:
-        """The answer about subjects that have been loaded; `values` are those of options."""
+        """The answer about subjects that have been loaded, and files; `values` are those of options."""
         from safevar_sumo.analysis.evaluator import open_evaluator  # SUMO takes long to load
 
         study = study_in(subjects[0])
@@ -190,7 +200,8 @@ def question(compute: Callable[..., Answer]) -> Question:
     """Decorator: makes a function `(subject, evaluator, *, options) -> Answer` a question.
 
     Defaults are those of its signature, ranges those of `Annotated` types, texts those of its numpydoc docstring. A
-    first parameter of type `Case` takes results only; further positional parameters are further subjects.
+    first parameter of type `Case` takes results only; further positional parameters are further subjects, of
+    type `Path` files.
     """
     return Question(compute)
 

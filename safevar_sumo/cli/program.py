@@ -70,7 +70,10 @@ COMMANDS_BY_GROUP = {
     },
     "Published data": {
         "import": ("reference", "Import published CSV solutions as a results directory."),
-        "validate": ("reference", "Compare a study with reference data, row by row."),
+        "validate": (
+            "ask",
+            "Compare a study with settings and metrics in the published package's CSV format, row by row.",
+        ),
     },
 }
 """Each command's module in this folder and its sentence in the help, by the title of its group, in the order of the

@@ -1,51 +1,20 @@
-"""Commands for published data: import it, and compare a study with it."""
+"""The command `import`, for published data."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import click
-from rich.console import Console
 
-from safevar_sumo.cli.arguments import check_output, complete_study, file_option, jobs_option, json_option
-from safevar_sumo.cli.program import commands, print_json, print_remarks
+from safevar_sumo.cli.arguments import complete_study, file_option
+from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.reference import agreement
 from safevar_sumo.reference.rows import RANGES, import_published
-from safevar_sumo.study import load_study
-from safevar_sumo.terminal import WholeTable, open_progress, print_text
 
 METRIC_NAMES = {word: metric.name for metric in METRICS.values() for word in (metric.name, metric.title.lower())}
 """Names of metrics by each name that `--original` accepts."""
 ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
-
-
-@commands.command()
-@click.argument("study", shell_complete=complete_study)
-@click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
-@jobs_option
-@file_option("--plot", "Plot simulated against reference values.", metavar="FILE.png")
-@json_option
-def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool) -> None:
-    """Compare STUDY with settings and metrics in the published package's CSV format."""
-    loaded_study = load_study(study)
-    print_remarks(loaded_study)
-    check_output(plot, "--plot")
-    with open_progress(True) as progress:
-        result = agreement.validate(loaded_study, reference, jobs=jobs, progress=progress)
-    if plot is not None:
-        result.plot(plot, f"{loaded_study.title}\nagainst {reference.name}")
-    if as_json:
-        print_json(result.to_dict())
-        return
-    console = Console()
-    print_text(console, result.verdict)
-    table = WholeTable("metric", right=agreement.HEADINGS.values(), title=loaded_study.title)
-    for name, *values in result.table.itertuples():
-        table.add_row(METRICS[name].heading, *(f"{value:.3f}".replace("nan", "-") for value in values))
-    console.print(table)
-    print_text(console, ", ".join(f"{name} {number}" for name, number in result.numbers.items()))
 
 
 @commands.command(name="import")

@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 
 import safevar_sumo as sv
-from safevar_sumo.analysis.answer import Answer, Column, tabulate, with_interval
+from safevar_sumo.analysis.answer import MAX_ROWS, Answer, Column, tabulate, with_interval
 from safevar_sumo.analysis.ask import QUESTIONS, Question, find_question
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
@@ -46,7 +46,7 @@ ANSWER = Answer(
     tables={"parts": tabulate("Parts & ages", COLUMNS, ROWS)},
 )
 QUESTION = '''
-from safevar_sumo.analysis.answer import Answer, Column, tabulate
+from safevar_sumo.analysis.answer import MAX_ROWS, Answer, Column, tabulate
 from safevar_sumo.analysis.ask import Count, question
 
 
@@ -90,6 +90,16 @@ def test_readers_see_units_and_intervals_and_no_column_without_values() -> None:
     assert "mass 2600" in text
     assert "age" not in text.replace("ages", "")
     assert max(map(len, text.splitlines())) <= 80
+
+
+def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
+    frame = tabulate("Many", {"number": Column("", "it")}, [(number,) for number in range(MAX_ROWS + 1)])
+    long = replace(ANSWER, tables={**ANSWER.tables, "many": frame})
+    for form in ("text", "html"):
+        assert f"--format csv --table NAME: many ({MAX_ROWS + 1} rows)" in long.render(form)
+        assert "Many" not in long.render(form)
+    assert len(long.render("csv", "many").splitlines()) == MAX_ROWS + 2
+    assert "--table" not in ANSWER.render("text") + ANSWER.render("html")
 
 
 def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
