@@ -35,11 +35,15 @@ def limits_of(study: sv.Study) -> dict[str, str]:
 def repair_of(study: sv.Study) -> tuple[str, str, str]:
     """The smallest repair, how much earlier it brakes on a new car, and needless braking before and after."""
     answer = sv.repair(study, promise=PROMISE)
-    if not answer.repairs:
-        return ("none is needed" if answer.proof_of_today else "none"), "-", "-"
-    first = answer.repairs[0]
-    scenes = f"{first.price.needless_braking_today} -> {first.price.needless_braking} of {first.price.benign_scenes}"
-    return answer.changes_in_words(first), f"{first.price.metres_earlier:.2f} m", scenes
+    if not answer.numbers["repairs"]:
+        return ("none is needed" if answer.numbers["kept_today"] else "none"), "-", "-"
+    first, price, changes = answer.table("repairs").iloc[0], answer.table("price").iloc[0], answer.table("changes")
+    scenes = f"{price.needless_braking_today} -> {first.needless_braking} of {first.benign_scenes}"
+    texts = [
+        f"{row.parameter} {row.today:g} -> {row.repaired:g} {row.unit}"
+        for row in changes[changes.repair == 1].itertuples()
+    ]
+    return ", ".join(texts), f"{first.metres_earlier:.2f} m", scenes
 
 
 def main() -> None:

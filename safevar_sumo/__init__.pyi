@@ -9,7 +9,6 @@ from .analysis.opinion import opinion as opinion
 from .analysis.opinion.compute import Opinion as Opinion, Opinions as Opinions
 from .analysis.rating import rating as rating
 from .analysis.repair import repair as repair
-from .analysis.repair.answer import Repair as Repair, Repairs as Repairs
 from .analysis.risk import risk as risk
 from .analysis.rules import rules as rules
 from .analysis.subject import Results as Results, load as load

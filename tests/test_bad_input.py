@@ -76,7 +76,7 @@ TYPED = [
     ("repair wear", "nothing is promised"),
     ("repair wear --promise treadDepth", "NAME >= X"),
     ("repair wear --promise all --change braking", "did you mean 'braking_share'?"),
-    ("repair wear --promise all --margin -1", "0<=x<=100"),
+    ("repair wear --promise all --margin -1", "a number from 0 to 100"),
     ("repair wear --promise all --out folder.png", "--out"),
     ("repair euro_ncap_rating --promise all", "is rated"),
     ("repair native --promise all --change headway", "no parameter 'headway'"),

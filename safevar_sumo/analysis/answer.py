@@ -217,7 +217,8 @@ def _text(value: Any, number_format: str = ".4g") -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_text(inner, number_format)}" for name, inner in value.items()) or "-"
     if isinstance(value, list):
-        return (" to " if len(value) == 2 else ", ").join(_text(inner, number_format) for inner in value) or "-"
+        is_interval = len(value) == 2 and not isinstance(value[0], dict)
+        return (" to " if is_interval else "; ").join(_text(inner, number_format) for inner in value) or "-"
     return str(value)
 
 

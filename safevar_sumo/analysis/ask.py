@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.case import Case
     from safevar_sumo.campaign.pool import Pool
 
-QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("compare", "rating", "risk", "rules")} | {
+QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("compare", "rating", "repair", "risk", "rules")} | {
     "validate": "safevar_sumo.reference.agreement"
 }
 """The module of each question, whose function has the question's name."""
@@ -55,6 +55,8 @@ Count = Annotated[int, Range(1, 100_000_000)]
 """A number of vehicles, solutions or attempts."""
 Share = Annotated[float, Range(0, 1, is_open=True)]
 """A share such as a confidence."""
+Margin = Annotated[float | None, Range(0, 100)]
+"""A distance to keep from a collision [m]."""
 Criterion = Annotated[str | None, "collision|below=X|points=X"]
 """What is unsafe: a collision, a safety degree below X [m], or at most X points of a rating; by default a collision if
 any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost.

@@ -47,17 +47,6 @@ def check_output(path: Path | None, flag: str, endings: tuple[str, ...] = PICTUR
     check_writable(path, flag)
 
 
-def check_study_output(path: Path | None, flag: str, studies: Sequence[Study]) -> None:
-    """Refuse an output file that is no study file, cannot be written, or is a file of one of the studies."""
-    check_output(path, flag, (".toml",))
-    if (
-        path is not None
-        and path.exists()
-        and any(path.samefile(file) for study in studies for file in study.origin.files)
-    ):
-        raise InputError(flag, f"{path} is an input of the command", "another file")
-
-
 def combine_values(
     values_by_name: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet
 ) -> FloatArray:

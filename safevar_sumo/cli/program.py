@@ -30,10 +30,7 @@ COMMANDS_BY_GROUP = {
         "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
         "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
         "tolerance": ("questions", "Find how far each characteristic may go: alone, and all together."),
-        "repair": (
-            "questions",
-            "Find the smallest change of the driving system that survives promised wear, and its price.",
-        ),
+        "repair": ("ask", "Find the smallest change of the driving system that survives promised wear, and its price."),
         "risk": (
             "ask",
             "Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which "

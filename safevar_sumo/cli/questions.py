@@ -1,4 +1,4 @@
-"""Commands that simulate many settings to answer a question, such as explain, tolerance and repair."""
+"""Commands that simulate many settings to answer a question, such as explain and tolerance."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from rich.console import Console
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.subject import answer_question, study_in
+from safevar_sumo.analysis.subject import answer_question
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
     CommandFunction,
@@ -24,7 +23,6 @@ from safevar_sumo.cli.arguments import (
     add_flags,
     as_it_is_now_option,
     check_output,
-    check_study_output,
     fail,
     file_option,
     gated,
@@ -162,25 +160,3 @@ def tolerance(
         return _show(result, as_json, plot)
     click.echo(result.sheet.render(format_name), nl=False)
     return _show(result, None, plot)
-
-
-@add_question(
-    RepairOptions,
-    "STUDY|RESULTS",
-    file_option("--out", "Write a study file with the first repair there, which extends STUDY.", metavar="FILE.toml"),
-)
-def repair(
-    source: str, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: OptionValue
-) -> JsonAnswer:
-    """Find the smallest change of the driving system of STUDY that survives the promised wear, and what it costs."""
-    from safevar_sumo.analysis.repair.answer import write_repair
-    from safevar_sumo.analysis.repair.compute import find_repairs
-
-    options, subject = RepairOptions(**values), load_results_or_study(source, point)
-    check_study_output(out, "--out", [study_in(subject)])
-    result = answer_question(find_repairs, subject, options, jobs=jobs)
-    answer = _show(result, as_json)
-    if out is not None and result.repairs:
-        write_repair(out, result)
-        click.echo(f"The study with it: {out}", err=as_json)
-    return answer

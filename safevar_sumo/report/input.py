@@ -16,8 +16,6 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.repair import RepairOptions
-from safevar_sumo.analysis.repair.compute import find_repairs
 from safevar_sumo.analysis.subject import answer_question, at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
@@ -37,11 +35,7 @@ if TYPE_CHECKING:
 
     from safevar_sumo.analysis.explain.failure import Explanation
 
-QUESTIONS: Mapping[str, Callable[..., Any]] = {
-    "explain": explain_failures,
-    "tolerance": find_tolerances,
-    "repair": find_repairs,
-}
+QUESTIONS: Mapping[str, Callable[..., Any]] = {"explain": explain_failures, "tolerance": find_tolerances}
 """The functions that answer the questions of a page, by their commands."""
 SAMPLES: Mapping[str, JsonObject] = {"risk": {"samples": 4000}, "rules": {"samples": 4000}}
 """The number of vehicles sampled for these sections."""
@@ -80,7 +74,6 @@ class ReportInput:
             ExplainOptions(limit=EXPLAIN_SIMULATIONS),
             OpinionOptions(),
             ToleranceOptions(margin=self.margin),
-            RepairOptions(margin=self.margin),
         )
         return {options.question: options for options in all_options}
 
@@ -90,7 +83,7 @@ class ReportInput:
         fewest changes that loses a point.
         """
         solution = self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None
-        return {**SAMPLES, "compare": {}, "rating": {"solution": solution}}
+        return {**SAMPLES, "compare": {}, "rating": {"solution": solution}, "repair": {"margin": self.margin}}
 
     def ask(self, question: str, jobs: int | None, progress: Progress, *others: Case) -> Any:
         """The answer to a question of the page, `others` beside its study."""

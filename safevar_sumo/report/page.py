@@ -329,7 +329,7 @@ def _study_data(
         "figures": {
             name: figure_data(answer.figure(), answer.to_frame())
             for name, answer in about_domain.items()
-            if name != "repair" and not answer.to_frame().empty  # whose rows are no characteristics
+            if not answer.to_frame().empty
         },
         **{name: make() for name, make in makers.items() if name in sections},
     }

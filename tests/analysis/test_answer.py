@@ -24,7 +24,6 @@ from safevar_sumo.analysis.ask import QUESTIONS, Question, find_question
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.repair import RepairOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import COMMANDS, commands
 from safevar_sumo.study import load_study
@@ -152,7 +151,7 @@ def test_a_question_from_outside_is_a_command(tmp_path: Path, monkeypatch: pytes
     assert "a whole number from 1 to 100,000,000" in str(refused.exception)
 
 
-@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, RepairOptions, ToleranceOptions])
+@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, ToleranceOptions])
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)
     arguments = inspect.signature(function).parameters

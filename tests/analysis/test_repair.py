@@ -6,18 +6,19 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
+from safevar_sumo.analysis import repair as question
 from safevar_sumo.analysis.evaluator import open_evaluator
-from safevar_sumo.analysis.repair import attack, compute, smallest
+from safevar_sumo.analysis.repair import attack, smallest
 from safevar_sumo.analysis.repair.answer import write_repair
 from safevar_sumo.analysis.repair.problem import Parameter, RepairProblem
 from safevar_sumo.metrics import Unsafe
@@ -135,7 +136,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (attack, "CHILDREN", 64),
         (attack, "GENERATIONS", 2),
         (attack, "MAX_UNSAFE_SHARE", 0.01),
-        (compute, "SOBOL_VEHICLES", 32),
+        (question, "SOBOL_VEHICLES", 32),
     ):
         monkeypatch.setattr(module, name, number)
     (tmp_path / "models.py").write_text(MODELS)
@@ -151,22 +152,24 @@ def gap_for(grip: float) -> float:
 @pytest.mark.slow
 def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Path) -> None:
     found = sv.repair(planted, change=["gap", "colour"], jobs=2)
-    (repair,) = found.repairs
-    assert repair.parameters == {"gap": pytest.approx(gap_for(5), rel=0.01)}
-    assert repair.price.metres_earlier == repair.price.metres_earlier_mean
-    assert repair.price.metres_earlier == pytest.approx(gap_for(5) - GAP_TODAY, rel=0.01)
-    assert len(str(repair.parameters["gap"])) <= 5  # four digits: what is printed is what was tried
-    assert repair.proof.proof_failures == 0
-    assert repair.proof.at_most <= 0.01
+    (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
+    assert repair["parameters"] == {"gap": pytest.approx(gap_for(5), rel=0.01)}
+    assert [repair["metres_earlier"]] == found.values("price.metres_earlier_mean")
+    assert repair["metres_earlier"] == pytest.approx(gap_for(5) - GAP_TODAY, rel=0.01)
+    assert len(str(repair["parameters"]["gap"])) <= 5  # four digits: what is printed is what was tried
+    assert repair["proof_failures"] == 0
+    assert repair["at_most"] <= 0.01
+    assert max(map(len, found.render("text").split("Repairs\n")[1].splitlines()[:-1])) <= 80
 
 
 @pytest.mark.slow
 def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
     answers = [sv.repair(planted, change=["always"], pool=pool).to_dict() for pool in (InlinePool(), InlinePool(2))]
     assert answers[0] == answers[1]
-    (repair, _) = answers[0]
+    tables = answers[0]["tables"]
+    (repair,) = tables["repairs"]["rows"]
     assert repair["needless_braking"] == repair["benign_scenes"] >= 6
-    assert repair["needless_braking_today"] == 0
+    assert tables["price"]["rows"][0]["needless_braking_today"] == 0
 
 
 class Adding:
@@ -210,9 +213,9 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
 def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
     planted.write_text(STUDY.replace("upper = 64.0", "upper = 26.0"))
     found = sv.repair(planted, change=["gap"], pool=InlinePool())
-    assert not found.repairs
+    assert found.numbers["repairs"] == len(found.table("repairs")) == 0
     assert "No change of one or two of gap was found" in found.verdict
-    assert not found.not_repairable  # full braking sees far enough
+    assert not found.numbers["not_repairable"]  # full braking sees far enough
 
 
 @pytest.mark.slow
@@ -220,8 +223,9 @@ def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: 
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 26.0, always"))
     out = tmp_path / "kept.toml"
     done = run("repair", str(planted), "--promise", "grip>=7.9", "--change", "gap", "--out", str(out), "--json")
-    (summary,) = json.loads(done.stdout)
-    assert summary["repairs"] == 0
+    answer = json.loads(done.stdout)
+    assert answer["numbers"]["repairs"] == 0
+    assert answer["numbers"]["kept_today"]
     assert not out.exists()
 
 
@@ -238,22 +242,22 @@ def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
     assert Parameter("a", row, 1000.0).values(np.array([0.45678])).item() == 1000.457
 
 
-def test_sentences_name_the_worst_vehicle_of_a_kept_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without attacks and fresh wear: of the worst brakes promised, those in between and the best."""
-    monkeypatch.setattr(compute, "SOBOL_VEHICLES", 3)
+    monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
     nothing = np.zeros((0, len(sv.load_study("native").vehicle.characteristics)))
-    monkeypatch.setattr(compute, "attack", lambda *_: nothing)
-    monkeypatch.setattr(compute, "prove", lambda *_: (attack.Proof(5, 0, 0.45), nothing))
+    monkeypatch.setattr(question, "find_failures", lambda *_: nothing)
+    monkeypatch.setattr(question, "prove", lambda *_: (attack.Proof(5, 0, 0.45), nothing))
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
-    assert kept.worst_today == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
-    worst = f"{kept.worst_today:.2f} m from centre to centre (gap {kept.worst_today - 4.7:.2f} m)"
-    assert f"has a safety degree of {worst}, and 5 fresh worn cars, 0 unsafe" in kept.verdict
-    name = kept.parameters[0].name
-    changed: Any = SimpleNamespace(parameters={name: kept.parameters[0].today})
+    worst = kept.numbers["worst_today"]
+    assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
+    words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
+    assert f"has a safety degree of {words}, and of 5 fresh worn vehicles 0 are unsafe" in kept.verdict
+    table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
     # A study that results alone hold has no file to extend.
     for study in (kept.study, replace_in(kept.study, name="lost")):
-        write_repair(tmp_path / "it.toml", replace(kept, study=study, repairs=(changed,)))
-        assert sv.load_study(tmp_path / "it.toml").ads.parameters[name] == kept.parameters[0].today
+        write_repair(tmp_path / "it.toml", replace(kept, study=study, tables={"repairs": table}))
+        assert sv.load_study(tmp_path / "it.toml").ads.parameters["standing_gap"] == 3.25
 
 
 @pytest.mark.parametrize(
@@ -261,10 +265,10 @@ def test_sentences_name_the_worst_vehicle_of_a_kept_promise(monkeypatch: pytest.
     [
         ("lower = 4.0", "lower = 14.0", "gap", "bounds that hold the value of today"),
         ("lower = 4.0", "log = true, lower = 0.0", "gap", "expected: 0 < lower < upper"),
-        ("always = {", "alway = {", "alway", "repair.alway: ads.parameters.alway = None"),
+        ("always = {", "alway = {", "alway", "ads.parameters.alway = None"),
         ("", "", "gape", "did you mean 'gap'?"),
         ("at_least = 5", "at_least = 3", "gap", "outside its domain"),
-        ("gap = 12.0, always", "gap = true, always", "gap", "a number, the value of today"),
+        ("gap = 12.0, always", "gap = 'x', always", "gap", "bounds that hold the value of today"),
     ],
 )
 def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, change: str, message: str) -> None:

@@ -31,7 +31,7 @@ class Proof(NamedTuple):
     at_most: float
 
 
-def attack(problem: RepairProblem, change: FloatArray, known: FloatArray, number: int) -> FloatArray:
+def find_failures(problem: RepairProblem, change: FloatArray, known: FloatArray, number: int) -> FloatArray:
     """Attack a change with known and random settings and their offspring: its worst failures, shape (M, n).
 
     A failure is a promised setting that the change does not keep safe, and a driving system could. `number` counts the

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.analysis.braking import brake_onset
 from safevar_sumo.campaign.evaluation import with_parameters
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import MatrixTable, Study
@@ -22,27 +21,10 @@ NEEDLESS_BRAKE = 0.1
 """Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the speed."""
 
 
-class Price(NamedTuple):
-    """The price of changed parameters against today's, on a new vehicle.
-
-    `metres_earlier` and `seconds_earlier` are how much earlier it brakes at the point where these are most metres, at
-    most, and `metres_earlier_mean` on average [m, s]; None if it brakes nowhere. `largest_deceleration` is
-    that with the change [m/s^2]. `needless_braking` of the `benign_scenes` are those in
-    which it brakes with the change, `needless_braking_today` those with today's parameters.
+def price_of(study: Study, values: Mapping[str, float]) -> JsonObject:
+    """The price of other values of parameters against today's, by the names of the answer's columns; None where the new
+    vehicle brakes nowhere.
     """
-
-    metres_earlier: float | None
-    metres_earlier_mean: float | None
-    seconds_earlier: float | None
-    most_at: str
-    largest_deceleration: float
-    needless_braking: int
-    needless_braking_today: int
-    benign_scenes: int
-
-
-def price_of(study: Study, values: Mapping[str, float]) -> Price:
-    """The price of other values of parameters."""
     today, changed = assemble(study), assemble(with_parameters(study, values))
     onsets_today, _ = _drive_new_car(today)
     onsets, deceleration = _drive_new_car(changed)
@@ -50,11 +32,17 @@ def price_of(study: Study, values: Mapping[str, float]) -> Price:
     before, after = (needless_braking(system, benign) for system in (today, changed))
     metres, seconds = onsets_today - onsets
     braked = np.flatnonzero(np.isfinite(metres))
-    earlier: tuple[float | None, float | None, float | None, str] = (None, None, None, "")
-    if len(braked):
-        most = int(braked[np.argmax(metres[braked])])
-        earlier = float(metres[most]), float(np.mean(metres[braked])), float(seconds[most]), today.points[most].name
-    return Price(*earlier, deceleration, sum(after), sum(before), len(after))
+    most = int(braked[np.argmax(metres[braked])]) if len(braked) else None
+    return {
+        "metres_earlier": None if most is None else float(metres[most]),
+        "metres_earlier_mean": None if most is None else float(np.mean(metres[braked])),
+        "seconds_earlier": None if most is None else float(seconds[most]),
+        "most_at": None if most is None else today.points[most].name or None,
+        "largest_deceleration": deceleration,
+        "needless_braking": sum(after),
+        "needless_braking_today": sum(before),
+        "benign_scenes": len(after),
+    }
 
 
 def _drive_new_car(system: System) -> tuple[FloatArray, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -143,17 +144,14 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     ads, parameters = assemble(study).ads, []
     for name in (name for name in table if name in (names or table)):
         row, today = table[name], study.ads.parameters.get(name, getattr(ads, name, None))
-        if isinstance(today, bool) or not isinstance(today, int | float):
-            raise InputError(
-                source, f"repair.{name}: ads.parameters.{name} = {today!r}", "a number, the value of today"
-            )
+        number = float(today) if isinstance(today, int | float) else math.nan
         if table is shipped:
-            row = replace_in(row, lower=min(row.lower, today), upper=max(row.upper, today))
-        if not row.lower < row.upper or not row.lower <= today <= row.upper or (row.log and row.lower <= 0):
-            problem = f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g}, and today it is {today:g}"
+            row = replace_in(row, lower=min(row.lower, number), upper=max(row.upper, number))
+        if not row.lower <= number <= row.upper or row.lower == row.upper or (row.log and row.lower <= 0):
+            problem = f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g}, ads.parameters.{name} = {today!r}"
             legal = f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today"
             raise InputError(source, problem, legal)
-        parameters.append(Parameter(name, row, float(today)))
+        parameters.append(Parameter(name, row, number))
     return parameters
 
 
@@ -162,15 +160,13 @@ class RepairProblem:
     """A study's ADS with P parameters that may change, and the criterion to keep within a promise: safety degrees of at
     least `margin`.
 
-    Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1]. With `arrays`, one
-    ADS drives vehicles with different parameters; otherwise there is an instance for each set.
+    Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
     """
 
     evaluator: Evaluator
     promise: Promise
     parameters: list[Parameter]
     unsafe: Unsafe
-    arrays: bool = False
 
     @property
     def study(self) -> Study:
@@ -199,29 +195,29 @@ class RepairProblem:
         names = [parameter.name for parameter in self.parameters]
         return {names[column]: values[column] for column in np.flatnonzero(change != self.today)}
 
-    def _evaluate(
-        self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
-    ) -> Evaluations:
-        """Evaluate each set of parameters with the setting of its row, at the worst of `points`, or of all if none is
-        named.
-        """
-        selection = Selection(tuple(parameter.name for parameter in self.parameters), tuple(points), self.arrays)
-        return self.evaluator.evaluate_selection(np.hstack([settings, self.values(shares)]), selection, stage)
-
-    def takes_arrays(self) -> bool:
-        """Whether one ADS may drive vehicles with different parameters: a shipped one, or the user's class if a sample
-        has the same results to the bit.
+    @cached_property
+    def arrays(self) -> bool:
+        """Whether one ADS drives vehicles with different parameters: a shipped one, or the user's class if a sample has
+        the same results to the bit; otherwise there is an instance for each set.
         """
         if self.study.ads.kind or self.study.ads.model in ADS:
             return not self.study.ads.kind
-        shares = sobol_points(ARRAY_CHECKS, len(self.parameters), 0)
+        values = self.values(sobol_points(ARRAY_CHECKS, len(self.parameters), 0))
         settings = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1))
-        stage = "does the driving system take arrays?"
         try:
-            together = replace(self, arrays=True)._evaluate(shares, settings, stage)
+            alone, together = (
+                self._evaluate(values, settings, "is it one driving system?", arrays=arrays) for arrays in (False, True)
+            )
         except UserCodeError:
             return False
-        return not any(differences(self._evaluate(shares, settings, stage).results, together.results))
+        return not any(differences(alone.results, together.results))
+
+    def _evaluate(
+        self, values: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = (), *, arrays: bool
+    ) -> Evaluations:
+        """Evaluate each set of values with the setting of its row, at the worst of `points`, or of all without any."""
+        selection = Selection(tuple(parameter.name for parameter in self.parameters), tuple(points), arrays)
+        return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
 
     def degrees(
         self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
@@ -229,8 +225,8 @@ class RepairProblem:
         """Safety degrees of each of M sets of parameters with each of L settings, shape (M, L), and the worst points of
         these M L rows; None without a matrix.
         """
-        rows = np.repeat(shares, len(settings), axis=0), np.tile(settings, (len(shares), 1))
-        evaluations = self._evaluate(*rows, stage, points)
+        values = self.values(np.repeat(shares, len(settings), axis=0))
+        evaluations = self._evaluate(values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays)
         return _degrees_of(evaluations).reshape(len(shares), len(settings)), evaluations.worst_points
 
     def degrees_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:

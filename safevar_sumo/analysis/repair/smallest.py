@@ -46,6 +46,7 @@ class Search:
 
     def __init__(self, problem: RepairProblem, settings: FloatArray) -> None:
         self.problem, self.settings = problem, settings
+        self._thinning = 1 if problem.arrays else THINNING
         self._failures = list[Failure]()
         self._best, self._least = dict[int, FloatArray](), dict[int, float]()
 
@@ -75,7 +76,7 @@ class Search:
         if best is None or self._failure_of(best) is not None:
             best, low, high = None, self._least.get(number, 0.0), limit
             for _ in range(2 if low < high else 0):
-                count = RINGS if self.problem.arrays else RINGS // THINNING
+                count = RINGS // self._thinning
                 sizes = low + (high - low) * np.arange(1, count + 1) / count
                 changes = self._rings(number, sizes)
                 row = self._first_survivor(changes)
@@ -93,8 +94,8 @@ class Search:
         """Changes of each subset of a number of parameters with these sizes; of equal ones first that with the smallest
         sum.
         """
-        today, side = self.problem.today, SIDE if self.problem.arrays else SIDE // THINNING
-        ring = np.array(list(product(np.linspace(-1.0, 1.0, side), repeat=number)))
+        today = self.problem.today
+        ring = np.array(list(product(np.linspace(-1.0, 1.0, SIDE // self._thinning), repeat=number)))
         ring = ring[np.max(np.abs(ring), axis=1) == 1]
         subsets = list(combinations(range(len(today)), number))
         moves = np.zeros((len(subsets) * len(ring), len(today)))
