@@ -17,7 +17,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin
 
 from safevar_sumo.analysis.subject import Results, reduce_to_point, study_in, study_or_case
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
@@ -158,6 +158,8 @@ class Question:
 
         def subject_of(source: StudyLike | Results) -> Study | Case:
             subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only)
+            if not isinstance(subject, Study) and subject.shortfall:
+                warn(subject.shortfall)
             return reduce_to_point(subject, point)
 
         command = self.command_line([_name(source), *map(_name, others)], point, values)

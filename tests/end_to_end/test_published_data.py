@@ -89,6 +89,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     Path("part/solutions.csv").unlink()
     output = run("tables", "part").stdout
     assert "unfinished, rs 1 of 2 runs" in output
+    assert "rs 1 of 2 runs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
     records = json.loads(run("tables", "part", "--rq", "rq2", "--format", "json").stdout)
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     against = json.loads(run("tables", "part", "--rq", "rq2", "--algorithm", "rs", "--format", "json").stdout)
