@@ -63,6 +63,14 @@ def original_of(system: Any) -> FloatArray:
     return np.asarray(system.characteristics.original[np.newaxis])
 
 
+def drawn(system: Any, number: int, seed: int) -> FloatArray:
+    """The original vehicle and settings at random."""
+    members = system.characteristics
+    settings = np.random.default_rng(seed).uniform(members.lower, members.upper, (number, len(members)))
+    settings[0] = members.original
+    return np.asarray(members.filter(settings))
+
+
 def made_up_evaluations(safety: Any, **columns: Any) -> Evaluations:
     """Vehicles of these safety degrees: collisions where these are 0 or less."""
     values = np.asarray(safety, dtype=float)

@@ -69,14 +69,13 @@ Make = Callable[..., System]
 
 
 @pytest.fixture
-def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
+def small(in_tmp: Path) -> Make:
     """The system of an FMU that runs `then` within a gap of 25 m; in its model description `old` becomes `new`."""
-    monkeypatch.chdir(tmp_path)
 
     def system(then: str = "self.pedal = 1.0", table: str = TABLE, old: str = "", new: str = "", source: str = SOURCE):  # type: ignore[no-untyped-def]
-        module = tmp_path / f"small_{next(NUMBERS)}.py"  # a process imports a module once
+        module = in_tmp / f"small_{next(NUMBERS)}.py"  # a process imports a module once
         module.write_text(source.format(then=then) if source is SOURCE else source)
-        (FmuBuilder if source is SOURCE else FmuBuilder3).build_FMU(module, dest=tmp_path)
+        (FmuBuilder if source is SOURCE else FmuBuilder3).build_FMU(module, dest=in_tmp)
         if old:
             with zipfile.ZipFile("Small.fmu") as archive:
                 contents = {name: archive.read(name) for name in archive.namelist()}

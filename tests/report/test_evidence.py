@@ -174,15 +174,8 @@ def test_what_is_missing_torn_or_too_much_is_damage(bare: Path, tmp_path: Path) 
         ("1-slippery/risk.json", b"{}", "risk.json belongs to no claim"),
         ("2-other/manifest.json", b"{}", "2-other/manifest.json belongs to no study"),
         ("1-slippery/solutions.csv", b"[" * 100_000, "1-slippery is damaged"),
-        ("1-slippery/manifest.json", b"[" * 100_000, "1-slippery is damaged"),
-        ("1-slippery/answers.json", b"[]", "1-slippery is damaged"),
         ("1-slippery/answers.json", b'{"risk": 1}', "answers.json answers other questions"),
         (DESCRIPTION, b"[" * 100_000, "pack.json is damaged"),
-        (
-            DESCRIPTION,
-            re.sub(rb'"studies": .*\]', b'"studies": []', texts[DESCRIPTION], flags=re.DOTALL),
-            "length >= 1",
-        ),
         (DESCRIPTION, texts[DESCRIPTION].replace(b"1-slippery", b"../slippery"), "is missing"),
         (DESCRIPTION, re.sub(rb'"libsumo": "', b'"libsumo": "0.', texts[DESCRIPTION]), "made with libsumo 0."),
     ):

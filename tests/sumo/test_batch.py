@@ -14,12 +14,7 @@ from safevar_sumo.sumo.batch import _Outcomes
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
-
-
-def drawn(system: System, n: int, seed: int) -> FloatArray:
-    characteristics = system.characteristics
-    rng = np.random.default_rng(seed)
-    return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
+from tests.made_up import drawn
 
 
 @pytest.mark.slow

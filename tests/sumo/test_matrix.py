@@ -19,7 +19,7 @@ from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.made_up import original_of
+from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
 
 BASE = load_study("euro_ncap_pedestrian")
@@ -42,14 +42,9 @@ def study(tests: list[MatrixTest]) -> Study:
 SYSTEM = assemble(study(TESTS))
 
 
-def drawn(system: System, n: int) -> np.ndarray:
-    c = system.characteristics
-    return c.filter(np.random.default_rng(3).uniform(c.lower, c.upper, (n, len(c))))
-
-
 @pytest.mark.slow
 def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> None:
-    population = drawn(SYSTEM, 3)
+    population = drawn(SYSTEM, 3, 3)
     points = simulate_all_points(SYSTEM, population)
     assert [one.point.name for one in points][:3] == [
         "CPNA, speed 20, impact_location 25, clear",

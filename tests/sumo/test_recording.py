@@ -15,7 +15,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray, Observation, Outcome, differences
+from safevar_sumo.records import FloatArray, Observation, differences
 from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.shipped import NETWORKS
@@ -28,6 +28,7 @@ from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.in_process import json_of, run
+from tests.made_up import drawn
 from tests.scenarios.holding import Pedals
 
 CLAIM = """
@@ -37,14 +38,6 @@ from safevar_sumo.scenarios import PedestrianCrossing
 class Claims(PedestrianCrossing, frozen=True, kw_only=True):
     reactive_actors = False
 """
-
-
-def drawn(system: System, number: int, seed: int) -> FloatArray:
-    """The original and settings at random."""
-    characteristics, rng = system.characteristics, np.random.default_rng(seed)
-    settings = rng.uniform(characteristics.lower, characteristics.upper, (number, len(characteristics)))
-    settings[0] = characteristics.original
-    return characteristics.filter(settings)
 
 
 def assert_same(system: System, settings: FloatArray) -> list[str]:
@@ -91,16 +84,6 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
     assert [*tmp_path.glob("networks/scenes-*/scenes.msgpack")]
     monkeypatch.setattr(recording, "_play", None)
     assert scene() == played
-
-
-def test_contacts_are_those_that_sumo_finds() -> None:
-    """Vehicles that brake at various gaps: they hit with the front, a corner or the side, or miss."""
-    rng, outcomes = np.random.default_rng(6), []
-    for gap in rng.uniform(3.0, 9.0, 6).tolist():
-        ads = {"brake_gap": gap, "brake_gap_before": 1.0, "first_command": rng.uniform(0, 1.5)}
-        system = assemble(load_study("sun", ads={"parameters": ads}))
-        outcomes += assert_same(system, drawn(system, 40, 6))
-    assert 40 < outcomes.count(Outcome.COLLISION) < 220
 
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
@@ -213,10 +196,7 @@ def test_the_reason_counts_the_points_and_names_one() -> None:
         ("traci.vehicle.setSpeed(vehicle_id, 0 if traci.vehicle.getLeader(vehicle_id, 100) else 12)", ""),
     ],
 )
-def test_a_traci_controller_sees_nobody(
-    step: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_traci_controller_sees_nobody(step: str, expected: str, in_tmp: Path) -> None:
     Path("controller.py").write_text(f"def step(traci, vehicle_id):\n    {step}\n")
     Path("mine.toml").write_text(
         'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "controller:step"\n'
@@ -227,9 +207,8 @@ def test_a_traci_controller_sees_nobody(
 
 
 @pytest.fixture
-def still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def still(in_tmp: Path) -> str:
     """A study file whose driving system does nothing."""
-    monkeypatch.chdir(tmp_path)
     Path("still.py").write_text(
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self, seen):\n"
         "        return 0.0, 0.0\n"

@@ -21,6 +21,7 @@ from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System, assemble
 from tests.sumo.test_traci_controller import changed, system
 
+pytestmark = pytest.mark.usefixtures("in_tmp")
 CONTROLLERS = """
 def at(traci, time):
     return abs(traci.simulation.getTime() - time) < 1e-6
@@ -108,12 +109,10 @@ def refuse_difference(runs: System, traffic: Path, step: Callable[[Any, str], No
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_vehicle_without_delays_drives_as_in_bare_sumo(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
     space: dict[str, Any] = {}
     exec(CONTROLLERS, space)
-    runs = system(name, tmp_path, monkeypatch, CONTROLLERS, vehicle=NO_DELAYS)
+    runs = system(name, CONTROLLERS, vehicle=NO_DELAYS)
     refuse_difference(runs, NET / "traffic.rou.xml", space[name])
 
 
@@ -126,33 +125,22 @@ def test_a_vehicle_without_delays_drives_as_in_bare_sumo(
         'carFollowModel="CACC"',
     ],
 )
-def test_sumos_driver_has_the_attributes_of_the_traffic_file(
-    attributes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in_tmp: Path) -> None:
     """All but tau, which the study varies: without delays it drives as in bare SUMO."""
-    network = tmp_path / "net"
+    network = in_tmp / "net"
     shutil.copytree(NET, network)
     traffic = network / "traffic.rou.xml"
     old, new = 'speedDev="0" sigma="0" color="0,0.45,0.7"', f'speedDev="0" mass="900" tau="0.3" {attributes}'
     traffic.write_text(traffic.read_text().replace(old, new))
-    runs = system(
-        "idle",
-        tmp_path,
-        monkeypatch,
-        CONTROLLERS,
-        vehicle=NO_DELAYS,
-        scenario={"parameters": {"network": str(network)}},
-    )
+    runs = system("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario={"parameters": {"network": str(network)}})
     unused = f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
     assert any(remark.startswith(unused) for remark in runs.remarks)
     traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
     refuse_difference(runs, traffic, lambda *_: None)
 
 
-def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runs = system("idle", tmp_path, monkeypatch, CONTROLLERS)
+def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
+    runs = system("idle", CONTROLLERS)
     run = simulate(runs, changed(runs))
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert run.trace.gap[run.trace.active][-1] < 2  # of the 2.5 m that he wants

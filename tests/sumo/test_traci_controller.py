@@ -18,6 +18,7 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
 from tests.in_process import run
 
+pytestmark = pytest.mark.usefixtures("in_tmp")
 SCRIPT = """
 def step(traci, vehicle_id):
     traci.vehicle.setSpeedMode(vehicle_id, 0)
@@ -75,9 +76,8 @@ def step(traci, vehicle_id):
 """
 
 
-def system(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, script: str = SCRIPT, **tables: object) -> System:
-    (folder / "my_controller.py").write_text(script)
-    monkeypatch.chdir(folder)
+def system(name: str, script: str = SCRIPT, **tables: object) -> System:
+    Path("my_controller.py").write_text(script)
     study = load_study("native", **tables)
     return assemble(msgspec.structs.replace(study, ads=ModelTable(model=f"my_controller:{name}", kind="traci")))
 
@@ -87,9 +87,9 @@ def changed(of: System, **values: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_module_that_imports_traci_reads_the_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "helper.py").write_text(HELPER)
-    runs = system("step", tmp_path, monkeypatch, USES_HELPER)
+def test_a_module_that_imports_traci_reads_the_simulation() -> None:
+    Path("helper.py").write_text(HELPER)
+    runs = system("step", USES_HELPER)
     run = simulate(runs, changed(runs))
     assert run.trace.speed.max() == pytest.approx(5, abs=0.7)
     assert {type(sys.modules[name]) for name in ("traci", "libsumo")} == {ModuleType}, (
@@ -112,14 +112,14 @@ def step(traci, vehicle_id):
 """
 
 
-def test_a_controller_reads_other_actors_through_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_controller_reads_other_actors_through_the_sensors() -> None:
     """The gap to the leader is the trace's gap one reaction time and one recognition delay ago, linear between two
     steps.
     """
     weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
-    runs = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
+    runs = system("step", LOOKS, weather=weather)
     trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
-    leader, x, number, listed = np.loadtxt(tmp_path / "looks.csv", delimiter=",")[: len(trace.time)].T
+    leader, x, number, listed = np.loadtxt("looks.csv", delimiter=",")[: len(trace.time)].T
     gap = np.concatenate([np.repeat(trace.gap[0, :], 4), trace.gap[:, 0]])
     late = gap[: len(leader)]  # 3.5 steps, rounded to 4
     near = late <= 40  # also the leader, whose gap is that of the bumpers without minGap
@@ -151,8 +151,8 @@ class Reads:
 """
 
 
-def test_no_function_returns_ids_or_actors_of_other_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = system("Reads", tmp_path, monkeypatch, SUBSCRIBES)
+def test_no_function_returns_ids_or_actors_of_other_copies() -> None:
+    runs = system("Reads", SUBSCRIBES)
     simulate(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
 
 
@@ -185,11 +185,9 @@ REFUSED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "problem"), REFUSED)
-def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(
-    line: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(line: str, problem: str) -> None:
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
-    runs = system("step", tmp_path, monkeypatch, script)
+    runs = system("step", script)
     with pytest.raises(InputError) as caught:
         simulate(runs, changed(runs))
     assert problem in str(caught.value)
@@ -230,7 +228,7 @@ def main(traci, v):
         ),
     ],
 )
-def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str, problem: str, in_tmp: Path) -> None:
+def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str, problem: str) -> None:
     Path("my_script.py").write_text(OWN_LOOP)
     Path("my_loop.py").write_text(f"{OWN_LOOP}\n\nmain(traci, 'vut')\n")
     Path("mine.toml").write_text(f'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "{model}"\n')
@@ -249,8 +247,8 @@ def test_each_bit_of_a_speed_mode_is_one_limit(mode: int, acceleration: float) -
     assert commands.acceleration(10.0, 0.0, sumo_speed=18.0, accel=2.0, decel=5.0) == acceleration
 
 
-def test_the_vehicle_model_limits_a_commanded_acceleration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = system("Harsh", tmp_path, monkeypatch)
+def test_the_vehicle_model_limits_a_commanded_acceleration() -> None:
+    runs = system("Harsh")
     run = simulate(runs, runs.characteristics.original[np.newaxis])
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
     assert 7 < hardest < 9.0  # more than SUMO's driver, who plans with 4.5 m/s^2
