@@ -221,7 +221,7 @@ def test_from_a_headway_of_a_second_the_competent_driver_hits() -> None:
     assert found == pytest.approx(least_gap(50 / 3.6, 1.0), abs=0.1)
 
 
-@pytest.mark.parametrize("speed", range(30, 80))
+@pytest.mark.parametrize("speed", range(30, 80, 7))
 def test_below_5_two_conventions_differ(speed: int) -> None:
     """CCRb: 4 m/s^2 from a headway of 1 s. By the letter nothing is a danger; any braking is one for the other."""
     letter, anyone = CompetentDriver(lets_go=0.0), CompetentDriver(lets_go=0.0, leader_braking=0.5)
