@@ -19,7 +19,7 @@ def page(slippery: Path, case: Case, explained: Explained) -> str:
     friction = list(case.study.vehicle.characteristics).index("tireFric")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(report_input.QUESTIONS, "explain", lambda *_, **__: explained)
-        patch.setattr(report_input, "SAMPLED_VEHICLES", 400)
+        patch.setattr(report_input, "SAMPLES", {key: {"samples": 400} for key in ("risk", "rules")})
         patch.setattr(local, "ProcessWorker", lambda _: Plant(case.study, lambda rows: rows[:, friction] < 1.5))
         shows: list[tuple[str, int, int]] = []
         page = report(slippery, paper=True, jobs=1, progress=lambda *values: shows.append(values))
