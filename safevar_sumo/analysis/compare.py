@@ -30,6 +30,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
 
 if TYPE_CHECKING:
@@ -112,8 +113,10 @@ def compare(
         "not_simulated": int(np.count_nonzero(~is_valid)),
     }
     numbers |= dict(zip(("a_needless_braking", "b_needless_braking", "benign_scenes"), braking, strict=True))
-    for side, original in zip(SIDES, originals, strict=True):
+    for side, study, original in zip(SIDES, studies, originals, strict=True):
         numbers |= {f"{side}_outcome": str(original.outcome[0]), f"{side}_degree": float(original.f_safe[0])}
+        if contact := contact_degree(assemble(study)):
+            numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
         if both_rated:
             numbers[f"{side}_points"] = float(original.column(RATING_POINTS.name)[0])
     title_a, title_b = titles = ("A", "B") if studies[0].name == studies[1].name else tuple(one.name for one in studies)

@@ -82,6 +82,13 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
     assert answer.figure().axes
 
 
+def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
+    """The vehicle is 4.7 m long."""
+    later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})
+    numbers = sv.compare("native", later, samples=8, pool=POOL).numbers
+    assert [numbers[f"{side}_degree"] - numbers[f"{side}_gap"] for side in "ab"] == pytest.approx([4.7, 4.7])
+
+
 @pytest.fixture(scope="module")
 def weathers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Results in two weathers, with enough runs for the test."""
