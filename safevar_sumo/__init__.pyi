@@ -6,7 +6,6 @@ from .analysis.explain.answer import Explained as Explained
 from .analysis.explain.causes import Cause as Cause
 from .analysis.explain.failure import Explanation as Explanation
 from .analysis.opinion import opinion as opinion
-from .analysis.opinion.compute import Opinion as Opinion, Opinions as Opinions
 from .analysis.rating import rating as rating
 from .analysis.repair import repair as repair
 from .analysis.risk import risk as risk

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.case import Case
     from safevar_sumo.campaign.pool import Pool
 
-QUESTIONS = {name: f"safevar_sumo.analysis.{name}" for name in ("compare", "rating", "repair", "risk", "rules")} | {
-    "validate": "safevar_sumo.reference.agreement"
-}
+QUESTIONS = {
+    name: f"safevar_sumo.analysis.{name}" for name in ("compare", "opinion", "rating", "repair", "risk", "rules")
+} | {"validate": "safevar_sumo.reference.agreement"}
 """The module of each question, whose function has the question's name."""
 
 

@@ -51,7 +51,7 @@ COMMANDS_BY_GROUP = {
             "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
         ),
         "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
-        "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
+        "opinion": ("ask", "Check the minimal causes of failures with a second vehicle model."),
         "rules": ("ask", "Find rules, in physical units, that say where in the domain a study is unsafe."),
         "rating": (
             "ask",

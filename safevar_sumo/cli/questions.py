@@ -11,7 +11,6 @@ import click
 from rich.console import Console
 
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.subject import answer_question
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -109,19 +108,6 @@ def explain(
         save(result.figure(), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
     return answer
-
-
-@add_question(OpinionOptions, "DIR")
-def opinion(source: str, point: str | None, jobs: int | None, as_json: bool, **values: OptionValue) -> JsonAnswer:
-    """Check the minimal causes of failures of results in DIR with a second vehicle model."""
-    from safevar_sumo.analysis.opinion.compute import ask_for_opinions
-
-    subject = load_results_or_study(source, point, results_only=True)
-    result = answer_question(ask_for_opinions, subject, OpinionOptions(**values), jobs=jobs)
-    if as_json:
-        for note in (*result.notes, result.counts):
-            print_note(note)
-    return _show(result, as_json)
 
 
 @add_question(

@@ -14,7 +14,6 @@ from safevar_sumo.analysis.ask import find_question
 from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.subject import answer_question, at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -72,7 +71,6 @@ class ReportInput:
         """Each question's options on the page: smaller samples than the commands take."""
         all_options: tuple[Options, ...] = (
             ExplainOptions(limit=EXPLAIN_SIMULATIONS),
-            OpinionOptions(),
             ToleranceOptions(margin=self.margin),
         )
         return {options.question: options for options in all_options}
@@ -83,7 +81,13 @@ class ReportInput:
         fewest changes that loses a point.
         """
         solution = self.select_handles("fewest")[0] if self.is_rated and self.any_unsafe else None
-        return {**SAMPLES, "compare": {}, "rating": {"solution": solution}, "repair": {"margin": self.margin}}
+        return {
+            **SAMPLES,
+            "compare": {},
+            "opinion": {},
+            "rating": {"solution": solution},
+            "repair": {"margin": self.margin},
+        }
 
     def ask(self, question: str, jobs: int | None, progress: Progress, *others: Case) -> Any:
         """The answer to a question of the page, `others` beside its study."""

@@ -17,7 +17,7 @@ from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause
 from safevar_sumo.analysis.explain.failure import Explanation
 from safevar_sumo.analysis.model_spread import compute_model_spreads
-from safevar_sumo.analysis.opinion.compute import Opinion, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.opinion import assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.tables import BoldText
 from safevar_sumo.analysis.words import number_of, points_in_words, question_command
 from safevar_sumo.errors import InputError
@@ -102,19 +102,17 @@ def make_cause_sections(data: ReportInput, explained: Explained) -> list[JsonObj
     for cause, failure in causes:
         distinct.setdefault(tuple(cause.changes), (cause, failure))
     selection = list(distinct.values())[:MAX_CAUSES]
-    opinions: tuple[Opinion | None, ...] = (None,) * len(selection)
+    opinions: list[Any] = [None] * len(selection)
     if selection and not reason_without_opinion(data):
         judged = [(failure.name, cause) for cause, failure in selection]
-        opinions = judge_causes(data.case.study, judged, explained.unsafe).opinions
+        opinions = [*judge_causes(data.case.study, judged, explained.unsafe)[0].itertuples()]
     return [
         _make_cause_section(data, rank, *pair, opinion)
         for rank, (pair, opinion) in enumerate(zip(selection, opinions, strict=True), 1)
     ]
 
 
-def _make_cause_section(
-    data: ReportInput, rank: int, cause: Cause, failure: Explanation, opinion: Opinion | None
-) -> JsonObject:
+def _make_cause_section(data: ReportInput, rank: int, cause: Cause, failure: Explanation, opinion: Any) -> JsonObject:
     comparison, player = data.play(data.case.characteristics.setting(cause.changes, "cause", beyond=True))
     title, rows = f"Cause {rank}: {', '.join(cause.changes)}", {}
     for item in data.case.characteristics:

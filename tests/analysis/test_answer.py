@@ -22,7 +22,6 @@ import safevar_sumo as sv
 from safevar_sumo.analysis.answer import MAX_ROWS, Answer, Column, tabulate, with_interval
 from safevar_sumo.analysis.ask import QUESTIONS, Question, find_question
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import COMMANDS, commands
@@ -151,7 +150,7 @@ def test_a_question_from_outside_is_a_command(tmp_path: Path, monkeypatch: pytes
     assert "a whole number from 1 to 100,000,000" in str(refused.exception)
 
 
-@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, ToleranceOptions])
+@pytest.mark.parametrize("options", [ExplainOptions, ToleranceOptions])
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)
     arguments = inspect.signature(function).parameters
@@ -174,7 +173,6 @@ def test_a_function_takes_and_documents_the_options_of_its_record(options: type[
         ExplainOptions(),
         ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
         ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), margin=0.5),
-        OpinionOptions(solutions="nsga2:3:0"),
     ],
 )
 def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:

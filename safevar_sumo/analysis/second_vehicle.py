@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.opinion.multi_body import (
+from safevar_sumo.analysis.multi_body import (
     LONGEST_STEP,
     WHEEL_COUNT,
     MultiBodyState,
