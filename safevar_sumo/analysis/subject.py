@@ -263,14 +263,12 @@ def answer_question(
         return compute(subject, options, evaluator)
 
 
-def answer_call(
-    compute: Callable[..., Answer], options: type[Options], arguments: JsonObject, *, results_only: bool = False
-) -> Answer:
+def answer_call(compute: Callable[..., Answer], options: type[Options], arguments: JsonObject) -> Answer:
     """Answer a call of a question's function; `arguments` are its arguments by name, the subject first."""
     from safevar_sumo.metrics import Unsafe
 
     source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]
-    subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=results_only)
+    subject = study_or_case(source, as_it_is_now=as_it_is_now)
     subject = reduce_to_point(subject, arguments.get("point"))
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
