@@ -271,7 +271,8 @@ def print_result(fit: Fit, log: Path) -> None:
         _, *evaluated = simulate(study, list(files.values()))
         for (file, data), here in zip(files.items(), evaluated, strict=True):
             for part, rows in (("used", ~held_back(data, hold_out)), ("held back", held_back(data, hold_out))):
-                agreement = measure_agreement(data.take(rows), here.take(rows)).loc[SAFETY_DEGREE]
+                table = measure_agreement(data.take(rows), here.take(rows)).set_index("metric")
+                agreement = table.loc[SAFETY_DEGREE].drop("unit")
                 print(f"# {file}, {part}: " + ", ".join(f"{key} {value:.3f}" for key, value in agreement.items()))
         error = model_error(study, [data.take(~held_back(data, hold_out)) for data in files.values()])
         print(f"[model_error]\n{SAFETY_DEGREE} = {round(error, ERROR_DECIMALS)}\n[spread]")

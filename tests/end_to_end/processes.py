@@ -28,7 +28,7 @@ running: list[Process] = []
 
 
 def started(*arguments: str, **options: object) -> Process:
-    """Start a command in its own process group, as a shell does."""
+    """Start a command in its own process group and with Ctrl-C as a shell does, whatever this process ignores."""
     running.append(
         subprocess.Popen(
             [sys.executable, "-m", "safevar_sumo", *arguments],
@@ -36,6 +36,7 @@ def started(*arguments: str, **options: object) -> Process:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            preexec_fn=None if os.name == "nt" else lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             **options,
         )
     )
