@@ -135,8 +135,8 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(
     assert [claim["claim"] for claim in result["table"]] == claims
     (claim,) = not_same(changed(pack, tmp_path / "it.zip", "answers.json", digit_of(r'"probability": 0\.(\d+)')))
     assert claim["claim"] == "answer risk"
-    assert claim["packed"].startswith("answer.probability = 0.")
-    assert claim["here"] == f"answer.probability = {answers['risk']['answer']['probability']}"
+    assert claim["packed"].startswith("answer.numbers.probability = 0.")
+    assert claim["here"] == f"answer.numbers.probability = {answers['risk']['answer']['numbers']['probability']}"
     (claim,) = not_same(
         changed(pack, tmp_path / "it.zip", "report.html", lambda text: text.replace("-&gt; ", "-&gt; 9", 1))
     )
