@@ -137,7 +137,12 @@ class _BoxSearch:
         """Which of B boxes, shape (B, 2, n), hold which of K settings; shape (B, K)."""
         change = settings - self.original
         extents = np.stack([-change, change], axis=1) - ROUNDING * self.width
-        return np.array([(extents <= sides).all(axis=(1, 2)) for sides in boxes]).reshape(len(boxes), len(settings))
+        holds = np.zeros((len(boxes), len(settings)), dtype=bool)
+        if len(boxes):  # no box holds what the smallest box around all of them does not hold
+            candidates = np.flatnonzero((extents <= boxes.max(axis=0)).all(axis=(1, 2)))
+            for row, sides in enumerate(boxes):
+                holds[row, candidates] = (extents[candidates] <= sides).all(axis=(1, 2))
+        return holds
 
     def unsafe_inside(self, sides: FloatArray) -> FloatArray:
         """The known unsafe settings that a box holds."""
