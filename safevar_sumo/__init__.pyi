@@ -14,13 +14,9 @@ from .analysis.subject import Results as Results, load as load
 from .analysis.tolerance import tolerance as tolerance
 from .analysis.tolerance.answer import Tolerance as Tolerance
 from .api import Figures as Figures, Tables as Tables, figures as figures, tables as tables
+from .api.evaluation import evaluate as evaluate
 from .api.running import run as run
-from .api.simulation import (
-    Simulation as Simulation,
-    evaluate as evaluate,
-    load_study as load_study,
-    simulate as simulate,
-)
+from .api.simulation import Simulation as Simulation, load_study as load_study, simulate as simulate
 from .campaign.pool import Pool as Pool
 from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
 from .metrics import Criterion as Criterion, Unsafe as Unsafe

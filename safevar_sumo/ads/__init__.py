@@ -10,9 +10,10 @@ from safevar_sumo.ads.base import (
     ScalarAds as ScalarAds,
 )
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
+from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.fmu import MAX_INSTANCES as MAX_INSTANCES, Fmu as Fmu, FmuAds as FmuAds
 from safevar_sumo.ads.published import Apollo, WorldOnRails
-from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FullBraking, FuzzySafety, Rss
+from safevar_sumo.ads.reference_drivers import R157, FullBraking, FuzzySafety, Rss
 
 ADS: Mapping[str, type] = {
     "acc": Acc,

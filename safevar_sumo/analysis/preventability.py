@@ -18,7 +18,8 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
-from safevar_sumo.ads.reference_drivers import ANY_BRAKING, CompetentDriver
+from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.reference_drivers import ANY_BRAKING
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.words import number_of, points_named, share_in_words
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from safevar_sumo.analysis.subject import Results as Results, load as load
+from safevar_sumo.api.evaluation import evaluate as evaluate
 from safevar_sumo.api.running import run as run
-from safevar_sumo.api.simulation import Simulation as Simulation, evaluate as evaluate, simulate as simulate
+from safevar_sumo.api.simulation import Simulation as Simulation, simulate as simulate
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,6 +9,7 @@ import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -56,6 +57,8 @@ class ProcessWorker:
         if TIMEOUT_MARK in words:
             return f"a batch took longer than the time limit, `search.time_limit`{place}"
         self._process.join()
+        while self._process.exitcode is None:  # the executor's thread has waited for the process and notes its code
+            time.sleep(0.001)
         return f"the worker process died (exit code {self._process.exitcode}){place}"
 
     def end(self) -> None:

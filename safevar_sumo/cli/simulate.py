@@ -15,7 +15,8 @@ from safevar_sumo.analysis.ask import find_question
 from safevar_sumo.analysis.changes import read_changes
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, remarks_on_sets, studies_of_sets
 from safevar_sumo.analysis.words import points_in_words
-from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
+from safevar_sumo.api.evaluation import evaluate_settings
+from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.cli.arguments import (
     CommandTarget,
     JsonAnswer,

@@ -21,8 +21,8 @@ import pandas as pd
 
 from safevar_sumo.analysis.case import Case, build_case
 from safevar_sumo.analysis.subject import changes_since, study_or_case
+from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.running import run
-from safevar_sumo.api.simulation import evaluate_settings
 from safevar_sumo.errors import InputError, SafevarError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import file_by_name, is_shipped

@@ -9,45 +9,26 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
-from safevar_sumo.errors import InputError, one_of, unknown_name
-from safevar_sumo.metrics import (
-    METRIC_OF_OBJECTIVE,
-    METRICS,
-    OPTIONAL_METRICS,
-    RATING_POINTS,
-    Metric,
-    Objective,
-    Scoring,
-    checked_metric,
-)
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
-from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
+from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
+from safevar_sumo.sumo.measuring import Measuring, measuring_of
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
-from safevar_sumo.vehicles import (
-    CHANGES,
-    VEHICLES,
-    Change,
-    CharacteristicSet,
-    FeasibleRegion,
-    Vehicle,
-    calibration_drive,
-    checked_change,
-    region_of,
-)
+from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
 from safevar_sumo.vehicles.base import Prepared
 
 RESULT_COLUMNS = (
@@ -67,65 +48,6 @@ RESULT_COLUMNS = (
 OBJECTIVES_KEY = "search.objectives"
 MIN_HEADWAY = 0.5
 """Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
-
-
-class Measuring(NamedTuple):
-    """Metrics and additional measures of change by column, and the objectives."""
-
-    metrics: Mapping[str, Metric]
-    changes: Mapping[str, Change]
-    scoring: Scoring
-
-
-def measuring_of(study: Study, lookup: Lookup) -> Measuring:
-    """Look up the metrics and objectives that a study names.
-
-    Raises
-    ------
-    InputError
-        If a metric or measure of change does not exist, is invalid, or has a name that is taken.
-    """
-    metrics = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}
-    shipped: Mapping[str, Metric] = {**metrics, **OPTIONAL_METRICS}
-    changes, user_records = dict[str, Change](), dict[str, Metric | Change]()
-
-    def look_up(known: Mapping[str, Metric | Change], name: str, key: str) -> Metric | Change:
-        if name in user_records:
-            return user_records[name]
-        member = lookup.find(known, name, key)
-        record: Metric | Change = member.target
-        if member.code is not None:
-            is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
-            record = (checked_change if is_change else checked_metric)(member.code)
-            if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
-                raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
-            user_records[name] = user_records[record.name] = record
-            if isinstance(record, Change):
-                changes[record.name] = record
-        if isinstance(record, Metric):
-            metrics.setdefault(record.name, record)
-        return record
-
-    for name in study.metrics.also:
-        if name in METRICS:
-            problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
-            raise InputError(lookup.source, problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
-        look_up(shipped, name, "metrics.also")
-    objectives = []
-    for name in study.search.objectives:
-        record = look_up({**shipped, **CHANGES, **METRIC_OF_OBJECTIVE}, name, OBJECTIVES_KEY)
-        if isinstance(record, Metric):
-            objectives.append(Objective.of(record))
-        else:
-            objectives.append(Objective(name=record.name, title=record.title, unit=record.unit))
-    names = [objective.name for objective in objectives]
-    if len(set(names)) < len(names):
-        problem = f"search.objectives: one of {', '.join(names)} is named twice"
-        raise InputError(lookup.source, problem, one_of([*METRICS, *OPTIONAL_METRICS, *CHANGES]))
-    scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
-    return Measuring(metrics, changes, scoring)
-
-
 CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
 """The legal forms of a controller written for TraCI."""
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from safevar_sumo.ads.car_following import Acc, Idm
-from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FuzzySafety, Rss
+from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.reference_drivers import R157, FuzzySafety, Rss
 from safevar_sumo.records import Nominal, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world

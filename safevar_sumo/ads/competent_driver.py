@@ -1,0 +1,134 @@
+"""The competent and careful human driver of UN Regulation No. 157, annex 4, appendix 3."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter, is_in_the_way, time_to_reach
+from safevar_sumo.ads.car_following import KEEPING_GAINS
+from safevar_sumo.ads.reference_drivers import (
+    DECELERATION_ROUNDING,
+    HARDEST_BRAKING,
+    JERK,
+    Reaction,
+    ReferenceDriver,
+    StartThrottle,
+)
+from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
+
+
+class _Perceiving(NamedTuple):
+    """What the competent driver remembers of N vehicles; arrays have shape (N,).
+
+    Attributes
+    ----------
+    reaction
+        What every reference driver remembers.
+    first_lateral, appeared_in_way
+        Lateral position at which the driver first saw the obstacle [m], infinite before; whether this position is in
+        the way.
+    stray_time
+        Time since the obstacle strayed from this position [s], negative before.
+    braking_time
+        Time since a leader began to brake harder than `leader_braking` [s], negative before.
+    """
+
+    reaction: Reaction
+    first_lateral: FloatArray
+    appeared_in_way: BoolArray
+    stray_time: FloatArray
+    braking_time: FloatArray
+
+
+class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
+    """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
+
+    Holds its speed or a headway, perceives a danger, reacts, and brakes with up to 0.774 g. The danger is
+
+    - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a standing car this is a
+      time headway of 2 s;
+    - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
+      by the letter the driver does not react.
+
+    While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
+    Behind a moving leader it keeps its headway by the accelerator only:
+    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`,
+    with the speeds u and v of leader and vehicle.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s], by default the initial speed.
+    critical_ttc, reaction_time
+        Time to collision that counts as a danger, and reaction time before braking [s].
+    stray, perception_time
+        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
+        position [m, s].
+    leader_braking
+        Deceleration of a leader above which its braking is a danger [m/s^2], perceived `perception_time` after it
+        begins; 5 by the letter of the regulation, 0.5 for any braking.
+    lets_go
+        Largest deceleration by which it lets its gap to a leader grow to the headway [m/s^2].
+    headway
+        Time headway at which it follows [s].
+    corridor
+        Half the width of the corridor that it watches [m].
+    start_throttle
+        Throttle in the run's first steps, one value per step, until it sees a danger [-].
+    """
+
+    critical_ttc: PositiveParameter = 2.0
+    reaction_time: NonNegativeParameter = 0.75
+    stray: NonNegativeParameter = 0.375
+    perception_time: NonNegativeParameter = 0.4
+    leader_braking: NonNegativeParameter = 5.0
+    lets_go: NonNegativeParameter = 0.4
+    headway: PositiveParameter = 2.0
+    start_throttle: StartThrottle = ()
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
+        reaction: Reaction = ReferenceDriver.start(self, n, nominal, step)
+        return _Perceiving(reaction, np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0), np.full(n, -1.0))
+
+    def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
+        is_perceived, memory = self._perceive(seen, memory)
+        is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
+        deceleration, reaction = self.watch_leader(seen, memory.reaction, is_in_way)
+        brakes_now = deceleration > self.leader_braking + DECELERATION_ROUNDING
+        begun = np.where(brakes_now, 0.0, -1.0)
+        braking_time = np.where(memory.braking_time >= 0, memory.braking_time + reaction.step, begun)
+        brakes = braking_time >= self.perception_time - TIME_ROUNDING
+        is_near = time_to_reach(seen) < self.critical_ttc
+        danger = is_in_way & np.where(reaction.leader_has_braked, brakes, is_near)
+        following = self._following(seen, is_in_way)
+        command, reaction = self.react(
+            seen, reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following
+        )
+        return command, memory._replace(reaction=reaction, braking_time=np.where(is_in_way, braking_time, -1.0))
+
+    def _following(self, seen: Observation, is_in_way: BoolArray) -> FloatArray:
+        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite if no leader is in the way."""
+        gap = np.where(is_in_way, seen.gap, 0.0)
+        by_speed, by_gap = KEEPING_GAINS
+        gap_control = by_speed * (seen.obstacle_speed - seen.speed) + by_gap * (gap - self.headway * seen.speed)
+        return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
+
+    def _perceive(self, seen: Observation, memory: _Perceiving) -> tuple[BoolArray, _Perceiving]:
+        """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
+        `perception_time` ago or earlier.
+        """
+        is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
+        lateral = np.where(is_sighted, seen.lateral, 0.0)
+        is_first_sight = is_sighted & ~np.isfinite(memory.first_lateral)
+        first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
+        appeared_in_way = memory.appeared_in_way | (is_first_sight & (np.abs(lateral) <= self.corridor))
+        deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
+        strays_now = is_sighted & (deviation >= self.stray)
+        new_stray_time = np.where(strays_now, 0.0, -1.0)
+        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
+        is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
+        return is_perceived, memory._replace(
+            first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
+        )

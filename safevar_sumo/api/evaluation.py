@@ -1,0 +1,136 @@
+"""Settings evaluated in one call: `sv.evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.api.simulation import load_and_assemble
+from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import evaluations_frame
+from safevar_sumo.study import Study, StudyLike, plain_values
+from safevar_sumo.terminal import Progress, open_progress, show_no_progress
+from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from safevar_sumo.campaign.pool import Pool
+
+
+SETTINGS_FORMAT = (
+    "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic "
+    "that is changed, "
+    "or an array of numbers, shape (M, n)"
+)
+
+
+def evaluate(
+    study: StudyLike,
+    settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike,
+    *,
+    filtered: bool = True,
+    beyond: bool = False,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+) -> pd.DataFrame:
+    """Simulate many settings of a study in worker processes.
+
+    Parameters
+    ----------
+    study
+        A study, or anything that `load_study` accepts.
+    settings
+        M settings, with values in the characteristics' table units, in one of these forms:
+
+        - a list with a mapping for each setting, or a frame with a row for each setting, of the characteristics that
+          are changed; a missing value (no key, None or NaN) means the original's value;
+        - an array of shape (M, n) without missing values, with the n characteristics in the study's order.
+    filtered
+        Put changes that are smaller than their thresholds back to the original, as every search does.
+    beyond
+        Also accept values outside the domains, and settings that violate the study's constraints.
+    pool
+        Pool that simulates, in place of new worker processes.
+    jobs
+        Worker processes, by default one for each core.
+    progress
+        True for a bar on the terminal, or a function called with the stage, the number of settings done, and of all.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated,
+        f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined),
+        collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated, invalid-test if it leaves a
+        test's speed before the driving system acts. These have no metrics, and are neither failures nor successes.
+
+    Raises
+    ------
+    InputError
+        If the study, a column or a value cannot be used.
+    SafevarError
+        If nothing can be simulated.
+    """
+    loaded_study, system = load_and_assemble(study)
+    characteristics = system.characteristics
+    requested, index = _read_settings(settings, characteristics, beyond)
+    if not beyond:
+        system.check_feasible(requested, "settings", filtered=filtered)
+    simulated = characteristics.filter(requested) if filtered else requested
+    with open_progress(progress) as report_progress:
+        evaluations = evaluate_settings(loaded_study, simulated, pool, jobs, report_progress)
+    groups = [(("", 0), evaluations)]  # one group, of no algorithm and run
+    frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
+    frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
+    return frame.set_axis(index)
+
+
+def evaluate_settings(
+    study: Study,
+    settings: FloatArray,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Evaluations:
+    """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
+    from safevar_sumo.analysis.evaluator import open_evaluator
+
+    with open_evaluator(study, pool, jobs, progress) as evaluator:
+        return evaluator.evaluate(settings, "settings", ignore_constraints=True)
+
+
+def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bool) -> tuple[FloatArray, Any]:
+    """Convert a user's settings into an array of shape (M, n), and the index of its rows; refuses illegal values."""
+    import pandas as pd
+
+    names = list(characteristics.names)
+    if isinstance(settings, Sequence):
+        settings = plain_values(settings)
+    if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
+        settings = pd.DataFrame(list(settings), index=range(len(settings)))
+    try:
+        if isinstance(settings, pd.DataFrame):
+            for name in settings.columns.difference(names, sort=False):
+                raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
+            values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
+            array = np.where(np.isnan(values), characteristics.original, values)
+            index = settings.index
+        else:
+            array = np.array(settings, dtype=float)
+            if array.ndim != 2 or array.shape[1] != len(names):
+                raise InputError(
+                    "settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}"
+                )
+            index = pd.RangeIndex(len(array))
+    except (TypeError, ValueError) as error:
+        raise InputError("settings", str(error), SETTINGS_FORMAT) from None
+    is_legal = [row.is_legal(values, beyond=beyond) for row, values in zip(characteristics, array.T, strict=True)]
+    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:  # the first illegal value
+        characteristics.members[column].check(float(array[row, column]), f"settings, row {row}", beyond=beyond)
+    return array, index
