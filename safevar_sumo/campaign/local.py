@@ -57,7 +57,9 @@ class ProcessWorker:
         if TIMEOUT_MARK in words:
             return f"a batch took longer than the time limit, `search.time_limit`{place}"
         self._process.join()
-        while self._process.exitcode is None:  # the executor's thread has waited for the process and notes its code
+        for _ in range(1000):  # the executor's thread may have waited for the process, and be about to note its code
+            if self._process.exitcode is not None:
+                break
             time.sleep(0.001)
         return f"the worker process died (exit code {self._process.exitcode}){place}"
 
