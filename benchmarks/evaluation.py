@@ -28,7 +28,7 @@ import traci
 from measuring import Record, clock_seconds, medians_in_turn, print_records, processor_seconds
 
 from safevar_sumo.ads import PerVehicleAds, ScalarAds
-from safevar_sumo.plugins import Guard
+from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import drive
@@ -153,7 +153,7 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
 def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[Record]:
     """Against other ways to do the same, on the clock."""
     n, few = len(settings), settings[:SOCKET_SETTINGS]
-    scalar = replace(system, ads=PerVehicleAds(Coasting, Guard("benchmark", "ads")))
+    scalar = replace(system, ads=PerVehicleAds(Coasting, UserCode("benchmark", "ads")))
     evaluate(system, settings)
     program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo")
     command = [program, *sumo_options(copied_network(stage_network(system.points[0].scenario), 1))]
