@@ -21,7 +21,14 @@ import cma
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.model_spread import BAND_SHARE, band_of, error_distance, evaluate_sets, value_of, with_values
+from safevar_sumo.questions.model_spread import (
+    BAND_SHARE,
+    band_of,
+    error_distance,
+    evaluate_sets,
+    value_of,
+    with_values,
+)
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.agreement import defined_pairs, measure_agreement, rank_correlation
 from safevar_sumo.reference.rows import ReferenceData, read_reference

@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 from sklearn.ensemble import RandomForestRegressor
 
-from safevar_sumo.analysis.evaluator import open_evaluator
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, read_reference
 from safevar_sumo.search import Nsga2, Problem

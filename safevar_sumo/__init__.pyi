@@ -1,18 +1,3 @@
-from .analysis.answer import Answer as Answer
-from .analysis.ask import question as question
-from .analysis.compare import compare as compare
-from .analysis.explain import explain as explain
-from .analysis.explain.answer import Explained as Explained
-from .analysis.explain.causes import Cause as Cause
-from .analysis.explain.failure import Explanation as Explanation
-from .analysis.opinion import opinion as opinion
-from .analysis.rating import rating as rating
-from .analysis.repair import repair as repair
-from .analysis.risk import risk as risk
-from .analysis.rules import rules as rules
-from .analysis.subject import Results as Results, load as load
-from .analysis.tolerance import tolerance as tolerance
-from .analysis.tolerance.answer import Tolerance as Tolerance
 from .api import Figures as Figures, Tables as Tables, figures as figures, tables as tables
 from .api.evaluation import evaluate as evaluate
 from .api.running import run as run
@@ -20,6 +5,21 @@ from .api.simulation import Simulation as Simulation, load_study as load_study, 
 from .campaign.pool import Pool as Pool
 from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
 from .metrics import Criterion as Criterion, Unsafe as Unsafe
+from .questions.answer import Answer as Answer
+from .questions.ask import question as question
+from .questions.compare import compare as compare
+from .questions.explain import explain as explain
+from .questions.explain.answer import Explained as Explained
+from .questions.explain.causes import Cause as Cause
+from .questions.explain.failure import Explanation as Explanation
+from .questions.opinion import opinion as opinion
+from .questions.rating import rating as rating
+from .questions.repair import repair as repair
+from .questions.risk import risk as risk
+from .questions.rules import rules as rules
+from .questions.subject import Results as Results, load as load
+from .questions.tolerance import tolerance as tolerance
+from .questions.tolerance.answer import Tolerance as Tolerance
 from .records import Outcome as Outcome
 from .reference.agreement import validate as validate
 from .reference.rows import import_published as import_published

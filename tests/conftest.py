@@ -12,13 +12,13 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from safevar_sumo.analysis.case import Case, load_cases
-from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.campaign import local
 from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import ExplainOptions
+from safevar_sumo.questions.explain.answer import Explained
+from safevar_sumo.questions.explain.compute import explain_failures
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, inline_worker, searched

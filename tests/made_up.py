@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.analysis.case import Case, build_case
+from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.records import Encounter, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study

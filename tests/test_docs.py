@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.tolerance import scans
 from safevar_sumo.cli.program import commands
+from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS
 from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES

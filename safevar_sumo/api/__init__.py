@@ -1,5 +1,5 @@
-"""The public library, which `import safevar_sumo` re-exports, without the questions of `safevar_sumo.analysis`; but the
-research questions are here, as tables and figures.
+"""The public library, which `import safevar_sumo` re-exports, without the questions of `safevar_sumo.questions`;
+the research questions are here, as tables and figures.
 """
 
 from __future__ import annotations
@@ -7,17 +7,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from safevar_sumo.analysis.subject import Results as Results, load as load
 from safevar_sumo.api.evaluation import evaluate as evaluate
 from safevar_sumo.api.running import run as run
 from safevar_sumo.api.simulation import Simulation as Simulation, simulate as simulate
+from safevar_sumo.questions.subject import Results as Results, load as load
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from safevar_sumo.analysis.case import Case
-    from safevar_sumo.analysis.research_questions.answer import TableAnswer
+    from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.research_questions.answer import TableAnswer
 
 
 class Tables(dict[str, "pd.DataFrame"]):
@@ -33,7 +33,7 @@ class Tables(dict[str, "pd.DataFrame"]):
         return {answer.name: answer.notes for answer in self.answers}
 
     def _repr_markdown_(self) -> str:
-        from safevar_sumo.analysis.research_questions.formats import as_markdown
+        from safevar_sumo.questions.research_questions.formats import as_markdown
 
         return as_markdown(self.answers)
 
@@ -59,14 +59,14 @@ def tables(*results: Results | str | Path, question: str | None = None, algorith
     Returns
     -------
     Tables
-        Frames by name; the functions in `safevar_sumo.analysis` describe the columns.
+        Frames by name; the functions in `safevar_sumo.questions` describe the columns.
 
     Raises
     ------
     InputError
         If there is no such question, or no results can answer it.
     """
-    from safevar_sumo.analysis.research_questions.answer import answer_questions
+    from safevar_sumo.questions.research_questions.answer import answer_questions
 
     return Tables(answer_questions(_load_cases(results), question, algorithm))
 
@@ -89,7 +89,7 @@ def figures(*results: Results | str | Path) -> Figures:
     InputError
         If no figure can be drawn.
     """
-    from safevar_sumo.analysis.research_questions.figures import draw_figures
+    from safevar_sumo.questions.research_questions.figures import draw_figures
 
     figures_by_name, lacking = draw_figures(_load_cases(results))
     drawn_figures = Figures(figures_by_name)
@@ -98,6 +98,6 @@ def figures(*results: Results | str | Path) -> Figures:
 
 
 def _load_cases(results: tuple[Results | str | Path, ...]) -> list[Case]:
-    from safevar_sumo.analysis.case import load_cases
+    from safevar_sumo.questions.case import load_cases
 
     return load_cases([source.directory if isinstance(source, Results) else source for source in results])

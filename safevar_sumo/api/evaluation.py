@@ -99,7 +99,7 @@ def evaluate_settings(
     progress: Progress = show_no_progress,
 ) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
-    from safevar_sumo.analysis.evaluator import open_evaluator
+    from safevar_sumo.questions.evaluator import open_evaluator
 
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         return evaluator.evaluate(settings, "settings", ignore_constraints=True)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import warn
+from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.system import System

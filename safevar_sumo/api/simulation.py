@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.metrics import Scoring, time_to_collision
+from safevar_sumo.questions.words import OUTCOME_VERBS
 from safevar_sumo.records import (
     STANDSTILL,
     TIME_DECIMALS,

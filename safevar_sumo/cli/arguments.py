@@ -19,19 +19,19 @@ import click
 import numpy as np
 from click.shell_completion import CompletionItem
 
-from safevar_sumo.analysis.changes import NUMBER_PATTERN
-from safevar_sumo.analysis.options import Option, Options
-from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.cli.program import print_note, print_warning
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.output import check_writable
+from safevar_sumo.questions.changes import NUMBER_PATTERN
+from safevar_sumo.questions.options import Option, Options
+from safevar_sumo.questions.subject import study_in
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.study import Study, load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.case import Case
+    from safevar_sumo.questions.case import Case
 
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
@@ -223,7 +223,7 @@ def load_results_or_study(source: str, point: str | None = None, *, results_only
 
 
 def _load_subject(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
-    from safevar_sumo.analysis.subject import reduce_to_point, study_or_case
+    from safevar_sumo.questions.subject import reduce_to_point, study_or_case
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)

@@ -13,11 +13,11 @@ from typing import Any
 import click
 from rich.console import Console
 
-from safevar_sumo.analysis.answer import FORMATS, Answer
-from safevar_sumo.analysis.ask import COMMON_OPTIONS, Option, Question
-from safevar_sumo.analysis.changes import NUMBER_PATTERN
 from safevar_sumo.cli.arguments import GATE_EXIT_CODE, check_output, complete_study
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.answer import FORMATS, Answer
+from safevar_sumo.questions.ask import COMMON_OPTIONS, Option, Question
+from safevar_sumo.questions.changes import NUMBER_PATTERN
 
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
@@ -38,7 +38,7 @@ def command_of(ask: Question) -> click.Command:
         answer = ask(*subjects, progress=True, **values)
         _print(answer, form, table)
         if plot is not None:
-            from safevar_sumo.analysis.figures import save
+            from safevar_sumo.questions.figures import save
 
             save(answer.figure(), plot, "--plot")
         failures = [*answer.failures, *(text for condition in conditions for text in _fulfilments(answer, *condition))]

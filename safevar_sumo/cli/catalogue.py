@@ -9,10 +9,10 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.words import number_of
 from safevar_sumo.cli.arguments import json_option
 from safevar_sumo.cli.program import commands, print_json
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
 from safevar_sumo.search import ALGORITHMS

@@ -12,11 +12,6 @@ import click
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.case import load_cases
-from safevar_sumo.analysis.research_questions.answer import QUESTION_NAMES, answer_questions
-from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
-from safevar_sumo.analysis.research_questions.formats import ENDINGS, FORMATS
-from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
     as_it_is_now,
     as_it_is_now_option,
@@ -31,6 +26,11 @@ from safevar_sumo.cli.arguments import (
 )
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.case import load_cases
+from safevar_sumo.questions.research_questions.answer import QUESTION_NAMES, answer_questions
+from safevar_sumo.questions.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
+from safevar_sumo.questions.research_questions.formats import ENDINGS, FORMATS
+from safevar_sumo.questions.tolerance import ToleranceOptions
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.sumo.matrix import system_at_point
 from safevar_sumo.sumo.system import assemble

@@ -91,8 +91,8 @@ class LazyCommands(click.Group):
         with _exit_on_interrupt():
             module, _ = COMMANDS.get(name, ("ask" if ":" in name else "", ""))
             if module == "ask":
-                from safevar_sumo.analysis.ask import find_question
                 from safevar_sumo.cli.ask import command_of
+                from safevar_sumo.questions.ask import find_question
 
                 return command_of(find_question(name))
             if module:

@@ -10,10 +10,6 @@ from typing import Any
 import click
 from rich.console import Console
 
-from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.subject import answer_question
-from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import (
     CommandFunction,
     Decorator,
@@ -32,6 +28,10 @@ from safevar_sumo.cli.arguments import (
 )
 from safevar_sumo.cli.program import commands, print_json, print_note
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.explain import ExplainOptions
+from safevar_sumo.questions.options import Options
+from safevar_sumo.questions.subject import answer_question
+from safevar_sumo.questions.tolerance import ToleranceOptions
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import print_answer
 
@@ -69,7 +69,7 @@ def _show(result: Any, as_json: bool | None, plot: Path | None = None) -> JsonAn
     elif as_json is not None:
         print_answer(Console(), result.study, result.no_verdict, result.sentences())
     if plot is not None:
-        from safevar_sumo.analysis.figures import save
+        from safevar_sumo.questions.figures import save
 
         save(result.figure(), plot, "--plot")
     return answer
@@ -87,9 +87,9 @@ def explain(
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change
     is enough, why.
     """
-    from safevar_sumo.analysis.explain.compute import explain_failures
-    from safevar_sumo.analysis.figures import save
-    from safevar_sumo.analysis.model_spread import remarks_on_sets
+    from safevar_sumo.questions.explain.compute import explain_failures
+    from safevar_sumo.questions.figures import save
+    from safevar_sumo.questions.model_spread import remarks_on_sets
 
     subject = load_results_or_study(source, point)
     if out is not None:
@@ -133,7 +133,7 @@ def tolerance(
     **values: OptionValue,
 ) -> JsonAnswer:
     """Find how far each characteristic of STUDY may go: alone, and all together."""
-    from safevar_sumo.analysis.tolerance.compute import find_tolerances
+    from safevar_sumo.questions.tolerance.compute import find_tolerances
 
     if as_json and format_name != "text":
         raise InputError("--format", f"{format_name}, and --json", "one of them")

@@ -11,10 +11,6 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.ask import find_question
-from safevar_sumo.analysis.changes import read_changes
-from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, remarks_on_sets, studies_of_sets
-from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.cli.arguments import (
@@ -35,6 +31,10 @@ from safevar_sumo.cli.program import commands, print_json, print_note, print_war
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import whole_file
+from safevar_sumo.questions.ask import find_question
+from safevar_sumo.questions.changes import read_changes
+from safevar_sumo.questions.model_spread import ModelSpread, compute_model_spreads, remarks_on_sets, studies_of_sets
+from safevar_sumo.questions.words import points_in_words
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, Outcome, finite_or_none
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, degree_note, pre_crash_sentence
@@ -165,7 +165,7 @@ def _show(
     """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both: as files, and `slower` in
     sumo-gui.
     """
-    from safevar_sumo.analysis.figures import save
+    from safevar_sumo.questions.figures import save
     from safevar_sumo.replay.animation import animate
     from safevar_sumo.replay.comparison import compare_setting
     from safevar_sumo.replay.figure import draw_comparison

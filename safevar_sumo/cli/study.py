@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.words import question_command, two_decimals
 from safevar_sumo.api.running import load_for_search
 from safevar_sumo.campaign import Campaign, RunKey, all_runs, run_campaign
 from safevar_sumo.campaign.campaign import ENGINES, choose_engine, measure_speed
@@ -20,6 +19,7 @@ from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
 from safevar_sumo.cli.program import commands, print_json, print_remarks, print_warning
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.words import question_command, two_decimals
 from safevar_sumo.records import JsonObject, Outcome, finite_or_none
 from safevar_sumo.results import evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.scenarios import degree_note
@@ -199,11 +199,11 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     """Print the verdict, a table of the original and of each algorithm's solutions, RQ1 and RQ2 in brief, and the next
     two commands.
     """
-    from safevar_sumo.analysis.case import build_case
-    from safevar_sumo.analysis.explain.answer import study_verdict
+    from safevar_sumo.questions.case import build_case
+    from safevar_sumo.questions.explain.answer import study_verdict
 
     # Loads more slowly than all other modules.
-    from safevar_sumo.analysis.research_questions.comparisons import summary_lines
+    from safevar_sumo.questions.research_questions.comparisons import summary_lines
 
     names = study.vehicle.characteristics
     solutions = solutions_frame(names, [(run.key, run.solutions) for run in campaign.runs])

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.answer import Answer, Column, tabulate
-from safevar_sumo.analysis.ask import question
-from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
-from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
+from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.results import evaluation_keys
@@ -25,7 +25,7 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, study_names, ta
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from safevar_sumo.analysis.case import Case
+    from safevar_sumo.questions.case import Case
 
 COLUMNS = {
     "metric": Column("", "safety metric; TET and TIT of the settings that collide neither here nor in the reference"),

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN, write_imported
 from safevar_sumo.study import SAFETY_DEGREE, StudyLike, load_study

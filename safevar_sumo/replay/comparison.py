@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.braking import brake_onset
-from safevar_sumo.analysis.words import OUTCOME_VERBS, change_texts
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
+from safevar_sumo.questions.braking import brake_onset
+from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike, unit_text

@@ -19,13 +19,13 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import Case, build_case
-from safevar_sumo.analysis.subject import changes_since, study_or_case
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.running import run
 from safevar_sumo.errors import InputError, SafevarError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import file_by_name, is_shipped
+from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.subject import changes_since, study_or_case
 from safevar_sumo.records import JsonObject
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedStudy, Question, read_pack

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safevar_sumo.analysis.ask import find_question
-from safevar_sumo.analysis.case import Case, load_cases
-from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.subject import answer_question, at_point, changes_since
-from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.compute import find_tolerances
-from safevar_sumo.analysis.words import change_texts
 from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.ask import find_question
+from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.explain import ExplainOptions
+from safevar_sumo.questions.explain.compute import explain_failures
+from safevar_sumo.questions.options import Options
+from safevar_sumo.questions.subject import answer_question, at_point, changes_since
+from safevar_sumo.questions.tolerance import ToleranceOptions
+from safevar_sumo.questions.tolerance.compute import find_tolerances
+from safevar_sumo.questions.words import change_texts
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import Comparison, compare_setting
@@ -32,7 +32,7 @@ from safevar_sumo.terminal import Progress
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from safevar_sumo.analysis.explain.failure import Explanation
+    from safevar_sumo.questions.explain.failure import Explanation
 
 QUESTIONS: Mapping[str, Callable[..., Any]] = {"explain": explain_failures, "tolerance": find_tolerances}
 """The functions that answer the questions of a page, by their commands."""

@@ -16,16 +16,16 @@ from urllib.parse import quote
 import pandas as pd
 from markupsafe import Markup
 
-from safevar_sumo.analysis.answer import Answer
-from safevar_sumo.analysis.case import Case, UnanswerableError
-from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.figures import draw_figures
-from safevar_sumo.analysis.research_questions.tables import lay_out
-from safevar_sumo.analysis.subject import Results
-from safevar_sumo.analysis.tolerance.answer import Tolerance
-from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.case import Case, UnanswerableError
+from safevar_sumo.questions.explain.answer import Explained
+from safevar_sumo.questions.research_questions.answer import answer_questions
+from safevar_sumo.questions.research_questions.figures import draw_figures
+from safevar_sumo.questions.research_questions.tables import lay_out
+from safevar_sumo.questions.subject import Results
+from safevar_sumo.questions.tolerance.answer import Tolerance
+from safevar_sumo.questions.words import question_command
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.replay.comparison import why_different

@@ -13,14 +13,14 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.answer import Explained
-from safevar_sumo.analysis.explain.causes import MIN_ROBUST_SHARE, Cause
-from safevar_sumo.analysis.explain.failure import Explanation
-from safevar_sumo.analysis.model_spread import compute_model_spreads
-from safevar_sumo.analysis.opinion import assemble_both_systems, judge_causes
-from safevar_sumo.analysis.research_questions.tables import BoldText
-from safevar_sumo.analysis.words import number_of, points_in_words, question_command
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.explain.answer import Explained
+from safevar_sumo.questions.explain.causes import MIN_ROBUST_SHARE, Cause
+from safevar_sumo.questions.explain.failure import Explanation
+from safevar_sumo.questions.model_spread import compute_model_spreads
+from safevar_sumo.questions.opinion import assemble_both_systems, judge_causes
+from safevar_sumo.questions.research_questions.tables import BoldText
+from safevar_sumo.questions.words import number_of, points_in_words, question_command
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
 from safevar_sumo.replay.comparison import format_number, list_differences

@@ -21,11 +21,11 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from safevar_sumo import cli
-from safevar_sumo.analysis.ask import QUESTIONS
-from safevar_sumo.analysis.changes import read_changes
 from safevar_sumo.cli.arguments import Condition
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.ask import QUESTIONS
+from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet

@@ -12,14 +12,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.answer import study_verdict
-from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures
-from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import ExplainOptions
+from safevar_sumo.questions.explain.answer import study_verdict
+from safevar_sumo.questions.explain.compute import compare_at_cells, explain_failures
+from safevar_sumo.questions.tolerance import ToleranceOptions
+from safevar_sumo.questions.tolerance.compute import find_tolerances
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, run, searched

@@ -12,11 +12,11 @@ import pandas as pd
 import pytest
 
 from calibration import fit
-from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, value_of, with_values
-from safevar_sumo.analysis.tolerance import scans
-from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, scan_with_sets
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.model_spread import compute_model_spreads, prediction_band, value_of, with_values
+from safevar_sumo.questions.tolerance import scans
+from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan_with_sets
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate

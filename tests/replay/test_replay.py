@@ -16,7 +16,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from safevar_sumo.analysis.case import Case
+from safevar_sumo.questions.case import Case
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene
 from safevar_sumo.replay.comparison import COLOURS, Comparison, compare_setting, list_differences

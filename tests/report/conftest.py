@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from safevar_sumo.analysis.case import Case
-from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.campaign import local
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.explain.answer import Explained
 from safevar_sumo.report import input as report_input, report
-from tests.analysis.conftest import Plant
+from tests.questions.conftest import Plant
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from selenium.webdriver import Chrome
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 
-from safevar_sumo.analysis.case import Case
+from safevar_sumo.questions.case import Case
 from safevar_sumo.replay.animation import animate
 from safevar_sumo.replay.comparison import compare_setting
 from safevar_sumo.sumo.system import assemble

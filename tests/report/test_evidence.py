@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from safevar_sumo.analysis.subject import load
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.subject import load
 from safevar_sumo.report import evidence, input as report_input
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, read_pack
 from safevar_sumo.shipped import NETWORKS
-from tests.analysis.test_repair import planted as planted
 from tests.in_process import json_of, refused, run
+from tests.questions.test_repair import planted as planted
 
 MINE = """
 from pathlib import Path

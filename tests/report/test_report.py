@@ -21,11 +21,11 @@ from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo.ads.reference_drivers import FullBraking
-from safevar_sumo.analysis.ask import find_question
-from safevar_sumo.analysis.case import Case
-from safevar_sumo.analysis.explain.answer import Explained
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.ask import find_question
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.explain.answer import Explained
 from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, input as report_input, report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs

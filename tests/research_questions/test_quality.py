@@ -19,18 +19,18 @@ import pytest
 import scipy
 from hypothesis import given, strategies as st
 
-from safevar_sumo.analysis.case import Case
-from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.figures import draw_convergence, draw_pareto_fronts
-from safevar_sumo.analysis.research_questions.formats import as_json, as_latex, as_markdown, as_text
-from safevar_sumo.analysis.research_questions.fronts import (
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.research_questions.answer import answer_questions
+from safevar_sumo.questions.research_questions.figures import draw_convergence, draw_pareto_fronts
+from safevar_sumo.questions.research_questions.formats import as_json, as_latex, as_markdown, as_text
+from safevar_sumo.questions.research_questions.fronts import (
     compute_convergence,
     compute_indicators,
     normalised,
     points_of,
     reference_front,
 )
-from safevar_sumo.analysis.research_questions.statistics import (
+from safevar_sumo.questions.research_questions.statistics import (
     EXACT_TEST,
     compare_samples,
     correct_by_holm,

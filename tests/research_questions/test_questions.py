@@ -15,9 +15,10 @@ import pandas as pd
 import pytest
 import scipy
 
-from safevar_sumo.analysis.case import Case, UnanswerableError, build_case
-from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.changes import (
+from safevar_sumo.errors import InputError
+from safevar_sumo.questions.case import Case, UnanswerableError, build_case
+from safevar_sumo.questions.research_questions.answer import answer_questions
+from safevar_sumo.questions.research_questions.changes import (
     compare_weathers,
     count_collisions,
     critical_solutions,
@@ -27,11 +28,10 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33,
     rq33_safety,
 )
-from safevar_sumo.analysis.research_questions.comparisons import rq1, rq1_runs, rq2, rq2_runs, summary_lines
-from safevar_sumo.analysis.research_questions.formats import as_text
-from safevar_sumo.analysis.research_questions.fronts import count_evaluations
-from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples
-from safevar_sumo.errors import InputError
+from safevar_sumo.questions.research_questions.comparisons import rq1, rq1_runs, rq2, rq2_runs, summary_lines
+from safevar_sumo.questions.research_questions.formats import as_text
+from safevar_sumo.questions.research_questions.fronts import count_evaluations
+from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import CharacteristicTable, MetricsTable, Study, load_study
 

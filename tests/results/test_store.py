@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safevar_sumo.analysis.case import Case, load_cases
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import (
     ResultsDirectory,

@@ -14,9 +14,9 @@ import jsonschema
 import msgspec
 import pytest
 
-from safevar_sumo.analysis.variation import VariationModel
 from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.results.manifest import evaluation_keys
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study import Limit, Origin, limits_of, load_study, study_names, tables_of, write_study

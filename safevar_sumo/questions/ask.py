@@ -1,0 +1,248 @@
+"""Every question is one function `(subject, evaluator, *, options) -> Answer`; here it becomes a call of the library.
+
+The command line makes its command from the same signature and docstring (`cli/questions.py`).
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, update_wrapper
+from importlib import import_module
+from numbers import Integral, Real
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin
+
+from safevar_sumo.errors import InputError, warn
+from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
+from safevar_sumo.records import JsonObject
+from safevar_sumo.shipped import PROGRAM_COMMAND
+from safevar_sumo.study import Study, StudyLike
+from safevar_sumo.terminal import Progress, open_progress
+
+if TYPE_CHECKING:
+    from safevar_sumo.campaign.pool import Pool
+    from safevar_sumo.questions.answer import Answer
+    from safevar_sumo.questions.case import Case
+
+QUESTIONS = {
+    name: f"safevar_sumo.questions.{name}" for name in ("compare", "opinion", "rating", "repair", "risk", "rules")
+} | {"validate": "safevar_sumo.reference.agreement"}
+"""The module of each question, whose function has the question's name."""
+
+
+class Range(NamedTuple):
+    """The range of a number; `is_open` leaves out its ends."""
+
+    low: float
+    high: float
+    is_open: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        assert isinstance(value, Real)
+        number = float(value)
+        return self.low < number < self.high if self.is_open else self.low <= number <= self.high
+
+    def __str__(self) -> str:
+        before, between = ("between", "and") if self.is_open else ("from", "to")
+        return f"{before} {self.low:,.12g} {between} {self.high:,.12g}"
+
+
+Count = Annotated[int, Range(1, 100_000_000)]
+"""A number of vehicles, solutions or attempts."""
+Share = Annotated[float, Range(0, 1, is_open=True)]
+"""A share such as a confidence."""
+Margin = Annotated[float | None, Range(0, 100)]
+"""A distance to keep from a collision [m]."""
+Criterion = Annotated[str | None, "collision|below=X|points=X"]
+"""What is unsafe: a collision, a safety degree below X [m], or at most X points of a rating; by default a collision if
+any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost.
+"""
+COMMON_OPTIONS = {
+    "point": "Only this point of the study's matrix.",
+    "jobs": "Number of worker processes, by default one for each core.",
+    "pool": "Pool that simulates; by default new worker processes.",
+    "progress": "True for a bar on the terminal, or a function of a stage, the number done in it, and its total.",
+    "as_it_is_now": "If results were computed with other files or versions, simulate with the present ones and say so.",
+}
+"""Options that every question has."""
+
+
+class Option(NamedTuple):
+    """An option of a question: the type of a value, its range or the form of its text, its default, and its meaning."""
+
+    name: str
+    kind: type
+    limits: Range | None
+    metavar: str | None
+    is_repeated: bool
+    default: Any
+    meaning: str
+
+    def check(self, value: Any) -> Any:
+        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has another type or is
+        outside the range.
+        """
+        if self.is_repeated:
+            if isinstance(value, Mapping):
+                value = [f"{name}={inner}" for name, inner in value.items()]
+            return (value,) if isinstance(value, str) else tuple(value)
+        if value is None or self.kind not in (int, float):
+            return value
+        number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
+        words = f"{words} {self.limits}" if self.limits else words
+        if isinstance(value, bool) or not isinstance(value, number) or (self.limits and value not in self.limits):
+            raise InputError(self.name, repr(value), words)
+        return value
+
+
+class Question:
+    """A question as a function of the library: `risk("rain", samples=1000)`."""
+
+    def __init__(self, compute: Callable[..., Answer]) -> None:
+        update_wrapper(self, compute)
+        self.compute, self.name = compute, compute.__name__
+        parameters = list(inspect.signature(compute).parameters.values())
+        self.takes_results_only = str(parameters[0].annotation) == "Case"
+        self.others = {
+            parameter.name: str(parameter.annotation) == "Path"
+            for parameter in parameters[2:]
+            if parameter.kind is not parameter.KEYWORD_ONLY
+        }
+        """Further positional parameters, and whether each is a file instead of a subject."""
+        common = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in COMMON_OPTIONS]
+        shown = [parameters[0], *(parameter for parameter in parameters[2:]), *common]
+        self.__signature__ = inspect.Signature(shown)
+        texts = "\n".join(f"{name}\n    {text}" for name, text in COMMON_OPTIONS.items())
+        self.__doc__ = f"{inspect.cleandoc(compute.__doc__ or '')}\n{texts}"
+
+    @cached_property
+    def options(self) -> list[Option]:
+        """The options by signature and docstring."""
+        texts = dict(
+            re.findall(r"^(\w+)\n((?:    .*\n?)+)", inspect.cleandoc(self.compute.__doc__ or ""), re.MULTILINE)
+        )
+        meanings = {name: " ".join(text.split()) for name, text in texts.items()}
+
+        def type_of(parameter: inspect.Parameter) -> Any:
+            """The type, which is a text where the module postpones annotations; others may name what is not loaded."""
+            hint = parameter.annotation
+            return eval(hint, self.compute.__globals__) if isinstance(hint, str) else hint
+
+        return [
+            _option(parameter, type_of(parameter), meanings.get(parameter.name, ""))
+            for parameter in inspect.signature(self.compute).parameters.values()
+            if parameter.kind is parameter.KEYWORD_ONLY
+        ]
+
+    def __call__(
+        self,
+        source: StudyLike | Results,
+        *others: StudyLike | Results,
+        point: str | None = None,
+        jobs: int | None = None,
+        pool: Pool | None = None,
+        progress: bool | Progress = False,
+        as_it_is_now: bool = False,
+        **values: Any,
+    ) -> Answer:
+        known = {option.name: option for option in self.options}
+        for name in values.keys() - known.keys():
+            raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
+        if len(others) != len(self.others):
+            raise TypeError(f"{self.name}() takes {1 + len(self.others)} positional arguments")
+        values = {name: known[name].check(value) for name, value in values.items()}
+
+        def subject_of(source: StudyLike | Results) -> Study | Case:
+            subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only)
+            if not isinstance(subject, Study) and subject.shortfall:
+                warn(subject.shortfall)
+            return reduce_to_point(subject, point)
+
+        command = self.command_line([_name(source), *map(_name, others)], point, values)
+        subjects: list[Any] = [subject_of(source)]
+        for other, is_file in zip(others, self.others.values(), strict=True):
+            subjects.append(Path(str(other)) if is_file else subject_of(other))
+        return replace(self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress), command=command)
+
+    def answer(
+        self,
+        subjects: Sequence[Any],
+        values: JsonObject,
+        *,
+        pool: Pool | None = None,
+        jobs: int | None = None,
+        progress: bool | Progress = False,
+    ) -> Answer:
+        """The answer about subjects that have been loaded, and files; `values` are those of options."""
+        from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
+
+        study = study_in(subjects[0])
+        with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
+            answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
+            about = evaluator if answer.study is study else evaluator.for_study(answer.study)
+            reason = about.no_verdict
+        verdict = f"{reason} {answer.verdict}".strip()
+        return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
+
+    def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:
+        """The command that asks this question; it has a flag for each option that is not at its default."""
+        words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
+        for option in self.options:
+            value, flag = values.get(option.name, option.default), f"--{option.name.replace('_', '-')}"
+            if value == option.default:
+                continue
+            texts = [""] if option.kind is bool else value if option.is_repeated else [value]
+            words += [f"{flag} {quote(str(text))}".strip() if text != "" else flag for text in texts]
+        return " ".join([*words, *([f"--point {quote(point)}"] if point else [])])
+
+
+def question(compute: Callable[..., Answer]) -> Question:
+    """Decorator: makes a function `(subject, evaluator, *, options) -> Answer` a question.
+
+    Defaults are those of its signature, ranges those of `Annotated` types, texts those of its numpydoc docstring. A
+    first parameter of type `Case` takes results only; further positional parameters are further subjects, of
+    type `Path` files.
+    """
+    return Question(compute)
+
+
+def find_question(name: str) -> Question:
+    """A question of this package, or one of the user's as `module:name`.
+
+    Raises
+    ------
+    InputError
+        If there is no such question.
+    """
+    module, _, function = name.partition(":") if ":" in name else (QUESTIONS.get(name, name), "", name)
+    try:
+        found = getattr(import_module(module), function, None)
+    except ModuleNotFoundError as error:
+        if error.name not in (module, module.partition(".")[0]):
+            raise
+        found = None
+    if not isinstance(found, Question):
+        raise InputError("question", repr(name), f"{', '.join(QUESTIONS)}, or module:name of a function with @question")
+    return found
+
+
+def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
+    limits, metavar = None, None
+    if get_origin(hint) is Annotated:
+        hint, extra = get_args(hint)
+        limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
+    is_repeated = get_origin(hint) is tuple
+    kinds = [kind for kind in (bool, int, float) if kind is hint or kind in get_args(hint)]
+    kind = str if is_repeated or not kinds else kinds[0]
+    return Option(parameter.name, kind, limits, metavar, is_repeated, parameter.default, meaning)
+
+
+def _name(source: StudyLike | Results) -> str:
+    """How a command line names a subject."""
+    if isinstance(source, Results):
+        return str(source.directory)
+    return source.origin.called or source.name if isinstance(source, Study) else str(source)

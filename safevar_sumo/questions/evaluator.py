@@ -1,0 +1,279 @@
+"""Evaluates settings for all questions about a study, and draws settings that cover the study's domain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+
+import msgspec
+import numpy as np
+
+from safevar_sumo.campaign.evaluation import (
+    EVERYTHING,
+    VERIFIED_SETTINGS,
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+)
+from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
+from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
+from safevar_sumo.protocol import cells_of_part
+from safevar_sumo.protocol.rater import is_rated, rater_of
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import Progress, show_no_progress
+from safevar_sumo.vehicles import CharacteristicSet, region_of
+
+PARTS_PER_WORKER = 2
+"""Number of parts per worker into which the cells of a rating are divided."""
+CONFIDENCE = 0.95
+"""Confidence level of the intervals of shares, unless an option sets another level."""
+Interval = tuple[float, float]
+"""Lower and upper end."""
+CRITERION_SETTINGS = 1024
+"""Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
+a safety degree.
+"""
+
+
+class Evaluator:
+    """Evaluates settings of one study without the filter, and draws settings that cover the study's domain.
+
+    Attributes
+    ----------
+    simulated
+        Number of settings simulated so far; of equal settings in one call only one is simulated.
+    """
+
+    def __init__(
+        self, study: Study, pool: Pool, progress: Progress = show_no_progress, verified: int = VERIFIED_SETTINGS
+    ) -> None:
+        self.study, self.region = study, region_of(study)
+        self.characteristics = self.region.characteristics
+        self._pool, self.progress, self._verified = pool, progress, verified
+        self.simulated = 0
+
+    def evaluate(self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False) -> Evaluations:
+        """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
+
+        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
+        `ignore_constraints` is true.
+        """
+        is_feasible = self.region.feasible(settings) | ignore_constraints
+        if is_feasible.all():
+            return self._evaluate_shown(settings, stage, self._verified)
+        infeasible, undefined = settings[~is_feasible], np.full(np.count_nonzero(~is_feasible), np.nan)
+        not_simulated = Evaluations(
+            settings=infeasible,
+            outcome=np.full(len(infeasible), Outcome.INFEASIBLE.value, dtype="U16"),
+            collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined),
+            f_diff=self.characteristics.largest_change(infeasible),
+            f_num_diff=self.characteristics.number_changed(infeasible),
+        )
+        groups = [self._evaluate_shown(settings[is_feasible], stage, self._verified), not_simulated]
+        rows = np.argsort(~is_feasible, kind="stable")  # of `settings`, as `groups` have them
+        return Evaluations.concatenate(groups).take(np.argsort(rows))  # restores the order of the settings
+
+    def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
+        """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.
+
+        The values stand beside the settings, shape (M, n + P).
+        """
+        return self._evaluate_shown(rows, stage, 0, selection)
+
+    def _evaluate_shown(
+        self, settings: FloatArray, stage: str, verified: int, selection: Selection = EVERYTHING
+    ) -> Evaluations:
+        """Evaluate settings while progress is shown."""
+        if not len(settings):
+            return Evaluations.none(len(self.characteristics), METRICS)
+        done, total = 0, len(np.unique(settings, axis=0))
+        self.progress(stage, done, total)
+
+        def show_more_done(increment: int) -> None:
+            nonlocal done
+            done += increment
+            self.progress(stage, done, total)
+
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection)
+        self.simulated += total
+        return evaluations
+
+    def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
+        """`number` settings that cover the feasible part of the domain evenly.
+
+        With `feasible_after_filter`, they are also feasible after the filter.
+        """
+        drawn = 0
+
+        def draw_next(count: int) -> FloatArray:
+            """The next `count` settings of the Sobol sequence."""
+            nonlocal drawn
+            drawn += count
+            return sobol_settings(self.characteristics, drawn, seed)[-count:]
+
+        return self.region.draw_feasible(draw_next, number, filtered=feasible_after_filter)
+
+    def random_settings(self, number: int) -> FloatArray:
+        """The first `number` random vehicles of the study, uniform over the feasible part of the domain; `risk`
+        draws the same ones.
+        """
+        bounds, rng = self.characteristics, np.random.default_rng(self.study.search.seed)
+        return self.region.draw_feasible(
+            lambda count: bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower), number
+        )
+
+    def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
+        """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
+
+        Raises
+        ------
+        SimulationError
+            If a setting cannot be simulated.
+        """
+        rater = rater_of(self.study, self.study.source)
+        assert rater is not None
+        cell_count = len(rater.protocol.cells)
+        parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
+        cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
+        jobs = [
+            (Task(study=self.study, batch_size=max(len(settings), 1), cells=(part, parts)), settings)
+            for part in range(parts)
+        ]
+        results, done = list[CellResults](), 0
+
+        def show_more_done(ended: Sequence[int]) -> None:
+            nonlocal done
+            done += sum(len(cells[part]) for part in ended)
+            self.progress(stage, done, cell_count)
+
+        show_more_done([])
+        for evaluations in carry_out(evaluate_settings, jobs, self._pool, show_more_done):
+            if evaluations.cells is None:
+                reason = evaluations.reason(int(np.argmax(evaluations.failed)))
+                raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
+            results.append(evaluations.cells)
+        self.simulated += len(settings)
+        order = np.argsort(np.concatenate(cells))  # restores the order of the cells
+        return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in zip(*results, strict=True))
+
+    def evaluate_original(self) -> Evaluations:
+        """Evaluation of the original vehicle.
+
+        Raises
+        ------
+        SimulationError
+            If the original vehicle cannot be simulated.
+        """
+        evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
+        if not evaluations.valid[0]:
+            raise SimulationError(
+                f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}"
+            )
+        return evaluations
+
+    @cached_property
+    def no_verdict(self) -> str:
+        """Why simulations tell nothing about the ADS, in a sentence with which every answer begins; "" if they do."""
+        return ask_why_no_verdict(self.study, self._pool)
+
+    def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:
+        """The criterion that an option states, or else the default for the solutions of results, or for settings over
+        the whole domain of a study.
+
+        Raises what `parse_criterion` and `Unsafe.default_among` raise.
+        """
+        if text is not None:
+            return self.parse_criterion(text)
+        if not isinstance(source, Study) and len(source.solutions):
+            return source.unsafe
+        original = original or self.evaluate_original()
+        if RATING_POINTS.name in original.metrics:  # a lost point depends on the original vehicle alone
+            return Unsafe.default_among(original, original)
+        evaluations = self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain")
+        return Unsafe.default_among(evaluations, original)
+
+    def parse_criterion(self, text: str) -> Unsafe:
+        """Parse the criterion that an option states.
+
+        Raises what `Unsafe.parse` raises, and an error if the criterion is about points and the study is not rated.
+        """
+        criterion = Unsafe.parse(text)
+        if criterion.points is not None and not is_rated(self.study):
+            raise InputError(
+                "unsafe", f"{text!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X"
+            )
+        return criterion
+
+    def with_step(self, step: float) -> Evaluator:
+        """An evaluator of the same study with another time step [s]."""
+        # The interval may be no multiple of this step.
+        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)
+        return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
+
+    def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
+        """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
+        return Evaluator(study, self._pool, self.progress, self._verified if verified is None else verified)
+
+    def for_sets(self, fits: int) -> list[Evaluator]:
+        """An evaluator for each of the first `fits` parameter sets, the study's own first; none without [spread].
+
+        No setting is verified in SUMO, because scene and equations are those of the study.
+        """
+        studies = studies_of_sets(self.study)[:fits] if fits and self.study.spread else []
+        return [self.for_study(study, verified=0) for study in studies]
+
+
+@contextmanager
+def open_evaluator(
+    study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = show_no_progress
+) -> Iterator[Evaluator]:
+    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each
+    core.
+
+    Raises
+    ------
+    InputError
+        If the study's models cannot be assembled.
+    """
+    if pool is not None:
+        yield Evaluator(study, pool, progress)
+        return
+    assemble(study, study.source)
+    with open_pool(jobs) as new_pool:
+        yield Evaluator(study, new_pool, progress)
+
+
+def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they are most even if `number` is a power of
+    two.
+    """
+    import scipy  # takes longer to load than a simulation
+
+    points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(
+        max(0, math.ceil(math.log2(number)))
+    )
+    return np.asarray(points[:number])
+
+
+def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
+    """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
+    lower, upper = characteristics.lower, characteristics.upper
+    return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
+
+
+def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> Interval:
+    """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`."""
+    import scipy
+
+    interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")
+    return float(interval.low), float(interval.high)

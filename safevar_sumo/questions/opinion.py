@@ -1,0 +1,177 @@
+"""Does another vehicle model confirm the failures? Minimal causes of failures are simulated in our model, A, and with
+CommonRoad's multi-body vehicle, B; the driving system keeps its knowledge of our original vehicle.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.ask import Criterion, question
+from safevar_sumo.questions.compare import SETTING_COLUMNS, counts_of, draw_pairs, paired_test, table_of_pairs
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import ExplainOptions
+from safevar_sumo.questions.explain.causes import MIN_ROBUST_SHARE, Cause, draw_neighbours
+from safevar_sumo.questions.explain.compute import explain_failures
+from safevar_sumo.questions.multi_body import load_bmw_parameters
+from safevar_sumo.questions.second_vehicle import SPIN_LIMIT, SecondVehicle
+from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import contact_degree, evaluate
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import Progress, show_no_progress
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
+
+Verdict = Literal["outside", "confirmed", "contradicted", "borderline"]
+"""The second model's verdict on a cause."""
+COLUMNS = {name: column._replace(is_shown=name == "solution") for name, column in SETTING_COLUMNS.items()} | {
+    "opinion": Column("", ", ".join(get_args(Verdict))),
+    "changes": Column("", "the cause: values in their units"),
+    "because": Column("", "the reason"),
+}
+SIMULATION_LIMIT = 12_000
+"""Approximate number of simulations of the search for minimal causes, the same as for a report."""
+STAGE = "second vehicle model"
+CHANGE_SHARES = np.arange(1, 10) / 10
+"""Shares of a cause's changes that the second model simulates, to locate the share from which they are unsafe."""
+
+
+@question
+def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = (), unsafe: Criterion = None) -> Answer:
+    """Check the minimal causes of failures with a second vehicle model.
+
+    Parameters
+    ----------
+    solution
+        Handle of a solution, such as nsga2:3:0; may be repeated. By default the failures that a report explains.
+    unsafe
+        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    """
+    assemble_both_systems(subject.study)
+    options = ExplainOptions(solutions=solution, unsafe=unsafe, limit=SIMULATION_LIMIT, fits=0)
+    explained = explain_failures(subject, options, evaluator)
+    causes = [(failure.name, cause) for failure in explained.explanations for cause in failure.causes]
+    frame, originals = judge_causes(subject.study, causes, explained.unsafe, evaluator.progress)
+    driven = frame[frame["opinion"] != "outside"]
+    p, a12 = paired_test(*driven[["a_degree", "b_degree"]].dropna().to_numpy(float).T)
+    found = Counter(frame["opinion"])
+    numbers: JsonObject = {"unsafe": str(explained.unsafe), **counts_of(driven), "p": p, "a12": a12}
+    numbers |= {verdict: found[verdict] for verdict in get_args(Verdict)} | originals
+    total = number_of(len(frame), "minimal cause")
+    verdict = (
+        f"CommonRoad's multi-body vehicle confirms {found['confirmed']} of {total} and contradicts "
+        f"{found['contradicted']}; {found['borderline']} are borderline, and it has no answer on {found['outside']} "
+        f"({explained.unsafe.description})."
+    )
+    if safe := [failure.name for failure in explained.explanations if not failure.causes]:
+        verdict += f" Not unsafe, without a cause: {join_phrases(safe)}."
+    return Answer(
+        question="opinion",
+        study=subject.study,
+        verdict=verdict,
+        numbers=numbers,
+        tables={"settings": tabulate("Minimal causes with both models", COLUMNS, frame)},
+        draw=partial(draw_pairs, titles=("our model", "the second")),
+    )
+
+
+def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
+    """A study's system, and the second vehicle, which can replace the system's.
+
+    Raises
+    ------
+    InputError
+        If commonroad-vehicle-models is not installed, or the second model cannot represent the vehicle at all.
+    """
+    load_bmw_parameters()  # raises the error if the package is not installed
+    system = assemble(study)
+    return system, SecondVehicle(system.vehicle, study)
+
+
+def judge_causes(
+    study: Study, causes: Sequence[tuple[str, Cause]], unsafe: Unsafe, progress: Progress = show_no_progress
+) -> tuple[pd.DataFrame, JsonObject]:
+    """Simulate minimal causes of solutions, named by their handles, with both models: a row of `COLUMNS` for each, and
+    how both original vehicles end. Raises the errors of `assemble_both_systems`.
+    """
+    system, vehicle = assemble_both_systems(study)
+    second_system, characteristics = replace(system, vehicle=vehicle), system.characteristics
+    original, contact = characteristics.original, contact_degree(system)
+    settings = np.stack([original, *(cause.setting(characteristics) for _, cause in causes)])
+    progress(STAGE, 0, len(settings))
+    # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
+    scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
+    ours, theirs = evaluate(system, settings), evaluate(second_system, np.concatenate([settings, scaled]))
+    fails_there = unsafe.of(theirs)
+    fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
+    frame = table_of_pairs(["", *(name for name, _ in causes)], ours, theirs.take(range(len(settings))), unsafe)
+    here, there = (
+        [ending_in_words(*end, contact) for end in zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)]
+        for side in "ab"
+    )
+
+    def judge(row: int, cause: Cause) -> tuple[Verdict, str]:
+        """The verdict on a cause, and its reason."""
+        if reasons := vehicle.reasons_to_omit(cause.changes):
+            return "outside", "; ".join(reasons)
+        if unsafe.of(ours)[0]:
+            return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
+        if fails_there[0] or not theirs.valid[0]:
+            return "outside", f"the original vehicle itself is not safe with the second model: it {there[0]}"
+        if not theirs.valid[row]:
+            return "outside", f"with the second model it {there[row]}"
+        if settings[row].tobytes() in vehicle.spinning:  # filled by `evaluate(second_system, ...)` above
+            return "outside", f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
+        verdict: Verdict = "contradicted"
+        because = f"safe with the second model: it {there[row]}; the original vehicle {there[0]}"
+        if fails_there[row]:
+            verdict = "confirmed"
+            safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])  # the largest that is still safe
+            because = (
+                f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[0]}. "
+                f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
+                f"model, {cause.fraction:.1%} with ours"
+            )
+        reason = _why_borderline(second_system, settings[row], cause, fails_there[row], unsafe, study.search.seed)
+        return ("borderline", f"{reason}; {because}") if reason else (verdict, because)
+
+    judged = list[tuple[Verdict, dict[str, float], str]]()
+    for row, (_, cause) in enumerate(causes, 1):
+        verdict, because = judge(row, cause)
+        judged.append((verdict, cause.changes, f"with our model it {here[row]}; {because}"))
+        progress(STAGE, row + 1, len(settings))
+        if vehicle.reasons_to_omit(cause.changes):
+            frame.loc[row, ["b_outcome", "b_degree"]] = None, np.nan
+    originals = {str(name): frame[name][0] for name in frame.columns.drop(["solution", "unsafe_in"])}
+    frame = frame.iloc[1:].reset_index(drop=True)
+    frame = pd.concat([frame, pd.DataFrame(judged, columns=["opinion", "changes", "because"])], axis=1)
+    frame.loc[frame["opinion"] == "outside", "unsafe_in"] = ""
+    return frame, originals
+
+
+def _why_borderline(
+    second_system: System, setting: FloatArray, cause: Cause, is_unsafe: bool, unsafe: Unsafe, seed: int
+) -> str:
+    """Why a cause is borderline, by its neighbours in our model, else in the second; empty if it is not."""
+    if cause.neighbours is None:  # in a rated study, whose neighbours take too long
+        return ""
+    if cause.neighbours.borderline:
+        return f"with our model {cause.neighbours}"
+    neighbours = draw_neighbours(second_system.characteristics, setting[np.newaxis], seed)
+    runs = evaluate(second_system, neighbours[second_system.region.feasible(neighbours)])
+    share = np.mean((unsafe.of(runs) == is_unsafe)[runs.valid]) if runs.valid.any() else 0.0
+    result = "unsafe" if is_unsafe else "safe"
+    if share >= MIN_ROBUST_SHARE:
+        return ""
+    return f"with the second model only {share:.0%} of the neighbours are {result}, too"

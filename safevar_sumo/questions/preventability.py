@@ -1,0 +1,209 @@
+"""Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
+
+If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible
+moment avoids it, the vehicle is the cause. A driver who collides at a point in the original vehicle, too, says nothing
+about a changed vehicle there: no verdict. UN R157 means its driver for cars that cut in, cut out or brake on
+motorways; its use for pedestrians is ours. How fast a driver reacts to a pedestrian is therefore uncertain: the share
+of collisions that the driver avoids is computed for a later reaction, too. The regulation names no danger if a leader
+brakes with 5 m/s^2 or less: there are two conventions, and both are computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from msgspec.structs import replace
+
+from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.reference_drivers import ANY_BRAKING
+from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.words import number_of, points_named, share_in_words
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.scenarios import PreCrash
+from safevar_sumo.study import ModelTable
+from safevar_sumo.sumo.matrix import simulate, study_at
+from safevar_sumo.sumo.system import System, assemble
+
+MAX_SIMULATIONS = 20_000
+"""Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated.
+"""
+DELAY = 0.4
+"""Time by which a competent driver reacts later in the second of two computations [s]."""
+LATER = {"reaction_time": CompetentDriver().reaction_time + DELAY}
+ANY = {"leader_braking": ANY_BRAKING}
+LETTER, ANY_LEADER, FULL = "competent_driver", "competent_driver_any_braking", "full_braking"
+DRIVERS: dict[str, tuple[str, JsonObject]] = {
+    LETTER: ("competent_driver", {}),
+    ANY_LEADER: ("competent_driver", ANY),
+    FULL: ("full_braking", {}),
+    f"{LETTER}_later": ("competent_driver", LATER),
+    f"{ANY_LEADER}_later": ("competent_driver", ANY | LATER),
+}
+"""Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
+TITLES = {
+    LETTER: "a competent driver",
+    ANY_LEADER: "one who reacts to any braking of a leader, not only above 5 m/s^2,",
+    FULL: "full braking at the first possible moment",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preventability:
+    """What the reference drivers do in collisions, or in a random sample of them.
+
+    The collisions are the distinct solutions that collide; without results, the settings drawn from the study's domain
+    that collide.
+
+    Attributes
+    ----------
+    verdicts
+        The result of `judge_collisions` for the simulated collisions.
+    collisions
+        Number of all these collisions, simulated with the reference drivers or not.
+    """
+
+    verdicts: pd.DataFrame
+    collisions: int
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The share that each driver avoids of the collisions on which he has a verdict; without a verdict no share."""
+        shares = ((driver, float(self.verdicts[driver].mean())) for driver in DRIVERS)
+        return {driver: share for driver, share in shares if not np.isnan(share)}
+
+    @property
+    def drivers(self) -> list[JsonObject]:
+        """A row for each driver, if a collision was simulated.
+
+        The numbers of collisions that he has `avoided`, avoids with a `later` reaction, and has `no_verdict` on; the
+        `share` that he avoids of those with a verdict, with the ends `share_low` and `share_high` of its 95 % interval:
+        Clopper and Pearson's for a sample (slightly too wide, without a correction for the finite population), the
+        share itself if all collisions were simulated; the share with the later reaction; and the names of the points
+        without a verdict.
+        """
+        rows, verdicts, shares = list[JsonObject](), self.verdicts, self.shares
+        for driver in TITLES if len(verdicts) else ():
+            later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
+            low = high = shares.get(driver)
+            if number and len(verdicts) < self.collisions:
+                low, high = clopper_pearson(avoided, number)
+            rows.append(
+                {
+                    "driver": driver,
+                    "avoided": avoided,
+                    "later": int(verdicts[later].sum()) if later in verdicts else None,
+                    "no_verdict": len(verdicts) - number,
+                    "share": shares.get(driver),
+                    "share_low": low,
+                    "share_high": high,
+                    "later_share": shares.get(later),
+                    "no_verdict_points": [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())],
+                }
+            )
+        return rows
+
+    def to_dict(self) -> JsonObject:
+        """The simulated collisions and `drivers`, for JSON."""
+        return {"looked_at": len(self.verdicts), "later_reaction": LATER["reaction_time"], "drivers": self.drivers}
+
+    def __str__(self) -> str:
+        """What each driver avoids, and where he has no verdict; empty if no collision was simulated."""
+        verdicts, phrases, silences = self.verdicts, list[str](), list[str]()
+        for row in self.drivers:
+            driver, silent = row["driver"], row["no_verdict"]
+            if driver == ANY_LEADER and verdicts[driver].equals(verdicts[LETTER]):
+                continue
+            if silent:
+                points = points_named(row["no_verdict_points"])
+                silences.append(
+                    f" No verdict of {TITLES[driver]} on {silent}{points and f', at {points}'}: there the original "
+                    "vehicle collides with that driver, too."
+                )
+            if row["share"] is None:
+                phrases.append(f"{TITLES[driver]} has no verdict")
+                continue
+            later = row["later_share"]
+            delayed = "" if later is None else f" ({share_in_words(later)} if he needs {DELAY:g} s longer)"
+            of_number = f" of the {len(verdicts) - silent} with a verdict" if silent else ""
+            phrases.append(f"{TITLES[driver]} avoids {share_in_words(row['share'])}{of_number}{delayed}")
+        sample = "" if len(verdicts) == self.collisions else f", drawn at random from {self.collisions}"
+        collisions = f"{number_of(len(verdicts), 'collision')}{sample}"
+        return f"In the same vehicle, of {collisions}, {'; '.join(phrases)}.{''.join(silences)}" if phrases else ""
+
+
+def avoided_by(verdicts: Mapping[Any, Any]) -> str:
+    """The weakest driver who avoids a collision, in words; `verdicts` is a row of `judge_collisions`."""
+    by = next((title for driver, title in TITLES.items() if verdicts[driver] == 1), "")
+    if not by:
+        return "no verdict" if np.isnan(verdicts[FULL]) else "physically unavoidable"
+    silent = f" (no verdict of {TITLES[LETTER]})" if np.isnan(verdicts[LETTER]) else ""
+    return f"preventable by {by}{silent}"
+
+
+def assess_preventability(
+    evaluator: Evaluator, collisions: Evaluations, max_simulations: int = MAX_SIMULATIONS
+) -> Preventability:
+    """Which of M evaluated collisions the drivers avoid; equal settings count once.
+
+    If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the
+    study's seed.
+    """
+    _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
+    shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
+    sample = shuffled[: max(max_simulations // len(TITLES), 1)]
+    return Preventability(verdicts=judge_collisions(evaluator, collisions.take(sample)), collisions=len(distinct))
+
+
+def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:
+    """Whether each driver avoids each of M evaluated collisions at its worst point: 1, 0, or NaN for no verdict.
+
+    A driver has no verdict on a collision at a point where he collides with the original vehicle, too, or if he cannot
+    be simulated. The columns are the drivers' names and `point`, the name of the point.
+    """
+    system = assemble(evaluator.study)
+    worst = np.zeros(len(collisions), dtype=np.intp) if collisions.worst_points is None else collisions.worst_points
+    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(DRIVERS)).assign(point="")
+    for index in np.unique(worst).tolist():
+        rows, point = np.flatnonzero(worst == index), system.points[index]
+        study = study_at(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
+        settings, at_point = collisions.settings[rows], system.at(point)
+        verdicts.loc[rows, list(DRIVERS)] = _judge_at_point(evaluator.for_study(study), at_point, settings)
+        verdicts.loc[rows, "point"] = point.name
+    return verdicts
+
+
+def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> FloatArray:
+    """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
+    approach, verdicts = approach_parameters(system), dict[str, FloatArray]()
+    with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
+    is_led = system.points[0].scenario.pre_crash == PreCrash.LEAD_DECELERATING
+    for driver, (model, parameters) in DRIVERS.items():
+        if ANY.items() <= parameters.items() and not is_led:  # nobody brakes: both conventions are one
+            verdicts[driver] = verdicts[driver.replace(ANY_LEADER, LETTER)]
+            continue
+        ads = ModelTable(model=model, parameters={**approach, **parameters})
+        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads, spread={}))
+        runs = with_driver.evaluate(with_original, "reference drivers in the same vehicle")
+        avoided = np.where(runs.valid, ~runs.collided, np.nan)
+        verdicts[driver] = avoided[1:] if avoided[0] == 1 else np.full(len(settings), np.nan)
+    return np.column_stack(list(verdicts.values()))
+
+
+def approach_parameters(system: System) -> JsonObject:
+    """Parameters with which a reference driver approaches from rest as the driving system does with the original
+    vehicle.
+
+    The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that
+    speed, so that both are at the same position when the danger begins. If the run begins at speed, the driver keeps
+    that speed.
+    """
+    trace = simulate(system, system.characteristics.original[np.newaxis]).trace
+    speed, is_braking = trace.speed[:, 0], trace.brake[:, 0] > 0
+    if speed[0] > 0 or not speed.any():
+        return {}
+    end = min(int(np.argmax(speed)), int(np.argmax(is_braking)) if is_braking.any() else len(speed))
+    return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:end, 0].tolist()}

@@ -1,0 +1,321 @@
+"""How many Euro NCAP points does a vehicle earn, and how many does a worn variant lose?
+
+All cells and robustness layers of the protocol are simulated, and scored by the official rules (`protocol/rater.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
+from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
+from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.changes import read_changes
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.results import SolutionId, row_of_handle
+from safevar_sumo.scenarios import weather_of
+from safevar_sumo.study import MatrixTable, Study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from safevar_sumo.questions.case import Case
+
+DECIMALS = 9
+"""Decimals of points and measured values; further decimals would hold only rounding errors."""
+POINTS = partial(Column, "", number_format=".2f")
+VEHICLE = {"variant": Column("", "the original vehicle, or its variant")}
+TEST = VEHICLE | {"test": Column("", "test of the protocol, with the light if it is driven by day and by night")}
+TESTS = TEST | {
+    "possible": POINTS(meaning="points of the test"),
+    "points": POINTS(meaning="points that the vehicle earns"),
+    "lost": POINTS(meaning="points of the original vehicle minus those of this one"),
+    "standard": POINTS(meaning="points of the standard range"),
+    "extended": POINTS(meaning="points of the extended range"),
+    "robustness": POINTS(meaning="points of robustness layers"),
+    "possible_standard": POINTS(meaning="points of the test in the standard range", is_shown=False),
+    "possible_extended": POINTS(meaning="points of the test in the extended range", is_shown=False),
+    "failing_layers": Column("", "robustness layers that do not hold"),
+    "claimed_layers": Column("", "robustness layers that the study claims and that are not simulated"),
+}
+VEHICLES = VEHICLE | {
+    "points": POINTS(meaning="points that the vehicle earns"),
+    "lost": POINTS(meaning="points of the original vehicle minus those of this one"),
+    "changes": Column("", "values that differ from the original's, in the study's units"),
+    "invalid_cells": Column("", "cells in which the vehicle cannot hold the speed; they earn nothing"),
+    "remark": Column("", "what the protocol or its calculator makes of this vehicle"),
+}
+NOT_SIMULATED = {"test": Column("", "test of the protocol"), "points": POINTS(meaning="points of the test")}
+CELLS = TEST | {
+    "range": Column("", "standard or extended range, or a robustness layer"),
+    "condition": Column("", "condition of the robustness layer"),
+    "vut_speed": Column("km/h", "speed of the vehicle under test"),
+    "target_speed": Column("km/h", "speed of the target"),
+    "impact_location": Column("%", "impact location in percent of the vehicle's width"),
+    "colour": Column("", "colour; none if the vehicle cannot drive the test"),
+    "relative_impact_speed": Column("km/h", "relative speed of the impact; none without one"),
+    "warning_ttc": Column("s", "time to collision at the warning; none without one"),
+}
+
+
+@question
+def rating(
+    subject: Study | Case,
+    evaluator: Evaluator,
+    *,
+    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
+    solution: Annotated[str | None, "ALG:RUN:N"] = None,
+) -> Answer:
+    """Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as Euro NCAP does in 2026.
+
+    Tests by day take place in the study's weather. Its numbers are the points of the original vehicle, the possible
+    ones, and those that the variant loses.
+
+    Parameters
+    ----------
+    set
+        A characteristic of the variant, in its unit or as +10% of the original; may be repeated.
+    solution
+        The variant is the N-th solution of a run, from 0, of a results directory; `set` changes it further.
+    """
+    study, original = evaluator.study, evaluator.characteristics.original
+    settings = {"original": original, **_variant(subject, evaluator, set, solution)}
+    if not is_rated(study):
+        study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
+    rater = assemble(study, study.source).rater
+    assert rater is not None
+    cells = evaluator.for_study(study).simulate_cells(np.stack([*settings.values()]), "cells and robustness layers")
+    return rate(study, rater, settings, cells)
+
+
+def _variant(
+    subject: Study | Case, evaluator: Evaluator, changes: tuple[str, ...], solution: str | None
+) -> dict[str, FloatArray]:
+    """The variant's setting by its name; empty if the options describe none.
+
+    Raises
+    ------
+    InputError
+        If there is no such solution, a value is outside its domain, or the changed variant violates a constraint.
+    """
+    characteristics = evaluator.characteristics
+    setting, name = characteristics.original, "variant"
+    if solution is not None:
+        if isinstance(subject, Study):
+            raise InputError("solution", f"{subject.name!r} is a study and has no solutions", "a results directory")
+        row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(solution))]
+        setting, name = row[list(characteristics.names)].to_numpy(float), solution
+    if changes:
+        values = dict(zip(characteristics.names, setting.tolist(), strict=True))
+        values |= {key: value for key, (value,) in read_changes(changes, characteristics, "set", single=True).items()}
+        setting = characteristics.setting(values, "set")
+        evaluator.region.check(setting[np.newaxis], "set")
+        name = "variant" if solution is None else f"{solution} changed"
+    return {name: setting} if changes or solution else {}
+
+
+def rate(study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: CellResults) -> Answer:
+    """The answer about the original vehicle and its variant, settings by name, that were simulated in all cells."""
+    protocol, scores, names = rater.protocol, rater.points(cells), list(settings)
+    lost = (scores.total[0] - scores.total).round(DECIMALS)
+    possible = round(sum(sum(matrix.points) for matrix in protocol.matrices), DECIMALS)
+    tests = tabulate("Points by test", TESTS, _rows_of_tests(rater, scores, names))
+    changes = [_changes(study, setting) for setting in settings.values()]
+    invalid, remarks = (~cells.valid).sum(axis=1), [*_remarks(rater, scores, cells)]
+    vehicles = tabulate("Vehicles", VEHICLES, zip(names, scores.total, lost, changes, invalid, remarks, strict=True))
+    not_simulated = tabulate(
+        "Not simulated, neither passed nor failed", NOT_SIMULATED, protocol.points_not_simulated.items()
+    )
+    return Answer(
+        question="rating",
+        study=study,
+        verdict=_verdict(study, settings, scores, possible, tests),
+        numbers={
+            "points": float(scores.total[0]),
+            "possible": possible,
+            "lost": float(lost[-1]),
+            "not_simulated": sum(protocol.points_not_simulated.values()),
+            "layers_not_simulated": _points_of_open_layers(rater),
+        },
+        tables={
+            "tests": tests,
+            "vehicles": vehicles,
+            "not_simulated": not_simulated,
+            "cells": tabulate("Cells", CELLS, _cells(protocol, scores, cells, names)),
+        },
+        draw=partial(_draw, protocol, scores),
+    )
+
+
+def _rows_of_tests(rater: Rater, scores: Points, names: list[str]) -> Iterator[tuple[Any, ...]]:
+    for number, name in enumerate(names):
+        for matrix in rater.protocol.matrices:
+            points = scores.tests[matrix.name].round(DECIMALS)
+            totals = points.sum(axis=1)
+            failing = [
+                layer
+                for (of_test, layer), holds in scores.layers.items()
+                if of_test == matrix.test_name and not holds[number]
+            ]
+            yield (
+                *(name, matrix.name, sum(matrix.points)),
+                *(totals[number], round(totals[0] - totals[number], DECIMALS), *points[number], *matrix.points[:2]),
+                *(", ".join(layers) or None for layers in (failing, rater.claims.get(matrix.test_name, ()))),
+            )
+
+
+def _cells(protocol: Protocol, scores: Points, results: CellResults, names: list[str]) -> pd.DataFrame:
+    """The rows of `CELLS`: all cells of each vehicle."""
+    placed = pd.DataFrame(
+        [
+            (
+                *(cell.matrix.name, cell.range_or_layer, cell.condition or None),
+                *(cell.vut_speed, cell.target_speed, cell.impact_location),
+            )
+            for cell in protocol.cells
+        ],
+        columns=["test", "range", "condition", "vut_speed", "target_speed", "impact_location"],
+    )
+    measured = zip(names, scores.colours, results.impact, results.warning, strict=True)
+    return pd.concat(
+        [
+            placed.assign(
+                variant=name,
+                colour=np.array([*COLOURS, None], dtype=object)[colours],  # an unknown one is -1
+                relative_impact_speed=impact.round(DECIMALS),
+                warning_ttc=warning.round(DECIMALS),
+            )
+            for name, colours, impact, warning in measured
+        ],
+        ignore_index=True,
+    )
+
+
+def _changes(study: Study, setting: FloatArray) -> dict[str, float]:
+    characteristics = CharacteristicSet.of(study)
+    pairs = zip(characteristics, setting.tolist(), strict=True)
+    return {item.name: value for item, value in pairs if value != item.original}
+
+
+def _remarks(rater: Rater, scores: Points, cells: CellResults) -> Iterator[str | None]:
+    """For each vehicle: required cells that are not green, and missing warnings."""
+    protocol = rater.protocol
+    for number, fails in enumerate(scores.fails):
+        remarks = []
+        if fails:
+            remarks.append(f"it earns nothing, because {REQUIRED} is not green in the whole standard range")
+        elif scores.colours[number, protocol.unchecked_cells].any():
+            remarks.append(
+                f"{UNCHECKED} is not green, which Euro NCAP requires; Euro NCAP's calculator "
+                f"{protocol.calculator_version} does not check this, nor do these points"
+            )
+        if np.isnan(cells.warning[number]).all():
+            remarks.append("it never warns: rows with FCW are red")
+        yield "; ".join(remarks) or None
+
+
+def _points_of_open_layers(rater: Rater) -> float:
+    """Points of the robustness layers of simulated tests that are neither simulated nor claimed."""
+    protocol, points = rater.protocol, 0.0
+    for matrix in protocol.matrices:
+        layers, claimed = protocol.layers_of(matrix.test_name), rater.claims.get(matrix.test_name, ())
+        is_open = [not layer.simulated_conditions and layer.name not in claimed for layer in layers]
+        points += matrix.points[2] * sum(is_open) / len(layers)
+    return points
+
+
+def _verdict(
+    study: Study, settings: Mapping[str, FloatArray], scores: Points, possible: float, tests: pd.DataFrame
+) -> str:
+    """How many points the variant loses and in which tests; without a variant, the original's points."""
+    weather, road = weather_of(study.weather, f"study {study.name!r}"), ""
+    if weather.wet or weather.road_friction != 1:
+        road = (
+            f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
+            f"{darken(weather).name!r}."
+        )
+    *others, variant = settings
+    earned = f"{scores.total[0]:.2f}"
+    if not others:
+        return f"The original vehicle earns {earned} of the {possible:g} points of the tests that are simulated.{road}"
+    items = {item.name: item for item in CharacteristicSet.of(study)}
+    changes = [
+        f"{items[name].short_name} {float(items[name].text(value)):g}{items[name].suffix}"
+        for name, value in _changes(study, settings[variant]).items()
+    ]
+    lost, where = round(scores.total[0] - scores.total[-1], DECIMALS), ""
+    result = f"earns {-lost:.2f} points more, {scores.total[-1]:.2f} instead" if lost < 0 else f"loses {lost:.2f}"
+    losses = tests[tests["variant"] == variant]
+    largest = losses[losses["lost"] == losses["lost"].max()]
+    if lost > 0:
+        each = "each of " if len(largest) > 1 else ""
+        where = f", {largest['lost'].iloc[0]:.2f} of them in {each}{join_phrases([*largest['test']])}"
+    return (
+        f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned} points that the "
+        f"original earns (of {possible:g} that are simulated){where}.{road}"
+    )
+
+
+def _draw(protocol: Protocol, scores: Points, answer: Answer) -> Figure:
+    """The matrices of all tests with the colours of their cells, of the original and its variant side by side."""
+    vehicles = answer.tables["vehicles"]
+    points = "; ".join(
+        f"{name}: {total:.2f} points" for name, total in zip(vehicles["variant"], vehicles["points"], strict=True)
+    )
+    arrangement = " (original left, variant right)" if len(vehicles) > 1 else ""
+    title = f"{answer.study.name}: {points} of {answer.numbers['possible']:g}{arrangement}"
+    figure, axes = new_panels(title, len(protocol.matrices), 4, (3.75, 2.6), min_width=15.0, title_height=0.0)
+    for axis, matrix in zip(axes, protocol.matrices, strict=True):
+        _draw_matrix(axis, protocol, scores, matrix)
+    legend = ", ".join(f"{colour[0].upper()} {colour}" for colour in COLOURS) + "; small letters: extended range"
+    figure.supxlabel(
+        f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {legend}; "
+        "asterisk: colour differs from the original's",
+        fontsize=FONT_SIZE,
+    )
+    figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT_SIZE)
+    return figure
+
+
+def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMatrix) -> None:
+    """Draw a matrix of every vehicle; each is followed by a gap, an empty column."""
+    import seaborn as sns
+    from matplotlib.colors import ListedColormap
+
+    columns = [*(f"{value:g}" for value in matrix.column_values), ""]
+    rows = [f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}" for number, row in enumerate(matrix.rows)]
+    known = protocol.matrix_cell_numbers
+    numbers = np.array(
+        [[known.get((matrix.name, row, column), -1) for column in range(len(columns))] for row in range(len(rows))]
+    )
+    is_extended = np.array([cell.range_or_layer == EXTENDED for cell in protocol.cells])
+    colours = [np.where(numbers < 0, np.nan, of_vehicle[numbers]) for of_vehicle in scores.colours]
+    letters = []
+    for of_vehicle in scores.colours:
+        plain = np.array([*(colour[0] for colour in COLOURS), "?"])[of_vehicle]
+        cased = np.where(is_extended, plain, np.char.upper(plain))
+        marked = np.char.add(cased, np.where(of_vehicle != scores.colours[0], "*", ""))
+        letters.append(np.where(numbers < 0, "", marked[numbers]))
+    frame = pd.DataFrame(np.hstack(colours), rows, columns * len(colours))
+    palette = ListedColormap(["#808080", *(f"#{protocol.colours[colour]}" for colour in COLOURS)])
+    limits = {"vmin": -1, "vmax": len(COLOURS) - 1}
+    sns.heatmap(frame, annot=np.hstack(letters), fmt="", cmap=palette, **limits, cbar=False, linewidths=0.6, ax=axis)
+    axis.grid(False)
+    axis.tick_params(labelsize=FONT_SIZE - 2, length=0, rotation=0)
+    totals = " / ".join(f"{total:.2f}" for total in scores.tests[matrix.name].sum(axis=1))
+    axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT_SIZE)

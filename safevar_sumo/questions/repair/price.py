@@ -1,0 +1,81 @@
+"""The price of a repair on a new vehicle: how much earlier it brakes, how hard, and how often needlessly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.campaign.evaluation import with_parameters
+from safevar_sumo.questions.braking import brake_onset
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios.benign import benign_points
+from safevar_sumo.study import MatrixTable, Study
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import System, assemble
+
+NEEDLESS_BRAKE = 0.1
+"""Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the speed."""
+
+
+def price_of(study: Study, values: Mapping[str, float]) -> JsonObject:
+    """The price of other values of parameters against today's, by the names of the answer's columns; None where the new
+    vehicle brakes nowhere.
+    """
+    today, changed = assemble(study), assemble(with_parameters(study, values))
+    onsets_today, _ = _drive_new_car(today)
+    onsets, deceleration = _drive_new_car(changed)
+    benign = benign_scenes(study, today)
+    before, after = (needless_braking(system, benign) for system in (today, changed))
+    metres, seconds = onsets_today - onsets
+    braked = np.flatnonzero(np.isfinite(metres))
+    most = int(braked[np.argmax(metres[braked])]) if len(braked) else None
+    return {
+        "metres_earlier": None if most is None else float(metres[most]),
+        "metres_earlier_mean": None if most is None else float(np.mean(metres[braked])),
+        "seconds_earlier": None if most is None else float(seconds[most]),
+        "most_at": None if most is None else today.points[most].name or None,
+        "largest_deceleration": deceleration,
+        "needless_braking": sum(after),
+        "needless_braking_today": sum(before),
+        "benign_scenes": len(after),
+    }
+
+
+def _drive_new_car(system: System) -> tuple[FloatArray, float]:
+    """Where and when the new vehicle begins to brake at each of N points, shape (2, N), NaN if it does not [m, s]; its
+    largest deceleration [m/s^2].
+    """
+    results = simulate_all_points(system, system.characteristics.original[np.newaxis])
+    onsets, deceleration = np.full((2, len(results)), np.nan), 0.0
+    for column, result in enumerate(results):
+        trace, step = result.runs.trace, brake_onset(result.runs, 0)
+        if step is not None:
+            onsets[:, column] = trace.position[step, 0], trace.time[step]
+        speed = trace.speed[trace.active[:, 0], 0]
+        deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))
+    return onsets, deceleration
+
+
+def benign_scenes(study: Study, system: System) -> list[Point]:
+    """The benign scenes that a study names, else those like its shipped scenarios; there may be none."""
+    if study.repair.benign:
+        return list(assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix)
+    return benign_points(system.points)
+
+
+def needless_braking(system: System, benign: list[Point]) -> list[bool]:
+    """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road without anybody."""
+    one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
+    return [
+        bool((np.where(result.runs.trace.active, result.runs.trace.brake, 0.0) > NEEDLESS_BRAKE).any())
+        for points, sees_nobody in ((benign, False), (one_per_speed, True))
+        if points
+        for result in simulate_all_points(
+            replace(system, matrix=tuple(points), rater=None, sees_nobody=sees_nobody),
+            system.characteristics.original[np.newaxis],
+        )
+    ]

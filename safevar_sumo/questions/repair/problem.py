@@ -1,0 +1,253 @@
+"""What a repair is asked: the promised wear, and the parameters of the ADS that may change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.ads import ADS
+from safevar_sumo.ads.varied import CHANGEABLE
+from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.errors import InputError, UserCodeError, unknown_name
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator, sobol_points
+from safevar_sumo.questions.preventability import approach_parameters
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
+from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
+from safevar_sumo.study.characteristics import check_limits
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import FeasibleRegion
+
+DIGITS = 4
+"""Significant digits of a parameter's changed value, more where its range is small beside it: the value that is printed
+is the one that has been tried.
+"""
+ARRAY_CHECKS = 8
+"""Sets of parameters with which a user's ADS is tried as one for all vehicles."""
+ALL = "all"
+"""The promise of the whole domain."""
+
+
+class Parameter(NamedTuple):
+    """A parameter of the ADS that may change, with its `range` and the value of `today`."""
+
+    name: str
+    range: FreeParameter
+    today: float
+
+    def share(self, value: float) -> float:
+        """Where a value lies in the range, in [0, 1]; of the logarithm if the parameter is logarithmic."""
+        ends = np.array([self.range.lower, self.range.upper, value])
+        lower, upper, place = (np.log(ends) if self.range.log else ends).tolist()
+        return float((place - lower) / (upper - lower))
+
+    def values(self, shares: FloatArray) -> FloatArray:
+        """The rounded values at shares of the range, shape (M,)."""
+        lower, upper = self.range.lower, self.range.upper
+        digits = DIGITS + max(0, int(np.log10(max(abs(lower), abs(upper)) / (upper - lower))))
+        exact = lower * (upper / lower) ** shares if self.range.log else lower + shares * (upper - lower)
+        distinct, row_of = np.unique(exact, return_inverse=True)
+        return np.clip([float(f"{value:.{digits}g}") for value in distinct.tolist()], lower, upper)[row_of]
+
+
+@dataclass(frozen=True)
+class Promise:
+    """The promised wear: all settings from `lower` to `upper`, shape (n,), that keep the study's constraints.
+
+    The ends of characteristics that stay as in the original are equal.
+    """
+
+    region: FeasibleRegion
+    lower: FloatArray
+    upper: FloatArray
+
+    @classmethod
+    def of(cls, study: Study, region: FeasibleRegion, texts: Sequence[str]) -> Promise:
+        """The promise that texts such as "treadDepth >= 2" state, or the study's own without any.
+
+        Raises
+        ------
+        InputError
+            If a promise cannot be read, names no characteristic, lies outside its domain, or lets nothing wear.
+        """
+        rows, stated, everything = study.vehicle.characteristics, study.repair.promise, region.characteristics
+        if list(texts) == [ALL] or (not texts and stated == ALL):
+            return cls(region, everything.lower, everything.upper)
+        of_study = stated if stated and isinstance(stated, dict) else study.limits
+        check_limits(rows, of_study, study.source, "repair.promise.")
+        limits = limits_of(texts, rows, None if texts else of_study, "promise")
+        if not limits:
+            raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
+        ends = [
+            limits[member.name].interval(rows[member.name]) if member.name in limits else (member.original,) * 2
+            for member in everything
+        ]
+        lower, upper = np.transpose(ends)
+        if (lower == upper).all():
+            raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
+        return cls(region, lower, upper)
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """The settings at points of the unit cube, shape (M, n)."""
+        return self.lower + points * (self.upper - self.lower)
+
+    def holds(self, settings: FloatArray) -> BoolArray:
+        """Which settings are promised, shape (M,)."""
+        is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
+        return np.asarray(is_within & self.region.feasible(settings))
+
+    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+        """Settings drawn uniformly among the promised ones."""
+        return self.region.draw_feasible(lambda count: self.at(rng.random((count, len(self.lower)))), number)
+
+    def to_dict(self) -> dict[str, list[float]]:
+        """The ends of every characteristic that may wear."""
+        names, ends = self.region.characteristics.names, np.transpose([self.lower, self.upper]).tolist()
+        return {name: pair for name, pair in zip(names, ends, strict=True) if pair[0] < pair[1]}
+
+    @property
+    def in_words(self) -> str:
+        """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`."""
+        ends = self.to_dict()
+        return ", ".join(
+            f"{member.name} {sign} {end:.5g}{member.suffix}"
+            for member in self.region.characteristics
+            if member.name in ends
+            for sign, end in zip((">=", "<="), ends[member.name], strict=True)
+            if end != member.original
+        )
+
+
+def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
+    """The parameters that may change: those called `names`, or all under [repair], or those of a shipped ADS.
+
+    Raises
+    ------
+    InputError
+        If there is none, one is unknown, or its bounds exclude the value of today.
+    """
+    source, shipped = study.source, CHANGEABLE.get(study.ads.model, {})
+    table = study.repair.parameters or shipped
+    if not table:
+        problem = f"ads.model = {study.ads.model!r}: no parameter may change"
+        raise InputError(source, problem, "parameters under [repair], such as gain = { lower, upper, unit, meaning }")
+    for name in names:
+        if name not in table:
+            raise unknown_name("change", f"{study.ads.model} has no parameter {name!r} that may change", name, table)
+    ads, parameters = assemble(study).ads, []
+    for name in (name for name in table if name in (names or table)):
+        row, today = table[name], study.ads.parameters.get(name, getattr(ads, name, None))
+        number = float(today) if isinstance(today, int | float) else math.nan
+        if table is shipped:
+            row = replace_in(row, lower=min(row.lower, number), upper=max(row.upper, number))
+        if not row.lower <= number <= row.upper or row.lower == row.upper or (row.log and row.lower <= 0):
+            problem = f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g}, ads.parameters.{name} = {today!r}"
+            legal = f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today"
+            raise InputError(source, problem, legal)
+        parameters.append(Parameter(name, row, number))
+    return parameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepairProblem:
+    """A study's ADS with P parameters that may change, and the criterion to keep within a promise: safety degrees of at
+    least `margin`.
+
+    Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
+    """
+
+    evaluator: Evaluator
+    promise: Promise
+    parameters: list[Parameter]
+    unsafe: Unsafe
+
+    @property
+    def study(self) -> Study:
+        return self.evaluator.study
+
+    @property
+    def margin(self) -> float:
+        return self.unsafe.keep + self.unsafe.contact
+
+    @cached_property
+    def today(self) -> FloatArray:
+        """The parameters of today, shape (P,)."""
+        return np.array([parameter.share(parameter.today) for parameter in self.parameters])
+
+    def values(self, shares: FloatArray) -> FloatArray:
+        """The parameters' values in their units, shape (M, P): today's value where a share is today's."""
+        columns = [
+            np.where(column == today, parameter.today, parameter.values(column))
+            for parameter, column, today in zip(self.parameters, shares.T, self.today, strict=True)
+        ]
+        return np.stack(columns, axis=1)
+
+    def changed_values(self, change: FloatArray) -> dict[str, float]:
+        """The values of the parameters that a change, one set of shape (P,), changes, by name."""
+        (values,) = self.values(change[np.newaxis]).tolist()
+        names = [parameter.name for parameter in self.parameters]
+        return {names[column]: values[column] for column in np.flatnonzero(change != self.today)}
+
+    @cached_property
+    def arrays(self) -> bool:
+        """Whether one ADS drives vehicles with different parameters: a shipped one, or the user's class if a sample has
+        the same results to the bit; otherwise there is an instance for each set.
+        """
+        if self.study.ads.kind or self.study.ads.model in ADS:
+            return not self.study.ads.kind
+        values = self.values(sobol_points(ARRAY_CHECKS, len(self.parameters), 0))
+        settings = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1))
+        try:
+            alone, together = (
+                self._evaluate(values, settings, "is it one driving system?", arrays=arrays) for arrays in (False, True)
+            )
+        except UserCodeError:
+            return False
+        return not any(differences(alone.results, together.results))
+
+    def _evaluate(
+        self, values: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = (), *, arrays: bool
+    ) -> Evaluations:
+        """Evaluate each set of values with the setting of its row, at the worst of `points`, or of all without any."""
+        selection = Selection(tuple(parameter.name for parameter in self.parameters), tuple(points), arrays)
+        return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
+
+    def degrees(
+        self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
+    ) -> tuple[FloatArray, npt.NDArray[np.intp] | None]:
+        """Safety degrees of each of M sets of parameters with each of L settings, shape (M, L), and the worst points of
+        these M L rows; None without a matrix.
+        """
+        values = self.values(np.repeat(shares, len(settings), axis=0))
+        evaluations = self._evaluate(values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays)
+        return _degrees_of(evaluations).reshape(len(shares), len(settings)), evaluations.worst_points
+
+    def degrees_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+        """Safety degrees of settings with one set of parameters, shape (L,)."""
+        return self.degrees(change[np.newaxis], settings, stage)[0].reshape(-1)
+
+    @cached_property
+    def best_driver(self) -> Evaluator:
+        """Full braking at the first possible moment."""
+        ads = ModelTable(model="full_braking", parameters=approach_parameters(assemble(self.study)))
+        return self.evaluator.for_study(replace_in(self.study, ads=ads, spread={}), verified=0)
+
+    def repairable(self, settings: FloatArray) -> BoolArray:
+        """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe."""
+        is_safe = _degrees_of(self.best_driver.evaluate(settings, "full braking")) >= self.margin
+        unsafe = np.flatnonzero(~is_safe)
+        is_safe[unsafe] = self.degrees_with(self.today, settings[unsafe], "full braking") >= self.margin
+        return is_safe
+
+
+def _degrees_of(evaluations: Evaluations) -> FloatArray:
+    """Safety degrees [m, or -m/s], shape (M,); infinite without a conflict, minus infinity without a valid result."""
+    degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
+    return np.where(evaluations.valid, degrees, -np.inf)

@@ -1,0 +1,259 @@
+"""RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun
+against rain.
+
+In the frames, the columns `setting` and `other` hold the names of cases. Functions of a case raise `UnanswerableError`
+as `critical_solutions` does; `rq31` also raises it if solutions belong to no run.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import permutations, product
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from safevar_sumo.ads import REACTION_PARAMETERS
+from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions
+from safevar_sumo.records import FloatArray
+from safevar_sumo.results import changed_values, evaluation_keys
+from safevar_sumo.study import SAFETY_DEGREE, tables_of
+
+ANY = "any"
+WEATHER_VALUES = ["percent", "percent_other", "difference", "rank", "rank_other"]
+WEATHER_VALUES += ["increase", "increase_other", "decrease", "decrease_other"]
+WEATHER_PARAMETERS = (*REACTION_PARAMETERS, "brake_place")
+"""Parameters of an ADS by which it reacts to a weather: its delays, and where World On Rails sees the pedestrian."""
+COMBINATION_SIZE = 4
+"""Number of changed characteristics in the combinations that are counted."""
+COMBINATIONS_SHOWN = 3
+"""Number of the most frequent combinations that are shown."""
+SAFETY_SCALES = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
+"""For each quantity of `rq33_safety` with a percentage: the metric whose value for the original vehicle is 100 %."""
+
+
+def critical_solutions(case: Case) -> pd.DataFrame:
+    """NSGA-II's solutions with a safety degree below the original's.
+
+    Raises
+    ------
+    UnanswerableError
+        If NSGA-II is missing or the original's safety degree is undefined.
+    """
+    solutions = case.solutions_of(NSGA2)
+    if np.isnan(case.original[SAFETY_DEGREE]):
+        raise UnanswerableError(case.name, "lacks the original vehicle's safety degree", "results that have it")
+    return solutions[solutions[SAFETY_DEGREE] < case.original[SAFETY_DEGREE]]
+
+
+def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
+    """Changes of n characteristics in M solutions, each in its unit: filtered minus original value, the paper's v'' -
+    v; shape (M, n).
+    """
+    return solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original
+
+
+def change_numbers(case: Case) -> list[str]:
+    """The numbers of changed characteristics, "1".."n"."""
+    return [str(j) for j in range(1, len(case.characteristics) + 1)]
+
+
+def count_changes(case: Case) -> npt.NDArray[np.str_]:
+    """The number j of changed characteristics of each critical solution, "1".."n"."""
+    return np.asarray(np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str))
+
+
+def _means_by_change_count(
+    case: Case, labels: Sequence[str], name: str, values: Iterable[tuple[tuple[str, ...], FloatArray]]
+) -> pd.DataFrame:
+    """Mean values of the critical solutions with j characteristics changed, for each key and j.
+
+    `values` holds keys, each with one value per critical solution; NaN does not count. Columns: setting, the `labels`
+    of the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of values).
+    """
+    change_counts = count_changes(case)
+    rows = []
+    for (key, column), j in product(values, (*change_numbers(case), ANY)):
+        sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
+        rows.append((case.name, *key, j, np.mean(sample) if sample.size else np.nan, sample.size))
+    return pd.DataFrame(rows, columns=["setting", *labels, "j", name, "n"])
+
+
+def rq31(case: Case) -> pd.DataFrame:
+    """Number of critical solutions of each run with exactly j characteristics changed; columns setting, run, j,
+    count.
+    """
+    solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
+    counts = solutions.groupby([solutions["run"], count_changes(case)]).size()
+    index = pd.MultiIndex.from_product([runs, change_numbers(case)], names=["run", "j"])
+    frame = counts.reindex(index, fill_value=0).reset_index(name="count")
+    frame.insert(0, "setting", case.name)
+    return frame
+
+
+def rq32(case: Case) -> pd.DataFrame:
+    """For each characteristic and j: the share of the critical solutions with j changes that change this
+    characteristic.
+
+    Columns setting, characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank (only for
+    j = "any"; ties share the better rank and the next one is skipped).
+    """
+    shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
+    values = {(name,): column for name, column in zip(case.characteristics.names, shares.T, strict=True)}
+    frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(columns="n")
+    frame["percent"] *= 100
+    ranks = frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
+    return frame.assign(rank=ranks.astype("Int64"))
+
+
+def rq33(case: Case) -> pd.DataFrame:
+    """Size of increases and of decreases in the critical solutions with j characteristics changed.
+
+    Columns setting, characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean change
+    relative to the original value, without sign), delta (mean signed change in the characteristic's unit), n (number of
+    changes); pc and delta are undefined where n is 0.
+    """
+    changes = changes_of(case, critical_solutions(case))
+    originals = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
+    values = {
+        (name, direction): np.where(np.sign(column) == sign, column, np.nan)
+        for name, column in zip(originals, changes.T, strict=True)
+        for direction, sign in (("increase", 1), ("decrease", -1))
+    }
+    frame = _means_by_change_count(case, ["characteristic", "direction"], "delta", values.items())
+    frame["pc"] = (frame["delta"] / frame["characteristic"].map(originals)).abs()
+    return frame[["setting", "characteristic", "direction", "j", "pc", "delta", "n"]]
+
+
+def rq33_safety(case: Case) -> pd.DataFrame:
+    """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
+
+    Columns setting, quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value
+    is undefined where n is 0. Quantities:
+
+    - avgSD_mD: mean reduction of the distance over solutions without collision [m];
+    - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
+    - TET [s], TIT [s^2]: mean increase over solutions without collision;
+    - aveDece: mean decrease over all solutions [m/s^2].
+    """
+    solutions = critical_solutions(case)
+    has_collided = are_collisions(solutions).to_numpy()
+    safety_degree, tet, tit, deceleration = solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
+    values = {
+        ("avgSD_mD",): np.where(has_collided, np.nan, case.original[SAFETY_DEGREE] - safety_degree),
+        ("avgSD_cS",): np.where(has_collided, -safety_degree, np.nan),
+        ("TET",): np.where(has_collided, np.nan, tet - case.original["tet"]),
+        ("TIT",): np.where(has_collided, np.nan, tit - case.original["tit"]),
+        ("aveDece",): case.original["ave_dece"] - deceleration,
+    }
+    frame = _means_by_change_count(case, ["quantity"], "value", values.items())
+    scale = frame["quantity"].map(SAFETY_SCALES).map(case.original).abs().replace(0.0, np.nan)
+    frame["percent"] = 100 * frame["value"] / scale
+    return frame[["setting", "quantity", "j", "value", "percent", "n"]]
+
+
+def count_collisions(case: Case) -> pd.DataFrame:
+    """Number of collisions among each algorithm's solutions; columns setting, algorithm, solutions, collisions, share
+    [fraction].
+
+    Raises
+    ------
+    UnanswerableError
+        If no run is finished.
+    """
+    case.require_solutions()
+    collisions = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
+    counts = collisions.agg(solutions="size", collisions="sum").reindex(list(case.algorithms), fill_value=0)
+    counts = counts.assign(share=counts["collisions"] / counts["solutions"]).rename_axis("algorithm").reset_index()
+    return pd.DataFrame({"setting": case.name, **counts})
+
+
+def frequent_combinations(case: Case) -> pd.DataFrame:
+    """The most frequent combinations among the critical solutions with exactly four characteristics changed.
+
+    Columns setting, rank (ties share the better one), characteristics (a list), percent (of the solutions with exactly
+    four changes); no row where there is no such solution. Of combinations that are equally frequent, those with the
+    earlier characteristics in the study come first.
+    """
+    is_changed = changes_of(case, critical_solutions(case)) != 0
+    masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
+    counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
+    most_frequent = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
+    rows = []
+    for indices, number in most_frequent:
+        rank = 1 + sum(other > number for other in counts.values())
+        rows.append((case.name, rank, [case.characteristics.names[i] for i in indices], 100 * number / len(masks)))
+    return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
+
+
+def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
+    """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction,
+    visibility, delays).
+
+    The reaction's parameters are the `WEATHER_PARAMETERS`.
+
+    Raises
+    ------
+    UnanswerableError
+        If there is no such pair.
+    """
+    pairs = [
+        (clearer, other)
+        for clearer, other in permutations(cases, 2)
+        if _clearness(clearer) > _clearness(other) and not _differences(clearer, other)
+    ]
+    if not pairs:
+        problem = "two cases are needed that differ in the weather alone"
+        if len(cases) == 2:
+            differences = ", ".join(_differences(*cases))
+            problem += f"; these two {f'also differ in {differences}' if differences else 'have equally clear weather'}"
+        raise UnanswerableError(
+            ", ".join(case.name for case in cases), problem, "results such as those of sun and rain"
+        )
+    return pairs
+
+
+def compare_weathers(*cases: Case) -> pd.DataFrame:
+    """The weathers of the pairs of `find_weather_pairs`, characteristic by characteristic, over the critical solutions.
+
+    The column setting names the clearer weather's case. Columns without the suffix "_other" belong to this case.
+    Columns: setting, other, characteristic; percent, percent_other (of the critical solutions that change it);
+    difference (percent_other - percent); rank, rank_other; increase, increase_other, decrease, decrease_other (mean
+    signed change in the characteristic's unit).
+    """
+    tables = [
+        _overall_changes(clearer)
+        .merge(_overall_changes(other), "left", "characteristic", suffixes=("", "_other"))
+        .rename(columns={"setting_other": "other"})
+        for clearer, other in find_weather_pairs(cases)
+    ]
+    table = pd.concat(tables, ignore_index=True)
+    table["difference"] = table["percent_other"] - table["percent"]
+    return table[["setting", "other", "characteristic", *WEATHER_VALUES]]
+
+
+def _overall_changes(case: Case) -> pd.DataFrame:
+    """How often and how far the critical solutions change each characteristic; columns setting, characteristic,
+    percent, rank, increase, decrease.
+    """
+    shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
+    deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
+    return shares.drop(columns="j").join(deltas, "characteristic")
+
+
+def _clearness(case: Case) -> tuple[float, float, float]:
+    weather = case.weather
+    reaction_delays = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTION_PARAMETERS]
+    return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(reaction_delays)
+
+
+def _differences(*pair: Case) -> list[str]:
+    """Keys on which a simulation depends and in which two studies differ, without those of the weather and of the ADS's
+    reaction to it.
+    """
+    first, second = (evaluation_keys(tables_of(case.study)) for case in pair)
+    ignored = {"name", "weather", "search", *(f"ads.parameters.{name}" for name in WEATHER_PARAMETERS)}
+    differences = (key for key, _, _ in changed_values(first, second))
+    return [key for key in differences if not {key, key.partition(".")[0]} & ignored]

@@ -1,0 +1,223 @@
+"""RQ1 and RQ2: algorithms against the original vehicle and against each other, over pooled solutions and over runs.
+
+The paper pools the solutions of all runs and compares them with a second sample: the original's single value, repeated
+once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
+small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests.
+
+In the frames, the column `setting` holds the case's name, `method` the name of the test, and `enough_runs` whether a
+test with so many runs can be significant; undefined values are NaN. Functions of a case raise `UnanswerableError` if no
+run is finished, if an algorithm that they compare is missing, and over runs if the solutions belong to no run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from itertools import product
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.questions.research_questions.fronts import (
+    INDICATOR_TITLES,
+    MORE_IS_BETTER,
+    compute_indicators,
+    count_evaluations,
+)
+from safevar_sumo.questions.research_questions.statistics import (
+    ALPHA,
+    FEWEST_RUNS,
+    compare_samples,
+    correct_by_holm,
+    signed_rank_test,
+)
+from safevar_sumo.questions.words import two_decimals
+from safevar_sumo.records import JsonObject
+
+TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
+RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original", "enough_runs"]
+RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS, "algorithm", "enough_runs"]
+RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
+RQ1_RUNS_COLUMNS += ["mean", "original", "enough_runs"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS, "algorithm", "enough_runs"]
+
+MORE_UNSAFE = "below 0.5: the runs are more unsafe than the original vehicle"
+Samples = Mapping[tuple[str, str], "pd.Series[float]"]
+"""Values by algorithm and name of a metric or quality indicator."""
+
+
+def rq1(case: Case) -> pd.DataFrame:
+    """Every algorithm's solutions against the original's value, repeated once for each solution, metric by metric.
+
+    `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are more unsafe; `mean` is
+    the mean over the algorithm's solutions, `original` the original vehicle's value.
+    """
+    return pd.DataFrame(_test_original(case), columns=RQ1_COLUMNS)
+
+
+def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
+    """One algorithm, as `opponents_of` chooses it, against every other: its runs' indicators, then its pooled
+    solutions' metrics.
+
+    `effect_size` is A12, oriented so that higher values mean that the algorithm is better: a better front, more unsafe
+    solutions. `n1` counts the algorithm's values, `n2` the baseline's; `evaluations` and `baseline_evaluations` are
+    mean numbers of settings that a run simulated. Indicators and evaluations of imported solutions, which belong to no
+    run, are undefined.
+    """
+    frame = pd.DataFrame(_test_opponents(case, algorithm))
+    simulated = pd.Series(dtype=float)
+    if case.has_runs and len(case.evaluations):
+        simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
+    sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
+    evaluations = {name: frame[side].map(simulated).astype(float) for name, side in sides.items()}
+    return frame[RQ2_COLUMNS].assign(**evaluations)
+
+
+def rq1_runs(case: Case) -> pd.DataFrame:
+    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
+
+    `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal ones
+    (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is
+    `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
+    """
+    tests = compare_over_runs(case)
+    return tests[tests.index == "RQ1"][RQ1_RUNS_COLUMNS]
+
+
+def rq2_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
+    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, and metrics' means
+    over solutions.
+
+    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
+    """
+    tests = compare_over_runs(case, algorithm)
+    opponents_of(case, algorithm)  # raises if RQ2 has no answer
+    return tests[tests.index == "RQ2"][RQ2_RUNS_COLUMNS]
+
+
+def compare_over_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
+    """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2."""
+    rows = {"RQ1": _test_original(case, over_runs=True)}
+    if len(case.algorithms) > 1:
+        rows["RQ2"] = _test_opponents(case, algorithm, over_runs=True)
+    tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]))
+
+
+def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
+    """The algorithm that RQ2 compares, by default NSGA-II or else the study's first with results, and the others.
+
+    Raises
+    ------
+    UnanswerableError
+        If the algorithm has no finished run, or there is no other algorithm.
+    """
+    case.require_solutions()
+    first = algorithm or (NSGA2 if NSGA2 in case.algorithms else case.algorithms[0])
+    case.solutions_of(first)  # raises if there are none
+    others = [name for name in case.algorithms if name != first]
+    if not others:
+        raise UnanswerableError(
+            case.name, f"only {first} has finished runs", "results of another algorithm to compare with, such as rs"
+        )
+    return first, others
+
+
+def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
+    """A row for each algorithm and metric, against the original vehicle."""
+    case.require_solutions()
+    rows = []
+    for algorithm, metric in product(case.algorithms, case.scoring.metrics):
+        values, original = _values(case, algorithm, metric, over_runs), case.original[metric.name]
+        if over_runs:
+            test = signed_rank_test(values, original)
+        else:
+            test = compare_samples(values, np.full(0 if np.isnan(original) else len(values), original))
+        if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
+            test = test.reversed()
+        runs = test.n1 if over_runs else _finished_runs(case, algorithm)
+        row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": runs}
+        row |= {"mean": values.mean(), "original": original, "enough_runs": runs >= FEWEST_RUNS["RQ1"]}
+        rows.append({**row, **test._asdict()})
+    return rows
+
+
+def _test_opponents(case: Case, algorithm: str, *, over_runs: bool = False) -> list[JsonObject]:
+    """A row for each baseline and metric."""
+    (first, others), samples, rows = opponents_of(case, algorithm), _samples(case, over_runs), []
+    for baseline, (metric, more_is_better) in product(others, _directions(case).items()):
+        test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
+        if not more_is_better:  # so that above 0.5 the first algorithm is better
+            test = test.reversed()
+        runs = min((test.n1, test.n2) if over_runs else (_finished_runs(case, name) for name in (first, baseline)))
+        row = {"setting": case.name, "algorithm": first, "baseline": baseline, "metric": metric}
+        rows.append({**row, **test._asdict(), "runs": runs, "enough_runs": runs >= FEWEST_RUNS["RQ2"]})
+    return rows
+
+
+def _finished_runs(case: Case, algorithm: str) -> float:
+    """The number of an algorithm's finished runs; without limit for imported solutions, whose runs are unknown."""
+    return sum(name == algorithm for name, _ in case.finished_runs) if case.has_runs else math.inf
+
+
+def _directions(case: Case) -> dict[str, bool]:
+    """For each indicator and metric: whether larger values speak for an algorithm (a better front, or more unsafe
+    solutions).
+    """
+    return MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+
+
+def _samples(case: Case, over_runs: bool) -> Samples:
+    """The values of every metric and, unless the solutions belong to no run, of every indicator."""
+    samples = {
+        (algorithm, metric.name): _values(case, algorithm, metric, over_runs)
+        for algorithm, metric in product(case.algorithms, case.scoring.metrics)
+    }
+    if case.has_runs and len(case.solutions):
+        for algorithm, rows in compute_indicators(case).groupby(level="algorithm"):
+            samples |= {(str(algorithm), name): rows.droplevel("algorithm")[name] for name in MORE_IS_BETTER}
+    return samples
+
+
+def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) -> pd.Series[float]:
+    """A metric's defined values over the solutions that count for it; over runs, the mean of each run."""
+    solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(subset=metric.name)
+    values = solutions[metric.name].astype(float)
+    if not over_runs:
+        return values
+    case.runs_of(algorithm)  # raises if there are none
+    return values.groupby(solutions["run"]).agg(lambda sample: np.mean(sample.to_numpy()))
+
+
+def titles_of(cases: Iterable[Case]) -> dict[str, str]:
+    """Titles of algorithms, quality indicators and the cases' metrics, by name."""
+    cases = list(cases)
+    metrics = {metric.name: metric.title for case in cases for metric in case.scoring.metrics}
+    algorithms = {name: case.title_of(name) for case in cases for name in case.algorithms}
+    return algorithms | INDICATOR_TITLES | metrics
+
+
+def summary_lines(case: Case) -> list[str]:
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk."""
+    lines, titles = [], titles_of([case])
+    try:
+        tests = compare_over_runs(case).replace(titles)
+        for question, subject, heading, meaning in (
+            ("RQ1", "algorithm", "{} against the original vehicle", MORE_UNSAFE),
+            ("RQ2", "baseline", "{first} against {}", "above 0.5: {first} is better"),
+        ):
+            first = case.title_of(opponents_of(case)[0]) if question == "RQ2" else ""  # raises if RQ2 has no answer
+            heading, meaning = heading.replace("{first}", first), meaning.replace("{first}", first)
+            lines.append(f"{question} over runs: A12 {meaning}; * p < {ALPHA:g} after Holm's correction")
+            for name, group in tests[tests.index == question].groupby(subject, sort=False):
+                marks = np.where(group["p_holm"] < ALPHA, "*", "")
+                effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
+                line = f"  A12 of {heading.format(name)}: {', '.join(effects)}"
+                if untestable := ", ".join(group.loc[~group["enough_runs"] & group["effect_size"].notna(), "metric"]):
+                    line += f"; too few runs for a test ({FEWEST_RUNS[question]} are needed): {untestable}"
+                lines.append(line)
+    except UnanswerableError as error:
+        lines.append(f"{'RQ2' if lines else 'RQ1 and RQ2'} over runs: {error.problem}.")
+    return lines

@@ -1,0 +1,283 @@
+"""All figures of results by name: how algorithms compare (RQ1, RQ2), and what critical solutions change (RQ3)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import combinations, cycle, product
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
+from safevar_sumo.questions.case import Case, UnanswerableError
+from safevar_sumo.questions.figures import (
+    BLUE,
+    FONT_SIZE,
+    SKY_BLUE,
+    VERMILION,
+    as_formula,
+    escape_dollars,
+    new_figure,
+    new_panels,
+    save,
+)
+from safevar_sumo.questions.research_questions.answer import answer_questions
+from safevar_sumo.questions.research_questions.changes import ANY, changes_of, critical_solutions, rq32
+from safevar_sumo.questions.research_questions.fronts import (
+    REFERENCE_COORDINATE,
+    compute_convergence,
+    nondominated_points,
+    points_of,
+    reference_front,
+)
+from safevar_sumo.records import FloatArray
+from safevar_sumo.results import make_directory
+from safevar_sumo.study import SAFETY_DEGREE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own marker."""
+MARKERS = ("o", "X", "^", "s", "D", "v")
+OBJECTIVE_TITLES = {
+    F_SAFE.name: "f_safe: safety degree [m, -m/s]",
+    F_DIFF.name: "f_diff: largest change [fraction of the original]",
+    F_NUM_DIFF.name: "f_numDiff: characteristics changed",
+}
+LONGEST_NAME = 28
+"""Number of letters of a name that fit above a small axis."""
+BIN_COUNT = 24
+"""Number of bins over a characteristic's domain."""
+
+
+def draw_pareto_fronts(case: Case) -> Figure:
+    """The non-dominated solutions of all runs of each algorithm together, for every pair of objectives.
+
+    Each panel also shows the original vehicle; solutions on the dashed line or to its left are collisions.
+
+    Raises
+    ------
+    UnanswerableError
+        If there is no solution.
+    """
+    reference_front(case)  # raises if there is no solution
+    objectives = case.scoring.objectives
+    fronts = {
+        algorithm: nondominated_points(points) * [objective.sign for objective in objectives]
+        for algorithm in case.algorithms
+        if len(points := points_of(case, case.solutions_of(algorithm)))
+    }
+    pairs = list(combinations(range(len(objectives)), 2))
+    title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
+    figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
+    known_values = {F_DIFF.name: 0.0, F_NUM_DIFF.name: 0.0, F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan)}
+    original = [{**case.original, **known_values}.get(objective.name, np.nan) for objective in objectives]
+    for axis, pair in zip(axes, pairs, strict=True):
+        for (algorithm, points), colour, marker in zip(fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+            label = f"{escape_dollars(case.title_of(algorithm))} ({len(points)})"
+            x, y = points[:, pair].T
+            axis.scatter(x, y, marker=marker, s=16, alpha=0.6, linewidths=0, color=colour, label=label)
+        x, y = (original[i] for i in pair)
+        axis.scatter(x, y, marker="*", s=80, color="black", label="original vehicle")
+        if objectives[pair[0]] == F_SAFE:
+            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less")
+        _label_axes(axis, [objectives[i] for i in pair])
+    _add_legend_below(figure, axes[0])
+    return figure
+
+
+def draw_convergence(case: Case) -> Figure:
+    """The hypervolume of all settings so far over the number of evaluations, as median and range over the runs; a line
+    ends where its algorithm does.
+    """
+    import seaborn as sns
+
+    growth = compute_convergence(case)
+    runs = growth.groupby("algorithm", sort=False)["run"].nunique()
+    labels = {
+        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)"
+        for algorithm, count in runs.items()
+    }
+    figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
+    sns.lineplot(
+        growth.assign(algorithm=growth["algorithm"].map(labels)),
+        x="evaluations",
+        y="hypervolume",
+        hue="algorithm",
+        style="algorithm",
+        estimator="median",
+        errorbar=("pi", 100),
+        palette=COLOURS[: len(labels)],
+        ax=axis,
+    )
+    axis.set_ylabel(
+        "normalised hypervolume of all settings so far\n(line: median, band: range over runs; "
+        f"reference point {REFERENCE_COORDINATE:g})"
+    )
+    _add_legend_below(figure, axis)
+    axis.get_legend().remove()
+    return figure
+
+
+def _label_axes(axis: Axes, objectives: Sequence[Objective]) -> None:
+    labels = [
+        OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
+        for objective in objectives
+    ]
+    axis.set(xlabel=labels[0], ylabel=labels[1])
+
+
+def _add_legend_below(figure: Figure, axis: Axes) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT_SIZE
+    )
+
+
+def draw_change_counts(cases: Sequence[Case]) -> Figure:
+    """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots over the runs; a panel
+    per case that has an answer.
+
+    Raises
+    ------
+    UnanswerableError
+        If no case has an answer.
+    """
+    (answer,) = answer_questions(cases, "rq3.1")
+    groups = answer.frame.groupby("setting", sort=False)
+    title = "number of changed characteristics"
+    figure, axes = new_panels(title, len(groups), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
+    for axis, (name, counts) in zip(axes, groups, strict=True):
+        numbers, samples = zip(*counts.groupby("j", sort=False)["count"], strict=True)
+        axis.boxplot(samples, tick_labels=numbers, widths=0.8, patch_artist=True, boxprops={"facecolor": SKY_BLUE})
+        runs = counts["run"].nunique()
+        axis.set(xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)")
+        axis.set_title(escape_dollars(str(name)), fontsize=FONT_SIZE)
+        axis.locator_params(axis="y", integer=True, min_n_ticks=1)
+    return figure
+
+
+def draw_changed_characteristics(case: Case) -> Figure:
+    """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which each characteristic
+    is changed.
+    """
+    import seaborn as sns
+
+    _critical_changes(case)  # raises if there are none
+    shares = rq32(case)
+    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
+    table = shares.pivot(index="characteristic", columns="j", values="percent").loc[order, list(shares["j"].unique())]
+    title = f"{case.name}: characteristics changed in critical solutions"
+    figure, ((axis,),) = new_figure(title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(table)))
+    sns.heatmap(
+        table.rename(index=escape_dollars),
+        ax=axis,
+        cmap="cividis",
+        vmin=0,
+        vmax=100,
+        annot=True,
+        fmt=".0f",
+        annot_kws={"fontsize": 7},
+        linewidths=0.5,
+        cbar_kws={"label": "critical solutions\nin which it is changed [%]"},
+    )
+    axis.set(
+        xlabel="number of characteristics changed (empty: no such solution)",
+        ylabel="characteristic, most frequent first",
+    )
+    axis.tick_params(axis="both", length=0, rotation=0)
+    return figure
+
+
+def draw_change_sizes(case: Case) -> Figure:
+    """The distribution of each characteristic's signed changes in the critical solutions."""
+    changes_of_solutions = _critical_changes(case)
+    title = f"{case.name}: changes in critical solutions"
+    figure, axes = new_panels(title, len(case.characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    for axis, characteristic, changes in zip(axes, case.characteristics, changes_of_solutions.T, strict=True):
+        low, high = characteristic.lower - characteristic.original, characteristic.upper - characteristic.original
+        increases, decreases = changes[changes > 0], changes[changes < 0]
+        axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
+        axis.axvline(0, color="black", linewidth=0.8)
+        axis.set_xlim(low, high)
+        axis.set_title(
+            f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
+            fontsize=min(FONT_SIZE, FONT_SIZE * LONGEST_NAME / len(characteristic.name)),
+        )
+        axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT_SIZE)
+        axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
+        axis.locator_params(axis="y", nbins=4, integer=True, min_n_ticks=1)
+    figure.supylabel(f"number of critical solutions (of {len(changes_of_solutions)})", fontsize=9)
+    figure.supxlabel(
+        "orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
+        "each axis spans the characteristic's domain",
+        fontsize=FONT_SIZE,
+    )
+    return figure
+
+
+def _critical_changes(case: Case) -> FloatArray:
+    """The changes of the critical solutions, shape (M, n); raises UnanswerableError if there are none."""
+    changes = changes_of(case, critical_solutions(case))
+    if not len(changes):
+        raise UnanswerableError(
+            case.name, "has no critical solution", "results with solutions that are more unsafe than the original"
+        )
+    return changes
+
+
+FORMATS = ("png", "pdf", "svg")
+COUNTS_FIGURE = "rq3.1-number-of-changes"
+"""The figure that has all cases side by side."""
+FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
+    "rq3.2-changed-characteristics": draw_changed_characteristics,
+    "rq3.3-sizes-of-changes": draw_change_sizes,
+    "pareto-fronts": draw_pareto_fronts,
+    "convergence": draw_convergence,
+}
+
+
+def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
+    """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the
+    case's name.
+
+    Raises
+    ------
+    UnanswerableError
+        If no figure can be drawn.
+    """
+    figures, errors = {}, []
+    drawings: dict[str, Callable[[], Figure]] = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
+    for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
+        drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)
+    for name, draw_figure in drawings.items():
+        try:
+            figures[name] = draw_figure()
+        except UnanswerableError as error:
+            errors.append(error)
+    if not figures:
+        raise errors[0]
+    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in errors))
+
+
+def save_figures(cases: Sequence[Case], directory: Path, file_format: str) -> tuple[list[Path], list[str]]:
+    """Draw every figure into a file; returns the files, and the reasons for missing figures.
+
+    Raises
+    ------
+    InputError
+        If the directory cannot be written, or no figure can be drawn.
+    """
+    figures, reasons = draw_figures(cases)
+    make_directory(directory)
+    files = []
+    for name, figure in figures.items():
+        file_name = re.sub(r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name).strip("-")
+        files.append(directory / f"{file_name}.{file_format}")
+        save(figure, files[-1])
+    return files, reasons

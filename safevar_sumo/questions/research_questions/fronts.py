@@ -1,0 +1,147 @@
+"""The quality of the fronts that runs find (docs/method.md, section 7): IGD on the objectives in their units, IGD+ and
+hypervolume on normalised ones, and its growth with the evaluations; and the number of evaluations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import moocore
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.questions.case import Case, UnanswerableError
+from safevar_sumo.records import FloatArray
+
+MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
+INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
+REFERENCE_COORDINATE = 1.1
+"""Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
+CURVE_POINTS = 50
+"""Maximum number of points of a run's convergence."""
+
+
+def nondominated_points(points: FloatArray) -> FloatArray:
+    """The distinct non-dominated points for minimisation, with shape (points, objectives)."""
+    return np.asarray(moocore.filter_dominated(points))
+
+
+def hypervolume(front: FloatArray) -> float:
+    """The volume between `front` and the reference point."""
+    return float(moocore.hypervolume(front, ref=np.full(front.shape[1], REFERENCE_COORDINATE)))
+
+
+def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
+    """Points on the scale from the best (0) to the worst value (1) of each objective in a reference front.
+
+    Where the best value is also the worst, an objective keeps its unit.
+    """
+    ideal, nadir = reference.min(axis=0), reference.max(axis=0)
+    return np.asarray((points - ideal) / np.where(nadir > ideal, nadir - ideal, 1.0))
+
+
+def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives' values, smaller being better, shape (rows, objectives); NaN where undefined."""
+    signs = [objective.sign for objective in case.scoring.objectives]
+    return frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs
+
+
+def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The `minimised_values` of those rows in which all objectives are defined."""
+    points = minimised_values(case, frame)
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def reference_front(case: Case) -> FloatArray:
+    """The non-dominated union of the results of all runs of all algorithms.
+
+    Raises
+    ------
+    UnanswerableError
+        If there is no solution.
+    """
+    points = points_of(case, case.solutions)
+    if not len(points):
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+    return nondominated_points(points)
+
+
+def compute_indicators(case: Case) -> pd.DataFrame:
+    """IGD, IGD+ and hypervolume of every finished run that has solutions; index algorithm and run, a column for each
+    indicator.
+
+    IGD is the mean Euclidean distance from each point of the reference front to the run's nearest point; IGD+ counts
+    only the objectives in which this point is worse.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs or no solutions.
+    """
+    reference = reference_front(case)
+    scaled_reference, rows = normalised(reference, reference), {}
+    for run, group in _frames_of_runs(case, case.solutions):
+        if len(points := points_of(case, group)):
+            scaled = normalised(points, reference)
+            distances = moocore.igd(points, ref=reference), moocore.igd_plus(scaled, ref=scaled_reference)
+            rows[run] = *map(float, distances), hypervolume(scaled)
+    index = pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"])
+    return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
+
+
+def _frames_of_runs(case: Case, frame: pd.DataFrame) -> Iterator[tuple[tuple[str, int], pd.DataFrame]]:
+    """The finished runs that have rows, each with its rows, in the study's order of algorithms."""
+    groups = dict(list(frame.groupby(["algorithm", "run"])))
+    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    yield from ((run, groups[run]) for run in runs if run in groups)
+
+
+def count_evaluations(case: Case) -> pd.DataFrame:
+    """The evaluations of every finished run; columns setting, algorithm, run, requested, simulated, budget.
+
+    Equal settings are simulated once, so `simulated` counts different settings. A run has requested its whole budget if
+    a new setting is in its last generation; else it ended with its last new setting.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs.
+    """
+    search, rows = case.study.search, []
+    for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+        last = int(group["evaluation"].max()) + 1
+        requested = search.evaluations if last > search.evaluations - search.population else last
+        rows.append((case.name, algorithm, run, requested, len(group), search.evaluations))
+    if not rows:
+        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
+    return pd.DataFrame(rows, columns=["setting", "algorithm", "run", "requested", "simulated", "budget"])
+
+
+def compute_convergence(case: Case) -> pd.DataFrame:
+    """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations,
+    hypervolume.
+
+    The numbers end with the longest run of the algorithm; a shorter one keeps its last hypervolume. The hypervolume is
+    0 as long as no setting dominates the reference point.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs or no solutions.
+    """
+    reference, search, frames = reference_front(case), case.study.search, []
+    counts = np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
+    ends = count_evaluations(case).groupby("algorithm")["requested"].max()
+    for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+        points = normalised(minimised_values(case, group), reference)
+        is_defined, numbers = np.isfinite(points).all(axis=1), group["evaluation"].to_numpy()
+        counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
+        front, volumes = points[:0], []
+        for start, end in pairwise([0, *counts_of_run]):
+            new_points = points[is_defined & (start <= numbers) & (numbers < end)]
+            front = nondominated_points(np.concatenate([front, new_points]))
+            volumes.append(hypervolume(front))
+        columns = {"algorithm": algorithm, "run": run, "evaluations": counts_of_run, "hypervolume": volumes}
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)

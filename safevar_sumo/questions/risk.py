@@ -1,0 +1,188 @@
+"""How likely is an unsafe vehicle when vehicles vary as a study specifies, and which characteristic decides?
+
+Plain Monte Carlo with the exact interval of Clopper and Pearson. What decides: Sobol indices, first order and total
+(Saltelli's design); where characteristics are correlated or constrained, for which Sobol's design does not exist, the
+first-order index from the drawn vehicles themselves (Plischke, Borgonovo, Smith 2013, European Journal of Operational
+Research 226, 536-550).
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.ask import Count, Criterion, Share, question
+from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.variation import VariationModel
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.study.characteristics import Uniform
+from safevar_sumo.terminal import constraints_in_words
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
+
+BASE_POINTS = 512
+"""Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
+RESAMPLES = 200
+"""Number of bootstrap samples for the intervals of indices."""
+MIN_OUTCOMES = 100
+"""Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
+VEHICLES_PER_CALL = 50_000
+"""Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
+OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
+"""What varies, by the beginning of the names of its columns."""
+
+
+@question
+def risk(
+    subject: Study | Case,
+    evaluator: Evaluator,
+    *,
+    samples: Count = 10_000,
+    confidence: Share = 0.95,
+    unsafe: Criterion = None,
+) -> Answer:
+    """Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which characteristics
+    decide it.
+
+    Parameters
+    ----------
+    samples
+        Number of vehicles, drawn as [variation] says, without it uniformly over the domain.
+    confidence
+        Confidence of the intervals.
+    unsafe
+        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    """
+    study, model = evaluator.study, VariationModel(evaluator.study)
+    criterion = evaluator.choose_criterion(unsafe, subject)
+    rng, batches = np.random.default_rng(study.search.seed), list[Evaluations]()
+    for start in range(0, samples, VEHICLES_PER_CALL):
+        vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng, study.source)
+        batches.append(evaluator.evaluate(vehicles, "sampling vehicles"))
+    drawn = Evaluations.concatenate(batches)
+    simulated = drawn.take(np.flatnonzero(drawn.valid))
+    failures, total = int(criterion.of(simulated).sum()), len(simulated)
+    if not total:
+        raise SimulationError(f"study {study.name!r}: none of {samples} vehicles could be simulated")
+    low, high = clopper_pearson(failures, total, confidence)
+    if model.is_correlated or model.region:
+        table = given_data_indices(evaluator, simulated, criterion, confidence)
+    else:
+        table = sobol_indices(evaluator, model, criterion, confidence)
+    numbers = {
+        "unsafe": str(criterion),
+        "samples": total,
+        "failures": failures,
+        "probability": failures / total,
+        "interval": [low, high],
+        "confidence": confidence,
+    }
+    verdict = (
+        f"{_probability_in_words(study, failures / total)} ({criterion.description}; from {100 * low:.3g} to "
+        f"{100 * high:.3g} % with {100 * confidence:g} % confidence, {failures:,} of {total:,} vehicles)."
+    )
+    if total < samples:
+        verdict += f" {samples - total:,} vehicles could not be simulated and are left out."
+    if len(table):
+        verdict += f" {table.iloc[0]['characteristic']} decides most of the safety degree's variance."
+    verdict = " ".join([verdict, *constraints_in_words(study)])
+    return Answer(question="risk", study=study, verdict=verdict, numbers=numbers, tables={"sensitivity": table})
+
+
+def _probability_in_words(study: Study, probability: float) -> str:
+    """The probability, and how vehicles vary."""
+    if not study.variation:
+        return f"{100 * probability:.3g} % of the domain is unsafe, no probability in the field without [variation]"
+    variation = [
+        f"{name} {distribution.__struct_config__.tag}"
+        for name, distribution in study.variation.items()
+        if distribution != Uniform()
+    ]
+    rest = ["the others uniform"] if len(variation) < len(study.vehicle.characteristics) else []
+    manner = join_phrases(variation + rest)
+    return f"The probability of an unsafe vehicle is {100 * probability:.3g} % if vehicles vary as specified, {manner}"
+
+
+def sobol_indices(evaluator: Evaluator, model: VariationModel, criterion: Unsafe, confidence: float) -> pd.DataFrame:
+    """Sobol indices, first order and total, of independent characteristics; undefined where nothing varies, or too few
+    settings are unsafe or safe. Base points with a setting that could not be simulated do not count.
+    """
+    from SALib.analyze import sobol as analysis
+    from SALib.sample import sobol as design
+
+    names, seed = list(evaluator.characteristics.names), evaluator.study.search.seed % 2**32
+    problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
+    points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
+    evaluations = evaluator.evaluate(model.settings(points), "sensitivity analysis")
+    is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
+
+    def indices_of(output: FloatArray) -> Any:
+        options = {"calc_second_order": False, "num_resamples": RESAMPLES, "conf_level": confidence, "seed": seed}
+        return analysis.analyze(problem, output[is_complete], **options)
+
+    outputs = _outputs(evaluations, criterion, is_complete)
+    found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
+    return _table(names, found, {"first": ("S1", "first order"), "total": ("ST", "total, with all others")})
+
+
+def given_data_indices(evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float) -> pd.DataFrame:
+    """The first-order index of correlated or constrained characteristics, from the vehicles as they were drawn: the
+    share of the variance that knowing a characteristic removes, with what is correlated with it.
+    """
+    from SALib.analyze import delta as analysis
+
+    varies = np.ptp(drawn.settings, axis=0) > 0
+    names = [name for name, it_varies in zip(evaluator.characteristics.names, varies, strict=True) if it_varies]
+    problem = {"num_vars": len(names), "names": [str(number) for number in range(len(names))]}  # SALib reserves endings
+    options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
+
+    def indices_of(output: FloatArray) -> Any:
+        with warnings.catch_warnings(), patch.object(warnings, "formatwarning"):  # SALib sets both for the process
+            seed = evaluator.study.search.seed % 2**32
+            return analysis.analyze(problem, drawn.settings[:, varies], output, seed=seed, **options)
+
+    outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
+    found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
+    return _table(names, found, {"first": ("S1", "first order, with what is correlated with it")})
+
+
+def _outputs(evaluations: Evaluations, criterion: Unsafe, counts: BoolArray) -> dict[str, FloatArray | None]:
+    """The outputs by name; None where there are no indices."""
+    is_unsafe = criterion.of(evaluations)
+    failures = int(is_unsafe[counts].sum())
+    is_defined = counts.any() and np.ptp(evaluations.f_safe[counts]) > 0
+    has_outcomes = MIN_OUTCOMES <= failures <= counts.sum() - MIN_OUTCOMES
+    return {
+        "degree": evaluations.f_safe if is_defined else None,
+        "unsafe": is_unsafe.astype(float) if has_outcomes else None,
+    }
+
+
+def _table(names: list[str], found: dict[str, Any], indices: dict[str, tuple[str, str]]) -> pd.DataFrame:
+    """A row for each characteristic, the one that decides most of the safety degree first; `indices` maps an index to
+    SALib's key and its meaning.
+    """
+    columns, values = {"characteristic": Column("", "characteristic of the vehicle")}, dict[str, Any]()
+    for output, of_what in OUTPUTS.items():
+        for index, (key, meaning) in (indices | {"total": indices.get("total", ("", "undefined here"))}).items():
+            name = f"{output}_{index}"
+            value = np.full(len(names), np.nan)
+            half = value
+            if output in found and key in found[output]:
+                value, half = (np.asarray(found[output][key + end], dtype=float) for end in ("", "_conf"))
+            values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
+            columns |= with_interval(name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f"))
+    frame = pd.DataFrame({"characteristic": names, **values})
+    last = "degree_total" if "total" in indices else "degree_first"
+    frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
+    return tabulate("What decides", columns, frame)

@@ -1,0 +1,206 @@
+"""In which regions of the domain do failures lie, in physical units?
+
+A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose
+score in cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings
+become rules. A rule then loses the conditions that do not make it denser. Other vehicles test the rules.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.ask import Count, Criterion, question
+from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.terminal import constraints_in_words
+from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
+
+MIN_SETTINGS = 10
+"""Minimum number of unsafe settings, and of safe settings, that rules need."""
+FOLDS = 5
+"""Number of folds of the cross-validation."""
+MAX_DEPTH = 6
+"""Maximum depth of the tree."""
+MAX_PRUNINGS = 24
+"""Maximum number of prunings compared."""
+MIN_ADDED_SHARE = 0.01
+"""Share of the unsafe settings that a rule must cover in addition to the rules before it."""
+LIMIT_DIGITS = 3
+"""Limits are rounded to this many digits of the domain's width."""
+UNLIMITED = np.array([[-np.inf], [np.inf]])
+"""Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in row 1."""
+COLUMNS = {
+    "rule": Column("", "limits of the characteristics; all others anywhere in their domains"),
+    **with_interval("density", Column("-", "unsafe share of the vehicles within the rule", ".2f")),
+    **with_interval("coverage", Column("-", "share of all unsafe vehicles that lie within the rule", ".2f")),
+}
+
+
+@question
+def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_384, unsafe: Criterion = None) -> Answer:
+    """Find rules, in physical units, that say where in the domain a study is unsafe.
+
+    In a rule all characteristics vary together over the whole domain; how far one may go while all others stay as in
+    the original says `tolerance`.
+
+    Parameters
+    ----------
+    samples
+        Number of vehicles drawn evenly over the domain; one half yields the rules, the other half tests them.
+    unsafe
+        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    """
+    study, characteristics = evaluator.study, evaluator.characteristics
+    criterion = evaluator.choose_criterion(unsafe, subject)
+    evaluations = evaluator.evaluate(evaluator.random_settings(samples), "settings over the whole domain")
+    rows = np.arange(len(evaluations))
+    training, testing = (evaluations.take(half[evaluations.valid[half]]) for half in np.split(rows, [len(rows) // 2]))
+    is_unsafe, is_unsafe_in_test = criterion.of(training), criterion.of(testing)
+    total, failures = len(training) + len(testing), int(is_unsafe.sum() + is_unsafe_in_test.sum())
+    if not total:
+        raise SimulationError(f"study {study.name!r}: none of {len(rows)} vehicles could be simulated")
+    boxes, remark = list[FloatArray](), ""
+    if is_unsafe.all() and len(training):
+        boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]
+    elif min(is_unsafe.sum(), (~is_unsafe).sum()) < MIN_SETTINGS:
+        remark = f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N draws more)."
+    else:
+        boxes = _find_boxes(training.settings, is_unsafe, characteristics)
+    cells: list[tuple[Any, ...]] = [
+        (conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes
+    ]
+    table = tabulate("Where failures lie", COLUMNS, sorted(cells, key=lambda row: -row[4]))
+    low, high = clopper_pearson(failures, total)
+    verdict = (
+        f"{100 * failures / total:.2f} % of {total:,} vehicles over the whole domain are unsafe "
+        f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
+    )
+    for row in table[table["density_low"] > failures / total].head(1).to_dict("records"):
+        density, coverage = (f"{100 * row[name]:.0f} %" for name in ("density", "coverage"))
+        verdict += f" {coverage} of them have {row['rule']}; of all vehicles like that {density} are unsafe."
+    numbers = {
+        "unsafe": str(criterion),
+        "samples": total,
+        "failures": failures,
+        "share": failures / total,
+        "interval": [low, high],
+    }
+    verdict = " ".join([verdict, *constraints_in_words(study)])
+    return Answer(question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table})
+
+
+def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
+    """The limits of a box in words, such as `mass above 2500 kg`; `everywhere` without any."""
+    texts = []
+    for item, low, high in zip(characteristics, *box.tolist(), strict=True):
+        if low > -np.inf and high < np.inf:
+            texts.append(f"{item.name} from {low:g} to {high:g}{item.suffix}")
+        elif low > -np.inf:
+            texts.append(f"{item.name} above {low:g}{item.suffix}")
+        elif high < np.inf:
+            texts.append(f"{item.name} below {high:g}{item.suffix}")
+    return join_phrases(texts) if texts else "everywhere"
+
+
+def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[float]:
+    """The unsafe share within a box, and the share of the unsafe settings within it, each with its interval."""
+    is_inside = is_within(box, settings)
+    count, values = int(np.count_nonzero(is_inside & is_unsafe)), list[float]()
+    for total in (int(is_inside.sum()), int(is_unsafe.sum())):
+        values += [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
+    return values
+
+
+def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[FloatArray]:
+    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to those before it is
+    dropped.
+    """
+    lower, width = characteristics.lower, characteristics.upper - characteristics.lower
+    tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
+    leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
+    dense_boxes = [box for box, density in leaves if density > 0.5]
+    if not dense_boxes:
+        densest, _ = max(leaves, key=lambda leaf: leaf[1])
+        dense_boxes = [densest]
+    digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
+    rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
+    boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
+    chosen, is_uncovered = list[FloatArray](), is_unsafe.copy()
+    for box in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
+        is_inside = is_within(box, settings)
+        if not chosen or np.count_nonzero(is_uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
+            chosen.append(box)
+            is_uncovered &= ~is_inside
+    return chosen
+
+
+def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
+    """The smallest tree whose cross-validated Brier score is within a standard error of the best score."""
+    from sklearn.model_selection import GridSearchCV, StratifiedKFold  # takes a second to load
+    from sklearn.tree import DecisionTreeClassifier
+
+    def smallest_good_enough(results: Any) -> int:
+        """The index of the strongest pruning whose score is within a standard error of the best."""
+        means = results["mean_test_score"]
+        best = np.argmax(means)
+        least = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
+        return int(np.flatnonzero(means >= least)[-1])
+
+    tree = DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0)
+    strengths = np.unique(np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))
+    strengths = strengths[:-1]  # the strongest pruning leaves no condition
+    evenly_spaced = np.unique(np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int))
+    prunings = {"ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)}
+    folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
+    search = GridSearchCV(tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough)
+    return search.fit(inputs, is_unsafe).best_estimator_
+
+
+def _boxes_of_leaves(
+    tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
+) -> Iterator[tuple[FloatArray, float]]:
+    """The boxes of a tree's leaves below a node, whose own box is `box`, each with its share of unsafe settings."""
+    if tree.children_left[node] < 0:  # a leaf
+        counts = tree.value[node][0]
+        yield box, float(counts[-1] / counts.sum())
+        return
+    column = int(tree.feature[node])
+    # The threshold is the lower end of the right child, and the upper end of the left one.
+    for end, children in enumerate((tree.children_right, tree.children_left)):
+        part = box.copy()
+        part[end, column] = lower[column] + tree.threshold[node] * width[column]
+        yield from _boxes_of_leaves(tree, int(children[node]), part, lower, width)
+
+
+def _drop_useless_conditions(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> FloatArray:
+    """Drop conditions while the lower bound of the density does not fall."""
+
+    def least_density(box: FloatArray) -> float:
+        is_inside = is_within(box, settings)
+        count = int(np.count_nonzero(is_inside))
+        return clopper_pearson(int(np.count_nonzero(is_unsafe & is_inside)), count)[0] if count else 0.0
+
+    while np.isfinite(box).any():
+        columns = np.flatnonzero(np.isfinite(box).any(axis=0))
+        wider = [np.where(np.arange(box.shape[1]) == column, UNLIMITED, box) for column in columns]
+        best = max(wider, key=least_density)
+        if least_density(best) < least_density(box):
+            break
+        box = best
+    return box
+
+
+def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
+    """Whether each of M settings lies within a box; shape (M,)."""
+    return np.asarray(((settings >= box[0]) & (settings <= box[1])).all(axis=1))

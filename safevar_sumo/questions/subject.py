@@ -1,0 +1,277 @@
+"""Subjects of questions: a study, or results read from their directory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
+from safevar_sumo.output import whole_file
+from safevar_sumo.questions.options import Options
+from safevar_sumo.records import JsonObject
+from safevar_sumo.results import MANIFEST, differences, manifest_of, read_manifest
+from safevar_sumo.study import Study, StudyLike, load_study, study_names
+from safevar_sumo.terminal import Progress, open_progress
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from safevar_sumo.campaign.pool import Pool
+    from safevar_sumo.questions.case import Case
+
+Answer = TypeVar("Answer")
+MAX_CHANGES_NAMED = 3
+"""Maximum number of changes that an error names."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Contents of a results directory; its runs may be unfinished.
+
+    Attributes
+    ----------
+    directory
+        The directory.
+    case
+        Study, solutions and evaluations, from which the research questions are answered.
+    """
+
+    directory: Path
+    case: Case
+
+    @property
+    def study(self) -> Study:
+        """The study as it was run."""
+        return self.case.study
+
+    @cached_property
+    def original(self) -> JsonObject:
+        """The original vehicle's outcome, metrics and objectives as plain values, None where undefined."""
+        return JsonObject(read_manifest(self.directory)["original"])
+
+    @property
+    def solutions(self) -> pd.DataFrame:
+        """One row per solution of every finished run.
+
+        Columns: algorithm, run (absent from imported results), the characteristics in their table units, f_safe [m or
+        -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), outcome.
+        """
+        return self.case.solutions
+
+    @property
+    def evaluations(self) -> pd.DataFrame:
+        """One row per simulated setting of every run, in the order of the run's requests; same columns as
+        `solutions`.
+        """
+        return self.case.evaluations
+
+    @property
+    def finished(self) -> tuple[tuple[str, int], ...]:
+        """Algorithm and number of every finished run."""
+        return self.case.finished_runs
+
+    def to_parquet(self, path: str | Path, *, evaluations: bool = False) -> None:
+        """Write the solutions, or all evaluations, to a parquet file.
+
+        Raises
+        ------
+        InputError
+            If no engine for parquet is installed, or the file cannot be written.
+        """
+        frame = self.evaluations if evaluations else self.solutions
+        try:
+            with whole_file(Path(path), "to_parquet") as file:
+                frame.to_parquet(file, index=False)
+        except ImportError:
+            raise InputError(
+                "to_parquet", "pyarrow is not installed", "in the checkout: pip install '.[parquet]'"
+            ) from None
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>\n{self.solutions.to_html(max_rows=10, index=False)}"
+
+    def __repr__(self) -> str:
+        return (
+            f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs, {len(self.solutions)} "
+            "solutions>"
+        )
+
+
+def load(directory: str | Path) -> Results:
+    """Read a results directory; its runs may be unfinished.
+
+    Parameters
+    ----------
+    directory
+        The directory.
+
+    Raises
+    ------
+    InputError
+        If the directory holds no results, or a file in it is damaged.
+    """
+    from safevar_sumo.questions.case import load_cases
+
+    return Results(Path(directory), load_cases([directory])[0])
+
+
+def study_or_case(
+    source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False
+) -> Study | Case:
+    """The subject of a question: a study, or the case of results; `source` may be a name or a path.
+
+    With `results_only`, a name or path means a directory, even if a study has the same name.
+
+    Warns
+    -----
+    UserWarning
+        If a directory of results has the name of the study; with `as_it_is_now`, for each input that has changed
+        since the results were computed.
+
+    Raises
+    ------
+    InputError
+        If `source` is no study and no results, if an input of the results has changed, or if `as_it_is_now` is set for
+        a study.
+    """
+    if isinstance(source, str | Path):
+        # `os.path` accepts any text, unlike paths.
+        names = study_names()
+        is_directory, is_study = os.path.isdir(source), str(source) in names
+        if results_only and not is_directory and (is_study or os.path.isfile(source)):
+            raise InputError(
+                source, "is a study and has no solutions", "a directory that the command `study` has written"
+            )
+        if results_only or (is_directory and not is_study):
+            source = load(source)
+        elif is_study and os.path.exists(os.path.join(source, MANIFEST)):
+            warn(f"{source} is the study; the results in the directory of this name are ./{source}")
+        elif not (is_study or os.path.lexists(source)):
+            raise InputError(
+                source,
+                f"is neither a results directory, a study nor a file{did_you_mean(source, names)}",
+                f"a directory that the command `study` has written, {one_of(names)}, or the path of a study file "
+                "(TOML)",
+            )
+    if isinstance(source, Results):
+        for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
+            warn(f"{source.directory}: {change}")
+        return source.case
+    if as_it_is_now:
+        raise InputError(
+            "as_it_is_now", "a study is simulated as it is now anyway", "results, which keep the study that they had"
+        )
+    return load_study(source)
+
+
+def study_in(subject: Study | Case) -> Study:
+    """The study itself, or the study of the results."""
+    return subject if isinstance(subject, Study) else subject.study
+
+
+def reduce_to_point(subject: Study | Case, point: str | None) -> Study | Case:
+    """A study or results at one point of the study's matrix; the subject itself without a point.
+
+    Raises
+    ------
+    InputError
+        If the study has no such point.
+    """
+    from safevar_sumo.sumo.matrix import study_at
+
+    if point is None:
+        return subject
+    return study_at(subject, point, source="point") if isinstance(subject, Study) else at_point(subject, point)
+
+
+def at_point(case: Case, point: str) -> Case:
+    """Results at one point of the study's matrix: their solutions and the original vehicle, simulated again there.
+
+    Raises
+    ------
+    InputError
+        If the study has no such point.
+    """
+    import numpy as np
+
+    from safevar_sumo.sumo.matrix import evaluate, study_at
+    from safevar_sumo.sumo.system import assemble
+
+    study, names = study_at(case.study, point, source="point"), list(case.characteristics.names)
+    system = assemble(study)
+    scoring = system.measuring.scoring
+    settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[names].to_numpy(float)])
+    evaluations = evaluate(system, settings)
+    columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
+    solutions = case.solutions.drop(columns=[name for name in case.original if name not in evaluations.metrics])
+    return replace(
+        case,
+        study=study,
+        scoring=scoring,
+        original={metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics},
+        solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
+    )
+
+
+def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
+    """Changes of the inputs since the results were computed; empty for imported results, which record no inputs.
+
+    Raises
+    ------
+    InputError
+        If an input has changed and `as_it_is_now` is false; the message names the changes.
+    """
+    from safevar_sumo.campaign.identity import identity_of
+    from safevar_sumo.sumo.system import assemble
+
+    manifest, study = read_manifest(directory), case.study
+    if "imported" in manifest:
+        return []
+    present = manifest_of(study, identity_of(study, assemble(study, str(directory))))
+    changes = [text for _, text, matters in differences(manifest, present) if matters]
+    if changes and not as_it_is_now:
+        more = len(changes) - MAX_CHANGES_NAMED
+        named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (f" (and {more} more)" if more > 0 else "")
+        raise InputError(
+            directory / MANIFEST,
+            f"{named}: new simulations would not match these results",
+            "the inputs of that time; or `as_it_is_now=True` to simulate with the present inputs and a warning",
+        )
+    return [f"{difference}; simulated as it is now" for difference in changes]
+
+
+def answer_question(
+    compute: Callable[..., Answer],
+    subject: Study | Case,
+    options: Options,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = True,
+) -> Answer:
+    """Compute the answer to a question about a subject, with an evaluator of its study."""
+    from safevar_sumo.questions.evaluator import open_evaluator
+
+    with (
+        open_progress(progress) as show_progress,
+        open_evaluator(study_in(subject), pool, jobs, show_progress) as evaluator,
+    ):
+        return compute(subject, options, evaluator)
+
+
+def answer_call(compute: Callable[..., Answer], options: type[Options], arguments: JsonObject) -> Answer:
+    """Answer a call of a question's function; `arguments` are its arguments by name, the subject first."""
+    from safevar_sumo.metrics import Unsafe
+
+    source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]
+    subject = study_or_case(source, as_it_is_now=as_it_is_now)
+    subject = reduce_to_point(subject, arguments.get("point"))
+    values = {name: arguments[name] for name in options.definitions()}
+    if values.get("unsafe") is not None:
+        values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
+    common = {name: arguments[name] for name in ("pool", "jobs", "progress")}
+    return answer_question(compute, subject, options(**values), **common)

@@ -1,0 +1,114 @@
+"""Boxes around the original vehicle: settings in them, and the test of a box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import scipy
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
+from safevar_sumo.records import FloatArray
+from safevar_sumo.vehicles.region import REJECTIONS
+
+MAX_UNSAFE_SHARE = 0.003
+"""Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
+MAX_CORNERS = 4096
+"""Largest number of corners of a box that are simulated."""
+
+
+def settings_in_box(
+    evaluator: Evaluator, columns: Sequence[int], lower: FloatArray, upper: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Settings whose `columns` lie between `lower` and `upper`, shape (n,), from points of the unit cube; shape
+    (K, n).
+    """
+    settings = np.tile(evaluator.characteristics.original, (len(points), 1))
+    settings[:, columns] = lower[columns] + points * (upper - lower)[columns]
+    return settings
+
+
+def sobol_and_corners(
+    evaluator: Evaluator, columns: Sequence[int], ends: tuple[FloatArray, FloatArray], number: int, seed: int
+) -> FloatArray:
+    """Settings at Sobol points of a box, and at as many of its corners, where all changes add up."""
+    sobol = sobol_points(number, len(columns), seed)
+    points = np.concatenate([sobol, np.round(sobol)])  # a rounded point is a corner
+    return settings_in_box(evaluator, columns, *ends, points)
+
+
+def corners_of(evaluator: Evaluator, columns: Sequence[int], ends: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Settings at all corners of a box; at `MAX_CORNERS` random ones if it has more."""
+    size, rng = len(columns), np.random.default_rng(evaluator.study.search.seed)
+    numbers = np.arange(2**size) if 2**size <= MAX_CORNERS else rng.integers(2**size, size=MAX_CORNERS)
+    lower, upper = ends
+    settings = np.tile(evaluator.characteristics.original, (len(numbers), 1))
+    bits = numbers[:, np.newaxis] >> np.arange(size) & 1
+    settings[:, columns] = np.where(bits, upper[columns], lower[columns])
+    return settings
+
+
+def random_settings(
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    lower: FloatArray,
+    upper: FloatArray,
+    number: int,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Feasible settings drawn uniformly in a box; fewer than `number` if few are feasible.
+
+    Raises
+    ------
+    InputError
+        If none of the drawn settings is feasible.
+    """
+    settings = evaluator.region.draw_feasible(
+        lambda count: settings_in_box(evaluator, columns, lower, upper, rng.random((count, len(columns)))), number
+    )
+    if not len(settings):
+        raise InputError(
+            evaluator.study.source,
+            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves "
+            f"no box to test: {evaluator.region}",
+            "characteristics that the constraints do not tie to each other",
+        )
+    return settings
+
+
+def sample_box(
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    unsafe: Unsafe,
+    ends: tuple[FloatArray, FloatArray],
+    attempt: int,
+    seed: Sequence[int],
+    stage: str,
+) -> tuple[FloatArray, int, int, float]:
+    """Test a box with random settings.
+
+    Returns the unsafe settings, the number of all settings, the number of those that could not be simulated, and a
+    bound: at most this share of all settings in the box is unsafe or cannot be simulated.
+
+    Notes
+    -----
+    The settings are drawn independently and uniformly, by a random generator that no search uses. Test k, k = 1, 2,
+    ..., may be wrong with probability alpha_k = alpha / 2^k, alpha = 1 - `CONFIDENCE`: its bound is Clopper and
+    Pearson's at confidence 1 - alpha_k. Box k depends on earlier samples alone, so given box k the bound fails with
+    probability at most alpha_k. So the probability that any bound is wrong, and with it the bound of the box that
+    passes, is at most sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `MAX_UNSAFE_SHARE`
+    if all of them are safe.
+    """
+    error_probability = (1 - CONFIDENCE) / 2**attempt
+    count = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
+    settings = random_settings(evaluator, columns, *ends, count, np.random.default_rng(seed))
+    evaluations = evaluator.evaluate(settings, stage)
+    unsafe_settings = settings[unsafe.of(evaluations)]
+    failed = int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
+    number, at_most = len(settings), 1.0
+    if safe := number - len(unsafe_settings) - failed:
+        at_most = float(scipy.stats.beta.ppf(1 - error_probability, number - safe + 1, safe))
+    return unsafe_settings, number, failed, at_most

@@ -1,0 +1,338 @@
+"""The largest box in which characteristics may vary together, with limits that the user specifies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator, Interval
+from safevar_sumo.questions.tolerance.boxes import corners_of, sample_box, sobol_and_corners
+from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Limit
+
+PARTS, ROUNDS = 8, 3
+"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS` parts."""
+WIDENING = 0.04
+"""Share of its domain by which a side of the box is widened in search of something unsafe."""
+MAX_GAP = 0.05
+"""A free side ends at most this share of the domain before something unsafe, or the domain's end; a little more than
+`WIDENING`.
+"""
+SEARCH_POINTS = 256
+"""Number of Sobol points, and of corners, at which a box is searched for something unsafe."""
+SLAB_POINTS = 64
+"""Number of Sobol points, and of corners, at which the room beside a box is searched."""
+MAX_ATTEMPTS = 40
+"""Maximum number of boxes that are searched for something unsafe, and of tests."""
+DEVIATIONS = tuple(0.35 * 0.8**k for k in range(14))
+"""Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
+PROPOSALS = 4096
+"""Number of boxes that a round of the random search proposes."""
+SIMULATED_CORNERS = 64
+"""Approximate number of corners that such a round simulates; each box is simulated at all known corners."""
+LEAST_GAIN = 0.01
+"""Least gain in the logarithm of the volume for which a proposed box is simulated."""
+CAUSES_PER_ROUND = 4
+"""Approximate number of unsafe settings of a search whose causes are sought."""
+ROUNDING = 1e-9
+"""Rounding errors of a setting, as a share of the domain."""
+STAGE = "limits together"
+
+
+class JointLimits(NamedTuple):
+    """The largest box that was found, by relative volume, in which characteristics reach the limits specified for them.
+
+    Attributes
+    ----------
+    box
+        The interval of each characteristic, rounded inwards to the digits that are printed.
+    samples, unsafe, failed
+        Number of settings drawn at random in the box, of the unsafe ones, and of those that could not be simulated.
+    at_most
+        With 95 % confidence, at most this share of all settings in the box is unsafe or cannot be simulated.
+    kept
+        False if no box is safe: settings within the limits are unsafe, all other characteristics as in the original.
+        In the box, the other characteristics then keep their original values.
+    beyond
+        By the name of a characteristic, an unsafe setting whose value of it is just beyond the box; all its other
+        values are in the box.
+    """
+
+    box: Mapping[str, Interval]
+    samples: int
+    unsafe: int
+    failed: int
+    at_most: float
+    kept: bool
+    beyond: Mapping[str, FloatArray]
+
+
+class _BoxSearch:
+    """The search for a box, which is given by its sides: the extents below and above the original, shape (2, n), in the
+    units of the characteristics.
+
+    Attributes
+    ----------
+    width
+        Widths of the domains; 0 for a characteristic that does not vary.
+    domain
+        The extents of the domains.
+    limits
+        The values of the sides that are at limits, NaN for the free ones.
+    is_free
+        Which sides may move; the others are at their limits.
+    longest
+        The longest that each side may be: a free one to the end of its domain, a fixed one to its limit.
+    fixed
+        The box whose free sides are 0.
+    unsafe_settings
+        Settings that no box may hold.
+    corners
+        Corners that were unsafe in some box: for each characteristic -1, the lower end of the box, 0, the original, or
+        1, the upper end.
+    """
+
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        columns: Sequence[int],
+        unsafe: Unsafe,
+        limits: Mapping[str, Limit],
+        unsafe_settings: FloatArray,
+    ) -> None:
+        self.evaluator, self.columns, self.unsafe, self.unsafe_settings = evaluator, columns, unsafe, unsafe_settings
+        members = evaluator.characteristics
+        self.original, is_varied = members.original, np.isin(range(len(members)), columns)
+        self.domain = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
+        self.width, self.limits = self.domain.sum(axis=0), np.full_like(self.domain, np.nan)
+        for name, limit in limits.items():
+            self.limits[:, members.names.index(name)] = limit.at_least, limit.at_most  # None is NaN
+        self.is_free = (self.domain > 0) & np.isnan(self.limits)
+        self.longest = np.where(np.isnan(self.limits), self.domain, np.abs(self.limits - self.original))
+        self.fixed = np.where(self.is_free, 0.0, self.longest)
+        self.corners, self.search_count = list[FloatArray](), 0
+
+    def ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.original - sides[0], self.original + sides[1]
+
+    def printed_ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The ends of a box as they are printed: limits and ends of domains exactly, all others rounded inwards."""
+        members = self.evaluator.characteristics
+        ends = np.array(
+            [
+                [item.rounded(end, upwards=upwards) for item, end in zip(members, ends, strict=True)]
+                for ends, upwards in zip(self.ends(sides), (True, False), strict=True)
+            ]
+        )
+        ends = np.where(sides >= self.domain, np.stack([members.lower, members.upper]), ends)
+        ends = np.where(self.domain > 0, ends, self.original)
+        lower, upper = np.where(np.isnan(self.limits), ends, self.limits)
+        return lower, upper
+
+    def hold(self, boxes: FloatArray, settings: FloatArray) -> BoolArray:
+        """Which of B boxes, shape (B, 2, n), hold which of K settings; shape (B, K)."""
+        change = settings - self.original
+        extents = np.stack([-change, change], axis=1) - ROUNDING * self.width
+        holds = np.zeros((len(boxes), len(settings)), dtype=bool)
+        if len(boxes):  # no box holds what the smallest box around all of them does not hold
+            candidates = np.flatnonzero((extents <= boxes.max(axis=0)).all(axis=(1, 2)))
+            for row, sides in enumerate(boxes):
+                holds[row, candidates] = (extents[candidates] <= sides).all(axis=(1, 2))
+        return holds
+
+    def unsafe_inside(self, sides: FloatArray) -> FloatArray:
+        """The known unsafe settings that a box holds."""
+        inside: FloatArray = self.unsafe_settings[self.hold(sides[np.newaxis], self.unsafe_settings)[0]]
+        return inside
+
+    def find_unsafe(self, settings: FloatArray) -> FloatArray:
+        """Simulate settings and return the unsafe ones; no later box holds one of them."""
+        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, settings[is_unsafe]])
+        return settings[is_unsafe]
+
+    def corner_settings(self, boxes: FloatArray) -> FloatArray:
+        """Settings at the C known corners of B boxes, shape (B, C, n)."""
+        corners, below, above = np.array(self.corners), boxes[:, :1], boxes[:, 1:]
+        return self.original + np.where(corners > 0, above, corners * below)  # a corner of 0 is the original
+
+    def points(self, sides: FloatArray, number: int) -> FloatArray:
+        """New Sobol points and corners of a box."""
+        self.search_count += 1
+        seed = self.evaluator.study.search.seed + self.search_count
+        return sobol_and_corners(self.evaluator, self.columns, self.ends(sides), number, seed)
+
+    def attack(self, sides: FloatArray) -> FloatArray:
+        """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
+        known = self.unsafe_inside(sides)
+        return known if len(known) else self.find_unsafe(self.points(sides, SEARCH_POINTS))
+
+    def learn(self, settings: FloatArray) -> None:
+        """Add corners that are unsafe, from some of these unsafe settings.
+
+        As many changes of a setting as possible are undone while it stays unsafe; the directions of the remaining
+        changes are the corner. Unsafe settings on the way become known, too.
+        """
+        causes = settings[:: max(len(settings) // CAUSES_PER_ROUND, 1)].copy()
+        for column in np.flatnonzero(self.is_free.any(axis=0)):
+            smaller = causes.copy()
+            smaller[:, column] = self.original[column]
+            is_unsafe = self.unsafe.of(self.evaluator.evaluate(smaller, STAGE))
+            self.unsafe_settings = np.concatenate([self.unsafe_settings, smaller[is_unsafe]])
+            causes[is_unsafe] = smaller[is_unsafe]
+        known = {corner.tobytes(): corner for corner in [*self.corners, *np.sign(causes - self.original)]}
+        self.corners = list(known.values())
+
+    def are_safe(self, boxes: FloatArray) -> BoolArray:
+        """Which of B boxes, shape (B, 2, n), are safe at the known corners and hold no known unsafe setting."""
+        is_safe: BoolArray = ~np.any(self.hold(boxes, self.unsafe_settings), axis=1)
+        settings = self.corner_settings(boxes[is_safe])
+        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings.reshape(-1, len(self.original)), STAGE))
+        is_unsafe = is_unsafe.reshape(settings.shape[:2])
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, settings[is_unsafe]])
+        is_safe[is_safe] = ~is_unsafe.any(axis=1)
+        return is_safe
+
+    def largest(self, start: FloatArray) -> FloatArray:
+        """A box within `start` that is safe at the known corners, as large as a random search makes it.
+
+        `start` first shrinks as a whole until it is safe. Larger boxes nearby are then simulated at their corners.
+        """
+        rng = np.random.default_rng((self.evaluator.study.search.seed, 2))
+        low, high = 0.0, 1.0
+        for _ in range(ROUNDS):
+            shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
+            boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * start, start)
+            safe_count = int(np.argmin([*self.are_safe(boxes), False]))  # the smallest ones, before the first unsafe
+            low, high = shares[safe_count], shares[min(safe_count + 1, PARTS)]
+        best = np.where(self.is_free, low * start, start)
+        for deviation in DEVIATIONS:
+            shape = (PROPOSALS, *start.shape)
+            steps = rng.normal(0.0, deviation, shape) * (rng.random(shape) < 0.5)  # about half of the sides move
+            boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
+            boxes = boxes[self._log_volume(boxes) > self._log_volume(best) + LEAST_GAIN]
+            boxes = boxes[~np.any(self.hold(boxes, self.unsafe_settings), axis=1)]
+            boxes = boxes[: max(SIMULATED_CORNERS // len(self.corners), 1)]
+            boxes = boxes[self.are_safe(boxes)]
+            if len(boxes):
+                best = boxes[int(np.argmax(self._log_volume(boxes)))]
+        return best
+
+    def _log_volume(self, boxes: FloatArray) -> FloatArray:
+        """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
+        shares = np.divide(boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0)
+        return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))  # finite for a width of 0, too
+
+    def widened(self, sides: FloatArray) -> FloatArray:
+        """Move each free side of a box outwards in steps, until something unsafe is in the next step or the domain
+        ends.
+        """
+        for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
+            while sides[side, column] < self.longest[side, column]:
+                wider = self.wider(sides, side, column, WIDENING)
+                if len(self.unsafe_inside(wider)) or len(self.attack_end(wider, side, column)):
+                    break
+                sides = wider
+        return sides
+
+    def wider(self, sides: FloatArray, side: int, column: int, share: float) -> FloatArray:
+        """A box with one side moved outwards by a share of the domain, at most to its end."""
+        wider = sides.copy()
+        wider[side, column] = min(sides[side, column] + share * self.width[column], self.domain[side, column])
+        return wider
+
+    def attack_end(self, sides: FloatArray, side: int, column: int) -> FloatArray:
+        """Unsafe settings at the end of one side of a box, all other values in the box."""
+        settings = np.concatenate([self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)])
+        settings[:, column] = self.ends(sides)[side][column]
+        return self.find_unsafe(settings)
+
+    def best(self, start: FloatArray) -> FloatArray:
+        """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be.
+
+        If every search finds something, the box keeps all but the fixed sides at the original.
+        """
+        for _ in range(MAX_ATTEMPTS):
+            sides = self.largest(start)
+            unsafe_inside = self.attack(sides)
+            if not len(unsafe_inside):
+                sides = self.widened(sides)
+                unsafe_inside = self.attack(sides)
+            if not len(unsafe_inside):
+                return sides
+            self.learn(unsafe_inside)
+        return self.fixed
+
+    def beyond(self, sides: FloatArray) -> dict[str, FloatArray]:
+        """For each characteristic, an unsafe setting in which it alone is beyond a box, by at most `MAX_GAP`."""
+        beyond = dict[str, FloatArray]()
+        for side, column in zip(*np.nonzero(sides < self.domain), strict=True):
+            wider = self.wider(sides, side, column, MAX_GAP)
+            if not self.is_free[side, column]:
+                self.attack_end(wider, side, column)
+            for setting in self.unsafe_inside(wider)[:1]:
+                beyond.setdefault(self.evaluator.characteristics.names[column], setting)
+        return beyond
+
+
+def find_joint_limits(
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    unsafe: Unsafe,
+    limits: Mapping[str, Limit],
+    scans: Sequence[OneAtATimeScan],
+    unsafe_settings: FloatArray,
+) -> JointLimits:
+    """The largest box by relative volume in which `columns` vary, and in which those of `limits` reach their limits.
+
+    The box holds none of `unsafe_settings`, shape (K, n).
+
+    Notes
+    -----
+    A random search seeks the largest box that is safe at known corners, within what is safe alone; at first at that
+    corner alone where every characteristic has gone towards its smaller margin. A search then attacks the box. Causes
+    of what is unsafe, as few changes as possible, are further corners, and the box is sought anew until no search finds
+    anything. Sides that could go further are widened. At last all corners of the box as it is printed, and independent
+    settings, test it (`sample_box`).
+    """
+    unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
+    search = _BoxSearch(unverified, columns, unsafe, limits, unsafe_settings)
+    start, corner = search.longest.copy(), np.zeros(len(search.original))
+    for column, scan in zip(columns, scans, strict=True):
+        original = search.original[column]
+        (low, high), (low_margin, high_margin) = scan.safe or (original, original), scan.margins
+        safe_alone = np.minimum(start[:, column], (original - low, high - original))
+        start[:, column] = np.where(search.is_free[:, column], safe_alone, start[:, column])
+        is_low_end = low_margin is not None and (high_margin is None or low_margin < high_margin)
+        corner[column] = -1.0 if is_low_end else 1.0
+    search.corners.append(corner)
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        kept = not len(search.attack(search.fixed))
+        # The last attempt gives up: it tests the limits alone, with all others as in the original.
+        sides = search.best(start) if kept and attempt < MAX_ATTEMPTS else search.fixed
+        ends, stream = search.printed_ends(sides), (evaluator.study.search.seed, 1, attempt)
+        stage = "test of the limits together"
+        corners = corners_of(evaluator, columns, ends)
+        unsafe_corners = corners[unsafe.of(evaluator.evaluate(corners, stage))]
+        unsafe_samples, count, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
+        unsafe_inside = np.concatenate([unsafe_corners, unsafe_samples])
+        if not kept or not len(unsafe_inside):
+            break
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_inside])
+        search.learn(unsafe_inside[:1])
+    else:
+        kept = False
+    lower, upper = (values.tolist() for values in ends)
+    return JointLimits(
+        box=dict(zip(evaluator.characteristics.names, zip(lower, upper, strict=True), strict=True)),
+        samples=count,
+        unsafe=len(unsafe_samples),
+        failed=failed,
+        at_most=at_most,
+        kept=kept,
+        beyond=search.beyond(sides) if kept else {},
+    )

@@ -1,0 +1,114 @@
+"""Made-up studies for tests: characteristics from 0 to 10 with an original of 5, and a pool whose unsafe region is
+known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from safevar_sumo.campaign import questions
+from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.study import CharacteristicTable, Study, load_study
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool
+from tests.made_up import made_up_evaluations
+
+
+@pytest.fixture(autouse=True)
+def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have no vehicle model whose batches could be measured."""
+    choose = questions.choose_batch_size
+
+    def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
+        return (100, False) if study.name == "made-up" else choose(study, selection)
+
+    monkeypatch.setattr(questions, "choose_batch_size", choose_batch_size)
+
+
+ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
+Region = Callable[[FloatArray], BoolArray]
+
+
+def made_up_study(n: int) -> Study:
+    smoke = load_study("smoke")
+    rows = {
+        name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER)
+        for name in "abcdefghijkl"[:n]
+    }
+    return msgspec.structs.replace(
+        smoke, name="made-up", vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows)
+    )
+
+
+class Plant(InlinePool):
+    """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all others have the safety
+    degree `degree`.
+    """
+
+    def __init__(
+        self,
+        study: Study,
+        region: Region,
+        degree: Callable[[FloatArray], FloatArray] | None = None,
+        failing: Region | None = None,
+    ):
+        super().__init__()
+        self._characteristics, self._region = CharacteristicSet.of(study), region
+        self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
+        self._failing = failing or nowhere
+        self.seen: set[bytes] = set()
+
+    def compute(self, function: Callable[..., Any], task: Task, *arguments: Any) -> Any:
+        return self.evaluate(*arguments) if function is evaluate_settings else ""
+
+    def evaluate(self, settings: FloatArray) -> Evaluations:
+        collides = np.asarray(self._region(settings), dtype=bool)
+        fails = self._failing(settings)
+        collides &= ~fails
+        degree = np.where(fails, np.nan, np.where(collides, -1.0, self._degree(settings)))
+        self.seen |= {row.tobytes() for row in settings}
+        return made_up_evaluations(
+            degree,
+            settings=settings,
+            outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
+            collision_speed=np.where(collides, 1.0, np.nan),
+            metrics={**dict.fromkeys(METRICS, np.full(len(settings), np.nan)), "safety_degree": degree},
+            f_diff=self._characteristics.largest_change(settings),
+            f_num_diff=self._characteristics.number_changed(settings),
+        )
+
+
+def made_up_evaluator(n: int, region: Region) -> Evaluator:
+    study = made_up_study(n)
+    return Evaluator(study, Plant(study, region))
+
+
+def nowhere(settings: FloatArray) -> BoolArray:
+    return np.zeros(len(settings), dtype=bool)
+
+
+def everywhere(settings: FloatArray) -> BoolArray:
+    return np.ones(len(settings), dtype=bool)
+
+
+def box(settings: FloatArray) -> BoolArray:
+    """a above 7 and b below 3: 9 % of two domains."""
+    return np.asarray((settings[:, 0] > 7) & (settings[:, 1] < 3))
+
+
+def two_islands(settings: FloatArray) -> BoolArray:
+    """a from 6.5 to 7, and a above 9: 15 % of its domain."""
+    return np.asarray(((settings[:, 0] > 6.5) & (settings[:, 0] < 7)) | (settings[:, 0] > 9))
+
+
+def diagonal_band(settings: FloatArray) -> BoolArray:
+    """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
+    return np.asarray((settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8))

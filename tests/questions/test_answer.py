@@ -1,0 +1,222 @@
+"""An answer in every format, a question from outside the package, and one set of options, from which flags, Python
+functions, the report's calls and printed commands follow.
+"""
+
+from __future__ import annotations
+
+import inspect
+import io
+import json
+import re
+import shlex
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+import safevar_sumo as sv
+from safevar_sumo.cli.program import COMMANDS, commands
+from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
+from safevar_sumo.questions.explain import ExplainOptions
+from safevar_sumo.questions.options import Options
+from safevar_sumo.questions.tolerance import ToleranceOptions
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool, refused, run
+
+COLUMNS = {
+    "part": Column("", "part of the vehicle"),
+    **with_interval("length", Column("m", "its length", ".2f")),
+    "age": Column("s", "its age"),
+    "changes": Column("", "what is changed"),
+}
+ROWS = [("a < b & 1 %", 1.234, 1.0, np.inf, np.nan, {"mass": 2600.0}), ("c_d", np.nan, np.nan, np.nan, np.nan, {})]
+ANSWER = Answer(
+    question="parts",
+    study=load_study("smoke"),
+    verdict="Two parts <are> old.",
+    numbers={"probability": np.float64(0.25), "interval": (0.1, np.nan), "driven": True},
+    tables={"parts": tabulate("Parts & ages", COLUMNS, ROWS)},
+)
+QUESTION = '''
+from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate
+from safevar_sumo.questions.ask import Count, question
+
+
+@question
+def spread(subject, evaluator, *, samples: Count = 100) -> Answer:
+    """Say how far safety degrees lie apart.
+
+    Parameters
+    ----------
+    samples
+        Number of vehicles drawn evenly over the domain.
+    """
+    degrees = evaluator.evaluate(evaluator.random_settings(samples), "vehicles").f_safe
+    table = tabulate("Quartiles", {"degree": Column("m", "safety degree")}, [(float(degrees.min()),)])
+    numbers = {"spread": float(degrees.max() - degrees.min())}
+    tables = {"quartiles": table}
+    return Answer(question="spread", study=evaluator.study, verdict="Far.", numbers=numbers, tables=tables)
+'''
+
+
+def test_json_names_units_and_meanings_and_has_no_value_where_none_is_defined() -> None:
+    answer = json.loads(ANSWER.render("json"))
+    assert list(answer) == ["question", "study", "verdict", "numbers", "tables"]
+    assert answer["numbers"] == {"probability": 0.25, "interval": [0.1, None], "driven": True}
+    table = answer["tables"]["parts"]
+    assert table["columns"]["length_low"] == {"unit": "m", "meaning": "lower end of length"}
+    assert table["rows"][0] == {
+        "part": "a < b & 1 %",
+        "length": 1.234,
+        "length_low": 1.0,
+        "length_high": None,
+        "age": None,
+        "changes": {"mass": 2600.0},
+    }
+
+
+def test_readers_see_units_and_intervals_and_no_column_without_values() -> None:
+    text = ANSWER.render("text")
+    assert "length [m]" in text
+    assert "1.23 (1.00 to -)" in text
+    assert "mass 2600" in text
+    assert "age" not in text.replace("ages", "")
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
+    frame = tabulate("Many", {"number": Column("", "it")}, [(number,) for number in range(MAX_ROWS + 1)])
+    long = replace(ANSWER, tables={**ANSWER.tables, "many": frame})
+    for form in ("text", "html"):
+        assert f"--format csv --table NAME: many ({MAX_ROWS + 1} rows)" in long.render(form)
+        assert "Many" not in long.render(form)
+    assert len(long.render("csv", "many").splitlines()) == MAX_ROWS + 2
+    assert "--table" not in ANSWER.render("text") + ANSWER.render("html")
+
+
+def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
+    page, latex = ANSWER.render("html"), ANSWER.render("latex")
+    assert "<p>Two parts &lt;are&gt; old.</p>" in page
+    assert '<td class="label">a &lt; b &amp; 1 %</td>' in page
+    assert page == ANSWER._repr_html_()
+    assert r"a < b \& 1 \%" in latex
+    assert r"c\_d" in latex
+    assert r"\caption{Parts \& ages}" in latex
+    text = ANSWER.render("csv", "parts")
+    assert pd.read_csv(io.StringIO(text))["length"][0] == 1.234
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [("probability", [0.25]), ("interval.0", [0.1]), ("interval.1", [np.nan]), ("parts.length", [1.234, None])],
+)
+def test_a_key_names_numbers(key: str, values: list[Any]) -> None:
+    assert ANSWER.values(key) == pytest.approx(values, nan_ok=True)
+
+
+def test_an_unknown_key_is_refused_with_the_nearest() -> None:
+    with pytest.raises(sv.InputError, match="did you mean 'probability'"):
+        ANSWER.values("probabilty")
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_help_and_call_have_the_same_sentence_and_options(name: str) -> None:
+    ask = find_question(name)
+    assert getattr(sv, name) is ask
+    first, _, _ = (ask.__doc__ or "").partition("\n\n")
+    assert COMMANDS[name][1] == " ".join(first.split())
+    text = CliRunner().invoke(commands, [name, "--help"]).output
+    for option in ask.options:
+        assert option.meaning
+        assert f"--{option.name.replace('_', '-')}" in text
+
+
+def test_a_question_from_outside_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_questions.py").write_text(QUESTION)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    name = "my_questions:spread"
+    assert isinstance(find_question(name), Question)
+    result = CliRunner().invoke(commands, [name, "smoke", "--samples", "8", "--jobs", "1", "--fail-if", "spread > 0"])
+    assert result.exit_code == 3, result.output
+    assert "Far." in result.output
+    assert re.search(r"failed: spread = [0-9.]+ > 0", result.output)
+    refused = CliRunner().invoke(commands, [name, "smoke", "--samples", "0"])
+    assert "a whole number from 1 to 100,000,000" in str(refused.exception)
+
+
+@pytest.mark.parametrize("options", [ExplainOptions, ToleranceOptions])
+def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
+    function = getattr(sv, options.question)
+    arguments = inspect.signature(function).parameters
+    record = {one.name: one.default for one in fields(options)}
+    assert {name: one.default for name, one in list(arguments.items())[1:]} == {
+        **record,
+        "pool": None,
+        "jobs": None,
+        "progress": False,
+        "as_it_is_now": False,
+        "point": None,
+    }
+    heads = re.findall(r"^(\w+)\n    \w", inspect.getdoc(function) or "", re.MULTILINE)
+    assert sorted(heads) == sorted([*arguments, "InputError", "SimulationError"])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ExplainOptions(),
+        ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
+        ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), margin=0.5),
+    ],
+)
+def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
+    """The command, parsed by its own flags, makes the record that printed it."""
+    typed = shlex.split(options.command_line("its results", "CPNA, night"))
+    assert typed[:5] == ["python", "-m", "safevar_sumo", options.question, "its results"]
+    command: Any = commands.get_command(None, options.question)  # type: ignore[arg-type]
+    given = command.make_context(options.question, typed[4:]).params
+    assert given["point"] == "CPNA, night"
+    assert type(options)(**{name: given[name] for name in options.definitions()}) == options
+    assert len(typed) == 7 + sum(
+        len(value) * 2 if name == "solutions" else 1 if value is True else 2
+        for name, value in vars(options).items()
+        if value != getattr(type(options), name)
+    )
+
+
+@pytest.mark.slow
+def test_a_question_takes_the_point_that_its_command_takes() -> None:
+    point = "CPFA, speed 40, wet"
+    typed = ["rules", "wear", "--samples", "64", "--point", point, "--json"]
+    answer = sv.rules("wear", samples=64, point=point, pool=InlinePool()).to_dict()
+    assert json.dumps(answer, indent=2) == run(*typed).stdout.strip()
+    refused("rules", "wear", "--point", "CPFB", message=("--point: 'CPFB'", "expected: one of 26 points"))
+    with pytest.raises(sv.InputError, match="point: 'CPFB'"):
+        sv.rules("wear", point="CPFB")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
+    for question, *flags in (
+        ("explain", "--limit", "1000", "--top", "1", "--fits", "0"),
+        ("tolerance", "--characteristics", "mass,tireFric", "--margin", "0.5", "--fits", "0"),
+        ("risk", "--samples", "300"),
+        ("compare", str(slippery), "--samples", "100"),
+    ):
+        one, two = (run(question, str(slippery), *flags, "--json", "--jobs", jobs).stdout for jobs in ("1", "2"))
+        assert one == two
+
+
+def test_limits_are_rounded_to_the_safe_side() -> None:
+    one = CharacteristicSet.of(load_study("wear")).members[0]
+    assert one.rounded(2.3178, upwards=True) == 2.32
+    assert one.rounded(2.3278, upwards=False) == 2.32
+    assert one.rounded(7.999, upwards=True) == 8
+    assert replace(one, original=7.9992).rounded(7.999, upwards=True) == 7.9992, "not beyond the original"

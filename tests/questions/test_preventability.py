@@ -1,0 +1,287 @@
+"""Who avoids a failure, and whether it is robust: by neighbours, by reference drivers, at the points of a matrix; and
+when a vehicle begins to brake.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+import scipy
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.braking import brake_onset
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain.causes import (
+    STEP_FACTORS,
+    Robustness,
+    estimate_robustness,
+    find_smallest_robust_failure,
+)
+from safevar_sumo.questions.explain.compute import PointComparison, compare_at_points
+from safevar_sumo.questions.preventability import (
+    DRIVERS,
+    Preventability,
+    assess_preventability,
+    avoided_by,
+    judge_collisions,
+)
+from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.study import ModelTable, load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import InlinePool
+from tests.made_up import made_up_runs, original_of
+from tests.questions.conftest import box, made_up_evaluator
+
+COLLISION = Unsafe()
+
+
+def test_robust_is_what_its_neighbours_are_too() -> None:
+    evaluator = made_up_evaluator(2, box)
+    threshold = evaluator.characteristics.threshold[0]
+    deep, edge = estimate_robustness(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
+    assert deep.shares_by_step == {0.1: 1.0, 0.05: 1.0, 0.2: 1.0}
+    assert edge.share == pytest.approx(0.5, abs=0.2)
+    assert (deep.borderline, edge.borderline) == (False, True)
+    (beyond,) = estimate_robustness(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
+    assert beyond.share == 1.0
+
+
+@pytest.mark.parametrize(
+    ("shares", "row"),
+    [
+        ([(0.5, 1.0, 1.0), (0.9, 0.9, 0.9)], 0),
+        ([(0.39, 1.0, 1.0), (0.9, 0.9, 0.9)], 1),
+        ([(0.9, 0.6, 0.8), (0.41, 1.0, 1.0)], 1),
+        ([(0.79, 0.79, 0.79), (1.0, 1.0, 0.3)], None),
+    ],
+)
+def test_a_failure_is_robust_by_the_mean_of_all_time_steps(
+    shares: list[tuple[float, ...]], row: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the study's own time step says, if the other steps can make up for it."""
+    evaluator = made_up_evaluator(2, box)
+
+    def estimates(_: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe) -> list[Robustness]:
+        of_settings = [shares[int(setting[0]) - 8] for setting in settings]
+        steps = [step * factor for factor in STEP_FACTORS]
+        return [Robustness(dict(zip(steps, of_setting, strict=True))) for of_setting in of_settings]
+
+    monkeypatch.setattr("safevar_sumo.questions.explain.causes.estimate_robustness", estimates)
+    failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")
+    assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=100) == row
+
+
+STUDY = load_study("euro_ncap_pedestrian")
+BLIND = ModelTable(model="aeb", parameters={"reach": 3.0})
+NAMES = list(STUDY.vehicle.characteristics)
+ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.values()])
+
+
+def evaluator(**parameters: object) -> Evaluator:
+    """A short-sighted driving system in one scenario."""
+    scenario = ModelTable(model="crossing", parameters=parameters)
+    return Evaluator(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool())
+
+
+def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
+    """The original vehicle with these shares of its brakes (and engine drag) and of its maximum speed of the engine."""
+    factors = {"maxBrakeTorque": brakes, "dampRateZeroT_CE": brakes, "max_rpm": max_rpm}
+    return ORIGINAL * [factors.get(name, 1.0) for name in NAMES]
+
+
+def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
+    """The evaluations of settings that collide."""
+    evaluations = here.evaluate(np.concatenate([np.atleast_2d(one) for one in settings]), "collisions")
+    assert evaluations.collided.all()
+    return evaluations
+
+
+def avoiders(here: Evaluator, *settings: FloatArray) -> list[str]:
+    """The weakest driver who avoids each collision."""
+    return list(map(avoided_by, judge_collisions(here, collisions(here, *settings)).to_dict("records")))
+
+
+def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> pd.DataFrame:
+    """Made-up verdicts of all drivers, in their order."""
+    return pd.DataFrame(dict(zip(DRIVERS, drivers, strict=True))).assign(point=points or "")
+
+
+def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> None:
+    seven = verdicts([1.0] * 5 + [0.0] * 2, [1.0] * 5 + [0.0] * 2, [1.0] * 6 + [0.0], *[[1.0] * 3 + [0.0] * 4] * 2)
+    many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
+    for found, number, told in (
+        (
+            seven,
+            7,
+            "7 collisions, a competent driver avoids 71 % (43 % if he needs 0.4 s longer); full braking at the "
+            "first possible moment avoids 86 %.",
+        ),
+        (
+            many,
+            3000,
+            "1000 collisions, drawn at random from 3000, a competent driver avoids nearly all (39 % if he needs "
+            "0.4 s longer); full braking at the first possible moment avoids all.",
+        ),
+    ):
+        assert str(Preventability(verdicts=found, collisions=number)) == f"In the same vehicle, of {told}"
+
+
+def test_who_has_no_verdict_is_counted_with_the_points() -> None:
+    """By the letter he collides in the original vehicle at the point b, where any braking is a danger to the other."""
+    nan = np.nan
+    two = verdicts([1.0, nan], [1.0, 1.0], [1.0, nan], [0.0, nan], [0.0, 0.0], points=["a", "b"])
+    found = Preventability(verdicts=two, collisions=2)
+    both, letter, full = str(found).split(". ")
+    assert both == (
+        "In the same vehicle, of 2 collisions, a competent driver avoids all of the 1 with a verdict (none if he needs "
+        "0.4 s longer); one who reacts to any braking of a leader, not only above 5 m/s^2, avoids all (none if he "
+        "needs 0.4 s longer); full braking at the first possible moment avoids all of the 1 with a verdict"
+    )
+    there = "on 1, at b: there the original vehicle collides with that driver, too"
+    assert letter == f"No verdict of a competent driver {there}"
+    assert full == f"No verdict of full braking at the first possible moment {there}."
+    rows = found.drivers
+    assert [(row["avoided"], row["later"], row["no_verdict"], row["no_verdict_points"]) for row in rows] == [
+        (1, 0, 1, ["b"]),
+        (2, 0, 0, []),
+        (1, None, 1, ["b"]),
+    ]
+    only_any, nobody = verdicts([nan], [1.0], [1.0], [nan], [nan]), verdicts(*[[nan]] * 5)
+    assert avoided_by(only_any.iloc[0].to_dict()).endswith("(no verdict of a competent driver)")
+    assert avoided_by(nobody.iloc[0].to_dict()) == "no verdict"
+    json.dumps(Preventability(verdicts=nobody, collisions=1).to_dict(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
+    found = avoiders(evaluator(test="CPFA", speed=30), vehicle(), vehicle(brakes=0.1))
+    assert found == ["preventable by a competent driver", "physically unavoidable"]
+
+
+@pytest.mark.slow
+def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
+    """He hits it in the original vehicle."""
+    found = avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99))
+    assert found == ["preventable by full braking at the first possible moment (no verdict of a competent driver)"]
+
+
+@pytest.mark.slow
+def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_verdict() -> None:
+    tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
+    study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
+    here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
+    found = assess_preventability(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
+    letter, any_braking, _ = found.drivers
+    assert (letter["no_verdict"], letter["share"], any_braking["share"]) == (2, None, 1.0)
+    (point,) = letter["no_verdict_points"]
+    assert point.startswith("CCRb, speed 50")
+    assert f"No verdict of a competent driver on 2, at {point}: " in str(found)
+
+
+@pytest.mark.slow
+def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
+    """Of 30 collisions, the 20 of the lowest engine speeds are the brakeless ones: those that come first when settings
+    are sorted.
+    """
+    here = evaluator(test="CPFA", speed=30)
+    brakeless = (vehicle(0.1, 1 - (30 - k) / 1e6) for k in range(20))
+    every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10)))
+    whole = assess_preventability(here, Evaluations.concatenate([every, every]))
+    assert (len(whole.verdicts), whole.collisions) == (30, 30)
+    letter = whole.drivers[0]
+    assert (letter["avoided"], letter["later"], letter["no_verdict"]) == (10, 10, 0)
+    assert [letter[name] for name in ("share", "share_low", "share_high", "later_share")] == [pytest.approx(1 / 3)] * 4
+    sample = assess_preventability(here, every, max_simulations=45)
+    assert len(sample.verdicts) == 15
+    reverse = every.take(np.arange(30)[::-1])
+    assert sample.to_dict() == assess_preventability(here, reverse, max_simulations=45).to_dict()
+    letter = sample.drivers[0]
+    hits = letter["avoided"]
+    expected = scipy.stats.beta.ppf(0.025, hits, 16 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 15 - hits)
+    assert (letter["share_low"], letter["share_high"]) == pytest.approx(expected)
+    assert expected[0] < 1 / 3 < expected[1]
+
+
+TESTS = [
+    {"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
+    {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}},
+]
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    return assemble(load_study("euro_ncap_pedestrian", matrix={"tests": TESTS}))
+
+
+@pytest.fixture(scope="module")
+def weak(system: System) -> FloatArray:
+    """Half the brakes."""
+    setting = system.characteristics.original.copy()
+    setting[system.characteristics.names.index("maxBrakeTorque")] /= 2
+    return setting[np.newaxis]
+
+
+@pytest.fixture(scope="module")
+def failure(system: System, weak: FloatArray) -> PointComparison:
+    (one,) = compare_at_points(system, original_of(system), weak, Unsafe())
+    return one
+
+
+def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
+    system: System, weak: FloatArray, failure: PointComparison
+) -> None:
+    endings, unsafe_points = failure
+    at = next(point for point in system.points if endings.startswith(f"At {point.name}: "))
+    assert at.name in unsafe_points
+    original = evaluate(system.at(at), original_of(system)).f_safe[0]
+    assert endings == (
+        f"At {at.name}: the original stops, safety degree {original:.2f} m; this one collides at "
+        f"{-evaluate(system, weak).f_safe[0]:.2f} m/s."
+    )
+
+
+STEP, OBSTACLE = 0.002, 20.0
+Vehicle = tuple[float, float, float, float]
+
+
+def drive_of(*vehicles: Vehicle) -> SimulationRuns:
+    """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an obstacle at 20 m."""
+    time = np.arange(0, 8, STEP)
+    drives = []
+    for v, gap, delay, deceleration in vehicles:
+        begins = (OBSTACLE - gap) / v
+        slows, stands = begins + delay, begins + delay + v / deceleration
+        braking = np.clip(time, slows, stands) - slows
+        place = v * np.minimum(time, stands) - deceleration * braking**2 / 2
+        drives.append((v - deceleration * braking, place, 1.0 * (time >= begins), 1.0 * (time >= slows)))
+    speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*drives, strict=True))
+    hit = place >= OBSTACLE
+    collision_speed = np.where(hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan)
+    active = np.cumsum(hit, axis=0) <= 1
+    gap, throttle = OBSTACLE - place, np.zeros_like(speed)
+    columns = {"position": place, "throttle": throttle, "brake": brake, "pedal": pedal, "active": active}
+    return made_up_runs(STEP, speed, gap, collision_speed, **columns)
+
+
+SAME = (10.0, 15.0, 0.2, 6.0)
+
+
+def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
+    """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one does nothing else
+    before it collides.
+    """
+    runs = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
+    runs.trace.brake[50:150, 1:3] = 0.5
+    runs.trace.throttle[150:200, 1] = 0.1
+    runs.trace.brake[150:250, 2:] = 0.01
+    plain, overshot, settling, unbraked = (brake_onset(runs, column) for column in range(4))
+    assert overshot == settling == plain
+    assert plain is not None
+    assert runs.trace.gap[plain, 0] == pytest.approx(15.0)
+    assert unbraked is None

@@ -1,0 +1,305 @@
+"""Repairs against a closed form, and their price where a driving system always brakes."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from msgspec.structs import replace as replace_in
+
+import safevar_sumo as sv
+from safevar_sumo.ads import ADS
+from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions import repair as question
+from safevar_sumo.questions.evaluator import open_evaluator
+from safevar_sumo.questions.repair import attack, smallest
+from safevar_sumo.questions.repair.answer import write_repair
+from safevar_sumo.questions.repair.problem import Parameter, RepairProblem
+from safevar_sumo.records import FloatArray, differences
+from safevar_sumo.scenarios.benign import benign_points
+from safevar_sumo.study import FreeParameter
+from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool, run
+
+SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
+"""Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the price of
+every promise, at least 10 m, is far longer than the 0.1 m of a step.
+"""
+
+MODELS = """
+import numpy as np
+from typing import NamedTuple
+from safevar_sumo.records import Command
+from safevar_sumo.vehicles import SumoType
+
+
+class State(NamedTuple):
+    speed: np.ndarray
+    throttle: np.ndarray
+    brake: np.ndarray
+    gear: np.ndarray
+
+
+class Sled:
+    UNITS = {"grip": "m/s^2", "paint": "-"}
+
+    def prepare(self, characteristics, road_friction, step):
+        return {**characteristics, "step": step}
+
+    def sumo_type(self, prepared):
+        n = np.ones_like(prepared["grip"])
+        return SumoType(1000 * n, 3 * n, prepared["grip"], 40 * n, 0.1 * n)
+
+    def at_rest(self, prepared):
+        nothing = np.zeros_like(prepared["grip"])
+        return State(nothing, nothing, nothing, nothing)
+
+    def at_speed(self, prepared, speed):
+        nothing = np.zeros_like(prepared["grip"])
+        return State(speed, nothing, nothing, nothing)
+
+    def sense(self, prepared, state, seen):
+        return seen, state
+
+    def advance(self, prepared, state, command):
+        acceleration = 3 * command.throttle - prepared["grip"] * command.brake
+        speed = np.maximum(state.speed + acceleration * prepared["step"], 0.0)
+        return State(speed, command.throttle, command.brake, state.gear)
+
+
+class Brakes:
+    def __init__(self, gap=12.0, always=0.0, colour=1.0):
+        self.gap, self.always, self.colour = gap, always, colour
+
+    def start(self, n, nominal, step):
+        return np.zeros(n, dtype=bool)
+
+    def drive(self, seen, braking):
+        is_near = (seen.gap <= self.gap) & (np.abs(seen.lateral) < 1.75)
+        braking = braking | is_near | (self.always + 0 * seen.speed >= 0.5)
+        return Command(np.zeros(len(seen.speed)), braking.astype(float)), braking
+"""
+
+STUDY = """
+name = "planted"
+title = "A sled that brakes at a gap"
+weather = "clear"
+step_length = 0.005
+
+[scenario]
+model = "car_to_car"
+parameters = { test = "CCRs", speed = 72.0, headway = 2.5, time_after = 3.5 }
+
+[vehicle]
+model = "models:Sled"
+
+[vehicle.characteristics]
+grip = { unit = "m/s^2", original = 8, lower = 3.6, upper = 9 }
+paint = { unit = "-", original = 1, lower = 0.5, upper = 2 }
+
+[ads]
+model = "models:Brakes"
+parameters = { gap = 12.0, always = 0.0, colour = 1.0 }
+
+[metrics]
+ttc_threshold = 1.5
+
+[search]
+algorithms = ["rs"]
+population = 20
+evaluations = 40
+runs = 1
+seed = 1
+
+[repair]
+gap = { lower = 4.0, upper = 64.0, unit = "m", meaning = "gap at which it brakes" }
+always = { lower = 0.0, upper = 1.0, unit = "-", meaning = "from a half on it brakes without reason" }
+colour = { lower = 0.0, upper = 2.0, unit = "-", meaning = "colour of its box" }
+
+[repair.promise]
+grip = { at_least = 5 }
+"""
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for module, name, number in (
+        (attack, "RANDOM", 64),
+        (attack, "CHILDREN", 64),
+        (attack, "GENERATIONS", 2),
+        (attack, "MAX_UNSAFE_SHARE", 0.01),
+        (question, "SOBOL_VEHICLES", 32),
+    ):
+        monkeypatch.setattr(module, name, number)
+    (tmp_path / "models.py").write_text(MODELS)
+    (tmp_path / "planted.toml").write_text(STUDY)
+    return tmp_path / "planted.toml"
+
+
+def gap_for(grip: float) -> float:
+    """The gap at which a sled has to brake so that it stops `MARGIN` before the obstacle."""
+    return MARGIN + SPEED**2 / (2 * grip)
+
+
+@pytest.mark.slow
+def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Path) -> None:
+    found = sv.repair(planted, change=["gap", "colour"], jobs=2)
+    (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
+    assert repair["parameters"] == {"gap": pytest.approx(gap_for(5), rel=0.01)}
+    assert [repair["metres_earlier"]] == found.values("price.metres_earlier_mean")
+    assert repair["metres_earlier"] == pytest.approx(gap_for(5) - GAP_TODAY, rel=0.01)
+    assert len(str(repair["parameters"]["gap"])) <= 5  # four digits: what is printed is what was tried
+    assert repair["proof_failures"] == 0
+    assert repair["at_most"] <= 0.01
+    assert max(map(len, found.render("text").split("Repairs\n")[1].splitlines()[:-1])) <= 80
+
+
+@pytest.mark.slow
+def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
+    answers = [sv.repair(planted, change=["always"], pool=pool).to_dict() for pool in (InlinePool(), InlinePool(2))]
+    assert answers[0] == answers[1]
+    tables = answers[0]["tables"]
+    (repair,) = tables["repairs"]["rows"]
+    assert repair["needless_braking"] == repair["benign_scenes"] >= 6
+    assert tables["price"]["rows"][0]["needless_braking_today"] == 0
+
+
+class Adding:
+    """A problem without simulations: the changes of the parameters, up to 0.85 each, add up to what a vehicle needs."""
+
+    arrays, margin = True, MARGIN
+
+    def __init__(self, parameters: int, need: float) -> None:
+        self.today, self._need = np.full(parameters, 0.1), need
+
+    def degrees(self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()) -> tuple[FloatArray, Any]:
+        gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
+        degrees = gain[:, np.newaxis] - self._need * settings[:, 0] + MARGIN
+        return degrees, np.zeros(degrees.size, dtype=int)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "need", "changed"),
+    [
+        (2, 0.0, {0: 0.0}),
+        (2, 0.4, {1: 0.4, 2: 0.2}),
+        (1, 0.4, {1: 0.4}),
+        (2, 1.2, {2: 0.6}),
+        (5, 1.0, {2: 0.5}),
+        (4, 3.0, {}),
+    ],
+)
+def test_the_smallest_changes_are_those_of_the_closed_form(
+    parameters: int, need: float, changed: dict[int, float]
+) -> None:
+    problem: Any = Adding(parameters, need)
+    search = smallest.Search(problem, np.linspace(0.5, 0, 20)[:, np.newaxis])
+    search.smallest_changes()
+    search.add(np.linspace(1, 0.5, 20)[:, np.newaxis])  # what was found before becomes a lower bound
+    changes = [change - problem.today for change in search.smallest_changes()]
+    found = {int(np.count_nonzero(change)): float(np.max(np.abs(change))) for change in changes}
+    assert found == pytest.approx(changed, abs=0.005)
+
+
+@pytest.mark.slow
+def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
+    planted.write_text(STUDY.replace("upper = 64.0", "upper = 26.0"))
+    found = sv.repair(planted, change=["gap"], pool=InlinePool())
+    assert found.numbers["repairs"] == len(found.table("repairs")) == 0
+    assert "No change of one or two of gap was found" in found.verdict
+    assert not found.numbers["not_repairable"]  # full braking sees far enough
+
+
+@pytest.mark.slow
+def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: Path) -> None:
+    planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 26.0, always"))
+    out = tmp_path / "kept.toml"
+    done = run("repair", str(planted), "--promise", "grip>=7.9", "--change", "gap", "--out", str(out), "--json")
+    answer = json.loads(done.stdout)
+    assert answer["numbers"]["repairs"] == 0
+    assert answer["numbers"]["kept_today"]
+    assert not out.exists()
+
+
+def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_does_not_have() -> None:
+    study = sv.load_study("rain")
+    assert any(key.startswith("ads.parameters.") for key in study.spread)
+    with open_evaluator(study, InlinePool()) as evaluator:
+        problem: Any = RepairProblem(evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3))  # type: ignore[arg-type]
+        assert problem.best_driver.evaluate(evaluator.characteristics.original[np.newaxis], "").f_safe[0] > 0.3
+
+
+def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
+    row = FreeParameter(lower=1000.0, upper=1001.0, unit="m", meaning="")
+    assert Parameter("a", row, 1000.0).values(np.array([0.45678])).item() == 1000.457
+
+
+def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without attacks and fresh wear: of the worst brakes promised, those in between and the best."""
+    monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
+    nothing = np.zeros((0, len(sv.load_study("native").vehicle.characteristics)))
+    monkeypatch.setattr(question, "find_failures", lambda *_: nothing)
+    monkeypatch.setattr(question, "prove", lambda *_: (attack.Proof(5, 0, 0.45), nothing))
+    kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
+    worst = kept.numbers["worst_today"]
+    assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
+    words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
+    assert f"has a safety degree of {words}, and of 5 fresh worn vehicles 0 are unsafe" in kept.verdict
+    table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
+    # A study that results alone hold has no file to extend.
+    for study in (kept.study, replace_in(kept.study, name="lost")):
+        write_repair(tmp_path / "it.toml", replace(kept, study=study, tables={"repairs": table}))
+        assert sv.load_study(tmp_path / "it.toml").ads.parameters["standing_gap"] == 3.25
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "change", "message"),
+    [
+        ("lower = 4.0", "lower = 14.0", "gap", "bounds that hold the value of today"),
+        ("lower = 4.0", "log = true, lower = 0.0", "gap", "expected: 0 < lower < upper"),
+        ("always = {", "alway = {", "alway", "ads.parameters.alway = None"),
+        ("", "", "gape", "did you mean 'gap'?"),
+        ("at_least = 5", "at_least = 3", "gap", "outside its domain"),
+        ("gap = 12.0, always", "gap = 'x', always", "gap", "bounds that hold the value of today"),
+    ],
+)
+def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, change: str, message: str) -> None:
+    planted.write_text(STUDY.replace(old, new))
+    with pytest.raises(sv.InputError, match=re.escape(message)):
+        sv.repair(planted, change=[change], pool=InlinePool())
+
+
+@pytest.mark.parametrize("model", CHANGEABLE)
+def test_one_driving_system_drives_vehicles_with_different_parameters(model: str) -> None:
+    shipped = {"world_on_rails": "sun", "apollo": "lgsvl"}
+    parameters = sv.load_study(shipped[model]).ads.parameters if model in shipped else {}
+    study = sv.load_study("wear", ads={"model": model, "parameters": parameters})
+    names, system = tuple(CHANGEABLE[model]), replace(assemble(study), matrix=assemble(study).points[-1:])
+    ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
+    low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
+    values = np.random.default_rng(1).uniform(low, high, (3, len(names)))
+    settings = np.tile(system.characteristics.original, (3, 1))
+    together = evaluate(replace(system, ads=VariedAds(system.ads, names, values)), settings)
+    for row, one in enumerate(values):
+        ads = ADS[model](**{**parameters, **dict(zip(names, one.tolist(), strict=True))})
+        alone = evaluate(replace(system, ads=ads), settings[:1])
+        assert not list(differences(together.take([row]).results, alone.results)), dict(zip(names, one, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
+def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
+    blind = {"model": "aeb", "parameters": {"reach": 0.001}}
+    system = assemble(sv.load_study(name, ads=blind))
+    benign = replace(system, matrix=tuple(benign_points(system.points)))
+    assert len({scene.name for scene in benign.matrix}) == len(benign.matrix) >= 40
+    for result in simulate_all_points(benign, system.characteristics.original[None]):
+        assert not result.evaluations.collided[0], result.point.name

@@ -1,0 +1,141 @@
+"""Shares, probabilities and rules: against analytic volumes, moments, Ishigami's function, a linear model and regions
+that are known.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo import risk, rules
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.variation import VariationModel
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import load_study
+from tests.questions.conftest import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+
+
+def of(region: Region, **options: Any) -> Answer:
+    study = made_up_study(2)
+    return risk(study, unsafe="collision", pool=Plant(study, region), **options)
+
+
+@pytest.mark.parametrize(
+    ("region", "volume"), [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)]
+)
+def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -> None:
+    numbers = of(region, samples=8000, confidence=0.999).numbers
+    low, high = numbers["interval"]
+    assert low <= volume <= high
+    assert high - low < 0.03
+    assert numbers["probability"] == numbers["failures"] / 8000
+
+
+def ishigami(settings: FloatArray) -> FloatArray:
+    x = (settings - 5) / 5 * math.pi
+    return np.asarray(np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0]))
+
+
+def test_sobol_indices_of_ishigamis_function() -> None:
+    """Analytic values of Saltelli et al., Global Sensitivity Analysis (2008), for a = 7, b = 0.1."""
+    study = made_up_study(3)
+    table = risk(study, unsafe="collision", samples=100, pool=Plant(study, nowhere, ishigami)).tables["sensitivity"]
+    frame = table.set_index("characteristic")
+    assert frame["degree_first"].to_dict() == pytest.approx({"a": 0.3139, "b": 0.4424, "c": 0.0}, abs=0.05)
+    assert frame["degree_total"].to_dict() == pytest.approx({"a": 0.5576, "b": 0.4424, "c": 0.2437}, abs=0.05)
+    assert (frame["degree_first_low"] < frame["degree_first"]).all()
+    assert frame["unsafe_total"].isna().all()
+    assert table["characteristic"].iloc[0] == "a", "what decides most stands first"
+
+
+def test_first_order_indices_of_correlated_characteristics() -> None:
+    """Y = a + b of normal variables with correlation r: knowing one leaves (1 - r^2) of the other's variance 1, so that
+    the index is 1 - (1 - r^2) / (2 + 2 r). Sobol's design does not exist, and total indices are undefined.
+    """
+    normal = {"distribution": "normal", "deviation": 1.0}
+    pair = {"between": ["a", "b"], "value": 0.5}
+    study = load_study(made_up_study(3), variation={"a": normal, "b": normal, "c": normal}, correlations=[pair])
+    plant = Plant(study, nowhere, lambda settings: settings[:, 0] + settings[:, 1])
+    answer = risk(study, unsafe="collision", samples=4000, pool=plant)
+    frame = answer.tables["sensitivity"].set_index("characteristic")
+    assert frame["degree_first"].to_dict() == pytest.approx({"a": 0.75, "b": 0.75, "c": 0.0}, abs=0.04)
+    assert frame["degree_total"].isna().all()
+    assert "if vehicles vary as specified, a normal, b normal and c normal" in answer.verdict
+
+
+def drawn(**variation: dict[str, Any]) -> FloatArray:
+    correlations = variation.pop("correlations", [])
+    study = load_study(made_up_study(2), variation=variation, correlations=correlations)
+    return VariationModel(study).settings(np.random.default_rng(1).random((20_000, 2)))
+
+
+def test_every_distribution_has_its_moments() -> None:
+    normal, triangular = drawn(
+        a={"distribution": "normal", "deviation": 0.5, "mean": 6.0}, b={"distribution": "triangular", "upper": 8.0}
+    ).T
+    assert (normal.mean(), normal.std()) == pytest.approx((6.0, 0.5), abs=0.02)
+    assert (triangular.mean(), triangular.max()) == pytest.approx((13 / 3, 8.0), abs=0.1)
+    fixed, uniform = drawn(a={"distribution": "fixed", "value": 7.0}, b={"distribution": "uniform", "lower": 2.0}).T
+    assert set(fixed) == {7.0}
+    assert (uniform.min(), uniform.mean()) == pytest.approx((2.0, 6.0), abs=0.05)
+    tight = drawn(a={"distribution": "normal", "deviation": 50.0})[:, 0]
+    assert tight.min() >= 0
+    assert tight.max() <= 10
+
+
+def test_correlations_are_those_of_the_copula() -> None:
+    normal = {"distribution": "normal", "deviation": 0.5}
+    settings = drawn(a=normal, b=normal, correlations=[{"between": ["a", "b"], "value": 0.8}])
+    assert np.corrcoef(settings.T)[0, 1] == pytest.approx(0.8, abs=0.02)
+
+
+def rules_of(region: Region, n: int = 4, **options: Any) -> Answer:
+    study = made_up_study(n)
+    return rules(study, unsafe="collision", pool=Plant(study, region), **options)
+
+
+def test_a_box_is_one_rule_of_its_two_conditions() -> None:
+    answer = rules_of(box)
+    (row,) = answer.tables["rules"].itertuples()
+    assert row.rule == "a above 7 N m and b below 3 N m"
+    assert (row.density, row.coverage) == pytest.approx((1, 1), abs=0.02)
+    assert row.density_low <= row.density <= row.density_high
+    assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(0.09, abs=0.005)
+    assert "of them have a above 7 N m and b below 3 N m; of all vehicles like that" in answer.verdict
+
+
+def test_nothing_everything_and_too_little() -> None:
+    assert rules_of(nowhere).tables["rules"].empty
+    (row,) = rules_of(everywhere).tables["rules"].itertuples()
+    assert (row.rule, row.density, row.coverage) == ("everywhere", 1.0, 1.0)
+    few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
+    assert few.tables["rules"].empty
+    assert "--samples N draws more" in few.verdict
+
+
+def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:
+    answer = rules_of(lambda settings: np.sin(1e6 * settings[:, 0]) > 0.7, n=2, samples=400)
+    table = answer.tables["rules"]
+    share = answer.numbers["failures"] / answer.numbers["samples"]
+    assert (" of them have " in answer.verdict) == (table["density_low"] > share).any()
+
+
+@pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
+def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
+    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the
+    other's interval.
+    """
+    study = made_up_study(2)
+    study = load_study(study, constraints=[constraint]) if constraint else study
+    asked = {number: Plant(study, box) for number in (400, 1000)}
+    numbers = {size: rules(study, unsafe="collision", pool=pool, samples=size).numbers for size, pool in asked.items()}
+    estimate = risk(study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000).numbers
+    assert asked[400].seen < asked[1000].seen <= plant.seen
+    assert numbers[1000]["share"] == estimate["probability"]
+    assert numbers[1000]["interval"] == pytest.approx(estimate["interval"])
+    for one, other in ((400, 1000), (1000, 400)):
+        low, high = numbers[one]["interval"]
+        assert low < numbers[other]["share"] < high

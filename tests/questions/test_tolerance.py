@@ -1,0 +1,271 @@
+"""Intervals and boxes against regions that are known; printed limits against simulations."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings, strategies as st
+
+from safevar_sumo import simulate, tolerance
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.tolerance import ToleranceOptions, boxes, compute
+from safevar_sumo.questions.tolerance.answer import Tolerance
+from safevar_sumo.questions.tolerance.compute import find_tolerances
+from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
+from safevar_sumo.questions.tolerance.scans import scan
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Limit, load_study
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import run
+from tests.made_up import case_of
+from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_islands
+
+
+@pytest.fixture(autouse=True)
+def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No vehicle has their characteristics; their failures are described as of the study smoke."""
+    smoke = assemble(load_study("smoke"))
+    monkeypatch.setattr(compute, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study))
+
+
+def of(
+    n: int,
+    region: Region,
+    unsafe: str | None = "collision",
+    failing: Region = nowhere,
+    characteristics: Sequence[str] | None = None,
+) -> Tolerance:
+    study = made_up_study(n)
+    return tolerance(
+        study,
+        unsafe=unsafe,
+        characteristics=characteristics,
+        pool=Plant(study, region, lambda rows: 8 - np.abs(rows[:, 0] - 5), failing),
+    )
+
+
+def test_islands_and_the_safe_interval_around_the_original() -> None:
+    first, second = of(2, two_islands).alone
+    assert first.safe == (0.0, pytest.approx(6.5, abs=1e-4))
+    assert first.safe[1] <= 6.5
+    assert first.unsafe[0][0] - first.safe[1] <= 1.001 * 0.05 / 4096, "a 4096th of the distance of two values"
+    assert [pytest.approx(interval, abs=1e-4) for interval in [(6.5, 7.0), (9.0, 10.0)]] == first.unsafe
+    assert first.margins == [pytest.approx(3.0), pytest.approx(6.5, abs=1e-3)]
+    assert (second.safe, second.unsafe) == ((0.0, 10.0), [])
+    assert len(first.profile) > 201
+
+
+@pytest.mark.slow
+@settings(max_examples=30)
+@given(ends=st.lists(st.floats(0, 10), min_size=2, max_size=2).map(sorted))
+def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: list[float]) -> None:
+    low, high = ends
+    (alone,) = of(1, lambda rows: (rows[:, 0] >= low) & (rows[:, 0] <= high)).alone
+    if high - low > 0.05:
+        assert alone.unsafe == [(pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))]
+    if low <= 5 <= high:
+        assert alone.safe is None
+    elif high - low > 0.05:
+        assert alone.safe == ((0.0, pytest.approx(low, abs=1e-4)) if low > 5 else (pytest.approx(high, abs=1e-4), 10.0))
+
+
+def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
+    result = of(2, two_islands, failing=lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75))
+    first = result.alone[0]
+    assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
+    assert first.intervals("not_simulated") == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
+    assert first.unsafe == [
+        (pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)),
+        (pytest.approx(9, abs=1e-4), 10.0),
+    ]
+    box = result.box
+    assert box is not None
+    assert box.failed / box.samples > 0.05, "the box holds what could not be simulated"
+    exact = scipy.stats.binomtest(box.failed, box.samples, alternative="less").proportion_ci(0.975, method="exact")
+    assert box.at_most == pytest.approx(exact.high)
+
+
+def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
+    """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain
+    hits it.
+    """
+
+    def sliver(rows: FloatArray) -> BoolArray:
+        return np.asarray(
+            (np.abs(rows[:, 0] - rows[:, 1]) < 0.001) & (rows[:, 0] > 7) & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5)
+        )
+
+    study = made_up_study(4)
+    pool = Plant(study, sliver)
+    found = pool.evaluate(np.array([[8.5, 8.5, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]))
+    case = case_of(study, found.take([1]), found)
+    bare, known, two = (
+        find_tolerances(subject, ToleranceOptions(unsafe=unsafe, characteristics=names), Evaluator(study, pool))
+        for subject, unsafe, names in ((study, "collision", None), (case, None, None), (case, None, ("a", "b")))
+    )
+    assert str(known.unsafe) == "collision", "as the solutions do, and as `explain` takes it"
+    assert bare.box is not None
+    assert known.box is not None
+    assert two.box is not None
+    assert relative_volume(bare.box) == pytest.approx(1, abs=0.01)
+    assert 0.8 < relative_volume(known.box) < 0.9, "the largest box ends before 8.5"
+    assert two.box.box["a"] == two.box.box["b"] == (0, 10), "the solution changes others as well"
+
+
+@pytest.mark.slow
+def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box: any box with a bound
+    below q is wrong.
+
+    Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong.
+    """
+    monkeypatch.setattr(boxes, "MAX_UNSAFE_SHARE", 0.03)
+    q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
+    for seed in range(seeds):
+        evaluator = Evaluator(study, Plant(study, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
+        for attempt in range(1, 12):
+            ends = np.full(2, attempt / 3), np.full(2, 10 - attempt / 3)
+            found, _, _, at_most = boxes.sample_box(evaluator, [0, 1], Unsafe(), ends, attempt, (seed, attempt), "test")
+            if not len(found):
+                wrong += at_most < q
+                break
+    assert 0 < wrong <= 0.05 * seeds
+
+
+def test_the_promised_record() -> None:
+    record = json.loads(json.dumps(of(2, two_islands).to_dict(), allow_nan=False))
+    assert list(record) == ["study", "unsafe", "margin", "kept", "samples", "failures", "at_most", "alone", "limits"]
+    keys = ["characteristic", "unit", "original", "safe", "unsafe", "not_simulated", "across_fits"]
+    assert list(record["alone"][0]) == keys
+    keys = "characteristic unit original together_low together_high alone_low alone_high specified_low specified_high"
+    assert list(record["limits"][0]) == [*keys.split(), "kept", "fails_first", "sentence"]
+
+
+LINEAR = np.array([1.0, 2.0, 3.0])
+"""Weights of a region whose largest box has sides at 10, 7.5 and 5."""
+
+
+def box_of(n: int, region: Region, limits: dict[str, Limit], known: Sequence[Sequence[float]] = ()) -> JointLimits:
+    study = made_up_study(n)
+    evaluator = Evaluator(study, Plant(study, region))
+    columns, criterion = list(range(n)), Unsafe()
+    scans = scan(evaluator, columns, criterion)
+    ends = [{one.characteristic.name: end} for one in scans for interval in one.unsafe for end in interval]
+    unsafe_settings = compute.settings_of(evaluator.characteristics, ends)
+    rows = np.array(known, dtype=float).reshape(-1, n)
+    return find_joint_limits(evaluator, columns, criterion, limits, scans, np.concatenate([unsafe_settings, rows]))
+
+
+def relative_volume(box: JointLimits) -> float:
+    return float(np.prod([(high - low) / 10 for low, high in box.box.values()]))
+
+
+@pytest.mark.parametrize(("limits", "largest"), [({}, 0.375), ({"c": Limit(at_most=7)}, 0.315)])
+def test_the_box_with_limits_is_nearly_the_largest(limits: dict[str, Limit], largest: float) -> None:
+    box = box_of(3, lambda rows: (rows - 5) @ LINEAR > 10, limits)
+    assert box.kept
+    assert 0.97 * largest < relative_volume(box) <= largest
+    assert (np.array([high for _, high in box.box.values()]) - 5) @ LINEAR <= 10
+    assert box.at_most == pytest.approx(1 - (0.05 / 2) ** (1 / box.samples))
+    assert all(box.box[name][1] == limit.at_most for name, limit in limits.items())
+
+
+def test_limits_that_a_region_breaks_are_not_kept_and_are_counted() -> None:
+    box = box_of(2, lambda rows: rows[:, 0] > 7, {"a": Limit(at_most=9)})
+    assert not box.kept
+    assert box.box == {"a": (5.0, 9.0), "b": (5.0, 5.0)}
+    assert box.unsafe / box.samples == pytest.approx(0.5, abs=0.05)
+    assert box.at_most > box.unsafe / box.samples
+
+
+def test_the_box_with_limits_holds_no_known_solution() -> None:
+    box = box_of(3, nowhere, {"a": Limit(at_most=8)}, known=[[7.0, 8.0, 9.0]])
+    assert any(high < value for (_, high), value in zip(box.box.values(), (7.0, 8.0, 9.0), strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "code"), [("5", 0), ("4.6", 3)])
+def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:
+    study = tmp_path / "mine.toml"
+    study.write_text(f'extends = "native"\n[limits]\ndecel = {{ at_least = {limit}, source = "workshop" }}\n')
+    flags = ("--characteristics", "decel,brakeGain", "--margin", "0", "--jobs", "1", "--json")
+    done = run("tolerance", str(study), *flags, expect=code)
+    answer = json.loads(done.stdout)
+    decel, gain = answer["limits"]
+    assert (decel["specified_low"], decel["specified_high"]) == (float(limit), None)
+    assert [decel["kept"], answer["kept"], gain["kept"]] == [code == 0, code == 0, True]
+    assert ("failed: limit of decel: outside by" in done.stderr) == (code == 3)
+    if code == 0:
+        assert decel["together_low"] == float(limit)
+        return
+    assert [row[name] for row in (decel, gain) for name in ("together_low", "together_high")] == [None] * 4
+    assert [row["sentence"].endswith(": no safe box.") for row in (decel, gain)] == [True, True]
+    assert run("tolerance", str(study), *flags[:-1], expect=code).stdout.count("no safe box") >= 2
+
+
+MANUAL = re.compile(r"(at least|at most) ([\d.]+)")
+"""A limit in a sentence of a maintenance manual."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "limit", "own"),
+    [("wear", "treadDepth >= 3", "at least 3 mm"), ("native", "decel >= 7", "7 m/s"), ("rain", "tireFric >= 3", "3;")],
+)
+def test_a_car_that_keeps_all_printed_limits_keeps_the_margin_at_every_point(name: str, limit: str, own: str) -> None:
+    """All sentences obeyed at once, in every combination of ends, and the corner of the JSON."""
+    study = load_study(name)
+    answer = tolerance(study, limits=[limit], fits=0, jobs=2)
+    record = answer.to_dict()
+    margin = study.model_error.get("safety_degree", 0.3)
+    assert (record["margin"], record["kept"], answer.unsafe.keep) == (margin, True, margin)
+    characteristics = CharacteristicSet.of(study)
+    ends = []
+    for item, row in zip(characteristics, record["limits"], strict=True):
+        keep = {word: float(text) for word, text in MANUAL.findall(row["sentence"].partition(";")[0])}
+        ends.append((keep.get("at least", item.lower), keep.get("at most", item.upper)))
+        assert ends[-1] == (row["together_low"], row["together_high"]), "as printed"
+    (specified,) = (row["sentence"] for row in record["limits"] if row["specified_low"] is not None)
+    assert own in specified
+    settings = np.unique(np.array(list(product(*ends))), axis=0)
+    system = assemble(study)
+    contact = 4.7 if name == "native" else 0.0  # the vehicle's length
+    for result in simulate_all_points(system, settings):
+        assert not result.evaluations.collided.any()
+        assert np.nanmin(result.evaluations.f_safe) >= margin + contact, result.point.name
+
+
+def test_the_margin_is_added_to_a_collision_alone() -> None:
+    """Safety degrees are 8 - |a - 5|, and 1 m less than 5 m is left from a = 8 on."""
+
+    def ends(**options: Any) -> tuple[str, float, Any]:
+        study = made_up_study(1)
+        pool = Plant(study, lambda rows: rows[:, 0] > 9, lambda rows: 8 - np.abs(rows[:, 0] - 5))
+        record = tolerance(study, pool=pool, **options).to_dict()
+        return record["unsafe"], record["margin"], record["limits"][0]["alone_high"]
+
+    assert ends() == ("collision", 0.446, 9.0), "the error of the study's model"
+    assert ends(margin=5) == ("collision", 5, 8.0)
+    assert ends(margin=0) == ("collision", 0, 9.0)
+    assert ends(unsafe="collision") == ("collision", 0, 9.0), "as it stands"
+    assert ends(unsafe="collision", margin=5) == ("collision", 5, 8.0)
+    assert ends(unsafe="below=4.5", margin=5) == ("below=4.5", 0, 8.5)
+
+
+def test_the_criterion_and_gaps_between_bumpers_are_printed() -> None:
+    said = run("tolerance", "native", "--characteristics", "decel", "--jobs", "1").stdout
+    assert "(safe: stops at least 0.30 m short, from bumper to bumper)" in " ".join(said.split())
+    gap = simulate("native").gap
+    assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m)" in " ".join(said.split()), "4.7 m: the length"
+    assert "the car keeps less than 0.3 m from a standing vehicle" in " ".join(said.split())
