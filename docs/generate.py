@@ -7,6 +7,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
@@ -16,7 +17,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
 PLAIN = {
@@ -152,7 +153,24 @@ def results_files() -> str:
     )
 
 
+def readme() -> str:
+    """The README of the repository, whose links go to this folder."""
+    return (Path(__file__).parents[1] / "README.md").read_text().replace("](docs/", "](")
+
+
+def characteristics() -> str:
+    """Every characteristic of the shipped vehicles, by the first study that has it."""
+    seen = dict[tuple[str, str], tuple[str, ...]]()
+    for study in map(load_study, study_names()):
+        for key, row in study.vehicle.characteristics.items():
+            model = study.vehicle.model
+            seen.setdefault((model, key), (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart))
+    return _table(("vehicle", "characteristic", "unit", "what it is", "real-world counterpart"), seen.values())
+
+
 TABLES: dict[str, Callable[[], str]] = {
+    "readme": readme,
+    "characteristics": characteristics,
     "study_keys": study_keys,
     "vehicles": models(VEHICLES),
     "ads": models(ADS),
