@@ -43,26 +43,6 @@ ANSWER = Answer(
     numbers={"probability": np.float64(0.25), "interval": (0.1, np.nan), "driven": True},
     tables={"parts": tabulate("Parts & ages", COLUMNS, ROWS)},
 )
-QUESTION = '''
-from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate
-from safevar_sumo.questions.ask import Count, question
-
-
-@question
-def spread(subject, evaluator, *, samples: Count = 100) -> Answer:
-    """Say how far safety degrees lie apart.
-
-    Parameters
-    ----------
-    samples
-        Number of vehicles drawn evenly over the domain.
-    """
-    degrees = evaluator.evaluate(evaluator.random_settings(samples), "vehicles").f_safe
-    table = tabulate("Quartiles", {"degree": Column("m", "safety degree")}, [(float(degrees.min()),)])
-    numbers = {"spread": float(degrees.max() - degrees.min())}
-    tables = {"quartiles": table}
-    return Answer(question="spread", study=evaluator.study, verdict="Far.", numbers=numbers, tables=tables)
-'''
 
 
 def test_json_names_units_and_meanings_and_has_no_value_where_none_is_defined() -> None:
@@ -137,17 +117,26 @@ def test_help_and_call_have_the_same_sentence_and_options(name: str) -> None:
         assert f"--{option.name.replace('_', '-')}" in text
 
 
-def test_a_question_from_outside_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "my_questions.py").write_text(QUESTION)
+def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has at most 60 lines, and gets a command with the shared options and every format."""
+    manual = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
+    (code,) = re.findall(r'```python title="my_questions.py"\n(.*?)```', manual, re.DOTALL)
+    assert code.count("\n") <= 60
+    (tmp_path / "my_questions.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    name = "my_questions:spread"
+    name = "my_questions:ends"
     assert isinstance(find_question(name), Question)
-    result = CliRunner().invoke(commands, [name, "smoke", "--samples", "8", "--jobs", "1", "--fail-if", "spread > 0"])
-    assert result.exit_code == 3, result.output
-    assert "Far." in result.output
-    assert re.search(r"failed: spread = [0-9.]+ > 0", result.output)
-    refused = CliRunner().invoke(commands, [name, "smoke", "--samples", "0"])
-    assert "a whole number from 1 to 100,000,000" in str(refused.exception)
+    command = [name, "smoke", "--unsafe", "below=2.2", "--jobs", "1"]
+    failed = CliRunner().invoke(commands, [*command, "--fail-if", "unsafe_ends > 0"])
+    assert failed.exit_code == 3, failed.output
+    assert "Unsafe at an end of the domain: " in failed.output
+    assert "failed: unsafe_ends = " in failed.output
+    refused("rules", "smoke", "--samples", "0", message=("--samples: 0", "a whole number from 1 to 100,000,000"))
+    answer = json.loads(CliRunner().invoke(commands, [*command, "--format", "json"]).stdout)
+    assert answer["question"] == name
+    rows = answer["tables"]["ends"]["rows"]
+    assert len(rows) == 2 * len(load_study("smoke").vehicle.characteristics)
+    assert answer["numbers"]["unsafe_ends"] == sum(row["safety_degree"] < 2.2 for row in rows)
 
 
 @pytest.mark.parametrize("options", [ExplainOptions, ToleranceOptions])
