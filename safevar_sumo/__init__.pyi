@@ -1,4 +1,3 @@
-from .api import Figures as Figures, Tables as Tables, figures as figures, tables as tables
 from .api.evaluation import evaluate as evaluate
 from .api.running import run as run
 from .api.simulation import Simulation as Simulation, load_study as load_study, simulate as simulate
@@ -15,6 +14,7 @@ from .questions.explain.failure import Explanation as Explanation
 from .questions.opinion import opinion as opinion
 from .questions.rating import rating as rating
 from .questions.repair import repair as repair
+from .questions.research_questions.answer import figures as figures, tables as tables
 from .questions.risk import risk as risk
 from .questions.rules import rules as rules
 from .questions.subject import Results as Results, load as load

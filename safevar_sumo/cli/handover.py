@@ -1,4 +1,4 @@
-"""Commands that hand results on: `tables`, `figures` and a `report` of them, `export` to other simulators, `evidence`
+"""Commands that hand results on: a `report` of them, `export` to other simulators, `evidence`
 to a reader, who runs `verify`.
 """
 
@@ -24,80 +24,12 @@ from safevar_sumo.cli.arguments import (
     point_option,
     split_names,
 )
-from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
+from safevar_sumo.cli.program import commands, print_json, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.case import load_cases
-from safevar_sumo.questions.research_questions.answer import QUESTION_NAMES, answer_questions
-from safevar_sumo.questions.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
-from safevar_sumo.questions.research_questions.formats import ENDINGS, FORMATS
 from safevar_sumo.questions.tolerance import ToleranceOptions
-from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.sumo.matrix import system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
-
-FORMATS_WITHOUT_NOTES = ("csv", "json")
-"""Formats of tables without notes; notes go to standard error."""
-
-
-@commands.command()
-@directories_argument
-@click.option("--rq", "question", type=click.Choice(QUESTION_NAMES), help="Answer only this question.")
-@click.option(
-    "--format",
-    "format_name",
-    type=click.Choice(list(FORMATS)),
-    default="text",
-    show_default=True,
-    help="Format of the tables.",
-)
-@click.option(
-    "--algorithm",
-    default="",
-    metavar="NAME",
-    help="The algorithm that RQ2 compares with all others.  [default: nsga2, else the study's first]",
-)
-@file_option("--out", "Write each table to a file in this directory.", metavar="DIR")
-def tables(
-    directories: tuple[str, ...], question: str | None, format_name: str, algorithm: str, out: Path | None
-) -> None:
-    """Answer the research questions as tables, from the results directories DIR..., one for each case."""
-    write = FORMATS[format_name]
-    answers = answer_questions(load_cases(directories), question, algorithm)
-    if format_name in FORMATS_WITHOUT_NOTES:
-        for note in dict.fromkeys(note for answer in answers for note in answer.notes):
-            print_note(note)
-    if out is not None:
-        make_directory(out)
-        for answer in answers:
-            if not answer.frame.empty:
-                write_whole(out / f"{answer.name}.{ENDINGS[format_name]}", write([answer]))
-        click.echo(f"Tables: {out}")
-        return
-    if question is not None and format_name in FORMATS_WITHOUT_NOTES:
-        answers = [answer for answer in answers if answer.name == question]
-    click.echo(write(answers), nl=False)
-
-
-@commands.command()
-@directories_argument
-@file_option("--out", "Directory for the pictures.", metavar="DIR", required=True)
-@click.option(
-    "--format",
-    "format_name",
-    type=click.Choice(PICTURE_FORMATS),
-    default="png",
-    show_default=True,
-    help="Format of the pictures.",
-)
-def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
-    """Draw the figures of the results directories DIR..., one file for each figure and case."""
-    cases = load_cases(directories)
-    paths, notes = save_figures(cases, out, format_name)
-    for note in (*(remark for case in cases for remark in case.remarks), *notes):
-        print_note(note)
-    for path in paths:
-        click.echo(str(path))
 
 
 @commands.command()

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
@@ -26,78 +27,61 @@ if TYPE_CHECKING:
 
 COMMANDS_BY_GROUP = {
     "From a driving system to a decision": {
-        "study": ("study", "Search a study; run the same command again to continue where it stopped."),
-        "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
-        "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
-        "tolerance": ("questions", "Find how far each characteristic may go: alone, and all together."),
-        "repair": ("ask", "Find the smallest change of the driving system that survives promised wear, and its price."),
-        "risk": (
-            "ask",
-            "Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which "
-            "characteristics decide it.",
-        ),
-        "report": ("handover", "Write one page about results: verdict, causes, replays, tables, figures."),
+        "study": "cli.study:study",
+        "simulate": "cli.simulate:simulate_command",
+        "explain": "cli.questions:explain",
+        "tolerance": "cli.questions:tolerance",
+        "risk": "questions.risk:risk",
+        "report": "cli.handover:report",
+        "status": "cli.study:status",
     },
-    "More": {
-        "status": (
-            "study",
-            "Show the progress of a study running in another process: runs, front, collisions, time left.",
-        ),
-        "evidence": ("handover", "Pack results, page and answers, so that anybody can compute every number again."),
-        "verify": ("handover", "Compute what a pack of evidence claims again, and compare."),
-        "export": ("handover", "Write a solution for CARLA, or as OpenSCENARIO and OpenDRIVE."),
-        "check": (
-            "catalogue",
-            "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
-        ),
-        "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
-        "opinion": ("ask", "Check the minimal causes of failures with a second vehicle model."),
-        "rules": ("ask", "Find rules, in physical units, that say where in the domain a study is unsafe."),
-        "rating": (
-            "ask",
-            "Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as Euro NCAP "
-            "does in 2026.",
-        ),
-        "compare": (
-            "ask",
-            "Compare two studies or results, A and B: what is unsafe in one of them only, limits, ratings.",
-        ),
-        "tables": ("handover", "Answer the research questions as tables."),
-        "figures": ("handover", "Draw the figures of results."),
+    "Further questions": {
+        "rules": "questions.rules:rules",
+        "compare": "questions.compare:compare",
+        "repair": "questions.repair:repair",
+        "rating": "questions.rating:rating",
+        "opinion": "questions.opinion:opinion",
     },
+    "Hand over": {
+        "evidence": "cli.handover:evidence",
+        "verify": "cli.handover:verify",
+        "export": "cli.handover:export",
+    },
+    "Your own code": {"check": "cli.catalogue:check_command", "list": "cli.catalogue:list_command"},
     "Published data": {
-        "import": ("reference", "Import published CSV solutions as a results directory."),
-        "validate": (
-            "ask",
-            "Compare a study with settings and metrics in the published package's CSV format, row by row.",
-        ),
+        "import": "cli.reference:import_command",
+        "validate": "reference.agreement:validate",
+        "tables": "questions.research_questions.answer:tables",
     },
 }
-"""Each command's module in this folder and its sentence in the help, by the title of its group, in the order of the
-help.
-"""
-COMMANDS = {name: command for group in COMMANDS_BY_GROUP.values() for name, command in group.items()}
+"""The function of each command, by the title of its group, in the order of the help."""
+COMMANDS = {name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()}
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 """An argument of a function of the library in an error, such as `method=monte_carlo`."""
 
 
 class LazyCommands(click.Group):
-    """The group of all commands; it loads a command's module, which takes long, only when the command is called."""
+    """The group of all commands; it loads a command's function, which takes long, only when the command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         with _exit_on_interrupt():
-            module, _ = COMMANDS.get(name, ("ask" if ":" in name else "", ""))
-            if module == "ask":
-                from safevar_sumo.cli.ask import command_of
+            if ":" in name:  # a question of the user's
                 from safevar_sumo.questions.ask import find_question
 
-                return command_of(find_question(name))
-            if module:
-                importlib.import_module(f"safevar_sumo.cli.{module}")
-        return super().get_command(ctx, name)
+                function: Any = find_question(name)
+            elif name in COMMANDS:
+                module, _, attribute = COMMANDS[name].partition(":")
+                function = getattr(importlib.import_module(f"safevar_sumo.{module}"), attribute)
+            else:
+                return None
+            if isinstance(function, click.Command):
+                return function
+            from safevar_sumo.cli.command import command_of
+
+            return command_of(name, function)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -124,7 +108,17 @@ class LazyCommands(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         for title, group in COMMANDS_BY_GROUP.items():
             with formatter.section(title):
-                formatter.write_dl([(name, sentence) for name, (_, sentence) in group.items()])
+                formatter.write_dl([(name, first_sentence(function)) for name, function in group.items()])
+
+
+def first_sentence(function: str) -> str:
+    """The first paragraph of a function's docstring, read from its file: to load it takes long."""
+    module, _, name = function.partition(":")
+    path = Path(__file__).parents[1] / module.replace(".", "/")
+    source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
+    docstring = re.search(rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', source, re.DOTALL | re.MULTILINE)
+    assert docstring is not None
+    return " ".join(docstring[1].split())
 
 
 def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:

@@ -3,62 +3,44 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from html import escape
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.questions.research_questions.formats import escaped_for_latex
+from safevar_sumo.questions.tables import (
+    HIGH as HIGH,
+    LATEX_PREAMBLE,
+    LOW as LOW,
+    Column as Column,
+    Wide as Wide,
+    columns_of,
+    csv_cell,
+    html_table,
+    latex_table,
+    plain,
+    reader_tables,
+    tabulate as tabulate,
+    terminal_tables,
+    text_of,
+    with_interval as with_interval,
+)
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import WholeTable, print_parts, print_text, printable_text
+from safevar_sumo.terminal import print_parts, print_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LOW, HIGH = "_low", "_high"
-"""Ends of the names of two columns that hold the ends of the interval of a third column."""
 FORMATS = ("text", "json", "csv", "latex", "html")
 MAX_ROWS = 200
 """Number of rows up to which readers see a table; JSON and CSV have them all."""
 WIDTH = 80
 """Width of text that is not printed to a terminal [characters]."""
-
-
-class Column(NamedTuple):
-    """A column of a table: its unit, its meaning, and how its numbers are written for readers, or whether JSON and CSV
-    alone have it.
-    """
-
-    unit: str
-    meaning: str
-    number_format: str = ".4g"
-    is_shown: bool = True
-
-
-def tabulate(title: str, columns: Mapping[str, Column], rows: pd.DataFrame | Iterable[Sequence[Any]]) -> pd.DataFrame:
-    """A table of an answer: a frame whose `attrs` hold its title and its columns' units and meanings.
-
-    A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name the ends, too.
-    """
-    named = dict(columns)
-    frame = pd.DataFrame(rows, columns=[*named])
-    frame.attrs = {"title": title, "columns": named}
-    return frame
-
-
-def with_interval(name: str, column: Column) -> dict[str, Column]:
-    """A column and the two that hold the ends of its interval."""
-    ends = {
-        f"{name}{end}": column._replace(meaning=f"{word} end of {name}")
-        for end, word in ((LOW, "lower"), (HIGH, "upper"))
-    }
-    return {name: column, **ends}
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -101,14 +83,14 @@ class Answer:
         tables = {
             name: {
                 "columns": {
-                    name: {"unit": unit, "meaning": text} for name, (unit, text, *_) in _columns(frame).items()
+                    name: {"unit": unit, "meaning": text} for name, (unit, text, *_) in columns_of(frame).items()
                 },
-                "rows": [_plain(row) for row in frame.to_dict("records")],
+                "rows": [plain(row) for row in frame.to_dict("records")],
             }
             for name, frame in self.tables.items()
         }
         head = {"question": self.question, "study": self.study.name, "verdict": self.verdict}
-        return {**head, "numbers": _plain(self.numbers), "tables": tables}
+        return {**head, "numbers": plain(self.numbers), "tables": tables}
 
     def table(self, name: str | None = None) -> pd.DataFrame:
         """A table by name, the first one by default.
@@ -124,17 +106,33 @@ class Answer:
             raise unknown_name("table", f"there is no table {name!r}", name, self.tables)
         return self.tables[name]
 
+    def only(self, name: str) -> Answer:
+        """The answer with one of its tables, and the remarks on it.
+
+        Raises
+        ------
+        InputError
+            If the answer has no such table.
+        """
+        tables, remarks = {name: self.table(name)}, self.tables.get("remarks")
+        if remarks is not None:
+            tables["remarks"] = remarks[remarks["table"].isin([name, "all"])]
+        return replace(self, tables=tables)
+
     def render(self, form: str, table: str | None = None) -> str:
-        """The answer as text, JSON, LaTeX or HTML; one table of it as CSV."""
+        """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default the first, as CSV."""
+        if form == "csv":
+            return self.table(table).map(csv_cell).to_csv(index=False, lineterminator="\n")
+        if table is not None:
+            return self.only(table).render(form)
         if form == "json":
             return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
-        if form == "csv":
-            return self.table(table).to_csv(index=False, lineterminator="\n")
         if form == "latex":
-            return "\n".join(_latex(f"{self.question}-{name}", frame) for name, frame in self._short_tables.items())
+            tables = (latex_table(f"{self.question}-{name}", frame) for name, frame in self._short_tables.items())
+            return "\n".join([LATEX_PREAMBLE, *tables])
         if form == "html":
             sentences = [f"<p>{escape(text)}</p>" for text in (self.verdict, self._long_tables) if text]
-            return "\n".join([sentences[0], *map(_html, self._short_tables.values()), *sentences[1:]])
+            return "\n".join([sentences[0], *map(html_table, self._short_tables.values()), *sentences[1:]])
         console = Console(width=WIDTH, no_color=True, force_terminal=False)
         with console.capture() as capture:
             self.print(console)
@@ -143,19 +141,24 @@ class Answer:
     def print(self, console: Console) -> None:
         """Print the verdict, the tables and the numbers."""
         print_text(console, self.verdict)
-        print_parts(console, map(_terminal_table, self._short_tables.values()))
+        for frame in self._short_tables.values():
+            print_parts(console, terminal_tables(frame, console.width))
         if self._long_tables:
             print_text(console, self._long_tables)
-        print_text(console, "; ".join(f"{name}: {_text(value)}" for name, value in self.numbers.items()))
+        print_text(console, "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()))
+
+    @property
+    def _reader_tables(self) -> dict[str, pd.DataFrame]:
+        return {label: shown for name, frame in self.tables.items() for label, shown in reader_tables(name, frame)}
 
     @property
     def _short_tables(self) -> dict[str, pd.DataFrame]:
-        return {name: frame for name, frame in self.tables.items() if len(frame) <= MAX_ROWS}
+        return {name: frame for name, frame in self._reader_tables.items() if len(frame) <= MAX_ROWS}
 
     @property
     def _long_tables(self) -> str:
         """The tables that readers do not see, in a sentence."""
-        long = [f"{name} ({len(frame):,} rows)" for name, frame in self.tables.items() if len(frame) > MAX_ROWS]
+        long = [f"{name} ({len(frame):,} rows)" for name, frame in self._reader_tables.items() if len(frame) > MAX_ROWS]
         return f"By --format csv --table NAME: {', '.join(long)}." if long else ""
 
     def _repr_html_(self) -> str:
@@ -184,111 +187,9 @@ class Answer:
         if isinstance(value, list | tuple) and rest.isdecimal() and int(rest) < len(value):
             return [value[int(rest)]]
         if name in self.tables and rest in self.tables[name]:
-            return list(_plain(self.tables[name][rest].tolist()))
+            return list(plain(self.tables[name][rest].tolist()))
         known = [*self.numbers, *(f"{table}.{column}" for table, frame in self.tables.items() for column in frame)]
         raise unknown_name("fail_if", f"the answer has no number {key!r}", key, known)
-
-
-def _columns(frame: pd.DataFrame) -> dict[str, Column]:
-    return dict(frame.attrs.get("columns", {}))
-
-
-def _plain(value: Any) -> Any:
-    """A value as JSON has it, null where undefined."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    is_undefined = value is pd.NA or (isinstance(value, float) and not math.isfinite(value))
-    return None if is_undefined else value
-
-
-def _text(value: Any, number_format: str = ".4g") -> str:
-    """A value for readers; `-` where undefined."""
-    value = _plain(value)
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:{number_format}}"
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_text(inner, number_format)}" for name, inner in value.items()) or "-"
-    if isinstance(value, list):
-        is_interval = len(value) == 2 and not isinstance(value[0], dict)
-        return (" to " if is_interval else "; ").join(_text(inner, number_format) for inner in value) or "-"
-    return str(value)
-
-
-class _ReaderColumn(NamedTuple):
-    """A column as a reader sees it: its heading with the unit, its meaning, and texts."""
-
-    head: str
-    meaning: str
-    texts: list[str]
-    is_number: bool
-
-
-def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
-    """The columns of a table for readers: an interval stands in brackets behind its value."""
-    columns = _columns(frame)
-    for name in map(str, frame):
-        base = name.removesuffix(LOW).removesuffix(HIGH)
-        if base != name and base in frame:
-            continue
-        if len(frame) and frame[name].isna().all():  # undefined in every row
-            continue
-        column = columns.get(name, Column("", ""))
-        if not column.is_shown:
-            continue
-        texts = [_text(value, column.number_format) for value in frame[name]]
-        if f"{name}{LOW}" in frame:
-            ends = zip(frame[f"{name}{LOW}"], frame[f"{name}{HIGH}"], strict=True)
-            intervals = (_text([low, high], column.number_format) for low, high in ends)
-            pairs = zip(texts, intervals, strict=True)
-            texts = [text if text == "-" else f"{text} ({interval})" for text, interval in pairs]
-        unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
-        is_number = pd.api.types.is_numeric_dtype(frame[name])
-        yield _ReaderColumn(f"{name.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
-
-
-def _terminal_table(frame: pd.DataFrame) -> WholeTable:
-    columns = list(reader_columns(frame))
-    table = WholeTable(title=frame.attrs.get("title", ""))
-    for column in columns:
-        table.add_column(printable_text(column.head), justify="right" if column.is_number else "left")
-    for cells in zip(*(column.texts for column in columns), strict=True):
-        table.add_row(*cells)
-    return table
-
-
-def _html(frame: pd.DataFrame) -> str:
-    """A table with a caption, in which a screen reader finds the headings; texts have the class `label`."""
-    columns = list(reader_columns(frame))
-    classes = ["" if column.is_number else ' class="label"' for column in columns]
-    heads = "".join(
-        f'<th scope="col"{css} title="{escape(column.meaning)}">{escape(column.head)}</th>'
-        for css, column in zip(classes, columns, strict=True)
-    )
-    rows = (
-        "".join(f"<td{css}>{escape(cell)}</td>" for css, cell in zip(classes, cells, strict=True))
-        for cells in zip(*(column.texts for column in columns), strict=True)
-    )
-    body = "\n".join(f"<tr>{row}</tr>" for row in rows)
-    title = escape(frame.attrs.get("title", ""))
-    table = f"<table><caption>{title}</caption><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table>"
-    return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>' if body else ""
-
-
-def _latex(label: str, frame: pd.DataFrame) -> str:
-    """A booktabs table; in the preamble: booktabs."""
-    readable = pd.DataFrame({column.head: column.texts for column in reader_columns(frame)})
-    style = readable.style.hide().format(escape="latex").format_index(escape="latex", axis=1)
-    alignment = "".join("r" if column.is_number else "l" for column in reader_columns(frame))
-    caption = escaped_for_latex(frame.attrs.get("title", ""))
-    return style.to_latex(hrules=True, column_format=alignment, caption=caption, label=f"tab:{label}", position="htbp")
 
 
 def _draw_intervals(answer: Answer) -> Figure:

@@ -1,6 +1,7 @@
 """Every question is one function `(subject, evaluator, *, options) -> Answer`; here it becomes a call of the library.
 
-The command line makes its command from the same signature and docstring (`cli/questions.py`).
+The command line makes its command from the same signature and docstring (`cli/command.py`), as of every other public
+function.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from importlib import import_module
 from numbers import Integral, Real
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
@@ -61,22 +62,35 @@ Criterion = Annotated[str | None, "collision|below=X|points=X"]
 """What is unsafe: a collision, a safety degree below X [m], or at most X points of a rating; by default a collision if
 any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost.
 """
-COMMON_OPTIONS = {
-    "point": "Only this point of the study's matrix.",
-    "jobs": "Number of worker processes, by default one for each core.",
-    "pool": "Pool that simulates; by default new worker processes.",
-    "progress": "True for a bar on the terminal, or a function of a stage, the number done in it, and its total.",
-    "as_it_is_now": "If results were computed with other files or versions, simulate with the present ones and say so.",
-}
-"""Options that every question has."""
+Jobs = Annotated[int | None, Range(1, 1024)]
+"""A number of worker processes."""
+COMMON_OPTIONS = (
+    ("point", str | None, None, "Only this point of the study's matrix."),
+    ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
+    ("pool", Any, None, "Pool that simulates; by default new worker processes."),
+    (
+        "progress",
+        Any,
+        False,
+        "True for a bar on the terminal, or a function of a stage, the number done and its total.",
+    ),
+    (
+        *("as_it_is_now", bool, False),
+        "If results were computed with other files or versions, simulate with the present ones and say so.",
+    ),
+)
+"""Options that every question has: name, type, default, and meaning."""
 
 
 class Option(NamedTuple):
-    """An option of a question: the type of a value, its range or the form of its text, its default, and its meaning."""
+    """An option of a function: the type of a value, its range, choices or the form of its text, its default and its
+    meaning.
+    """
 
     name: str
     kind: type
     limits: Range | None
+    choices: tuple[str, ...]
     metavar: str | None
     is_repeated: bool
     default: Any
@@ -113,30 +127,19 @@ class Question:
             if parameter.kind is not parameter.KEYWORD_ONLY
         }
         """Further positional parameters, and whether each is a file instead of a subject."""
-        common = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in COMMON_OPTIONS]
+        common = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            for name, kind, default, _ in COMMON_OPTIONS
+        ]
         shown = [parameters[0], *(parameter for parameter in parameters[2:]), *common]
-        self.__signature__ = inspect.Signature(shown)
-        texts = "\n".join(f"{name}\n    {text}" for name, text in COMMON_OPTIONS.items())
+        self.__signature__ = inspect.Signature(shown, return_annotation="Answer")
+        texts = "\n".join(f"{name}\n    {text}" for name, _, _, text in COMMON_OPTIONS)
         self.__doc__ = f"{inspect.cleandoc(compute.__doc__ or '')}\n{texts}"
 
     @cached_property
     def options(self) -> list[Option]:
-        """The options by signature and docstring."""
-        texts = dict(
-            re.findall(r"^(\w+)\n((?:    .*\n?)+)", inspect.cleandoc(self.compute.__doc__ or ""), re.MULTILINE)
-        )
-        meanings = {name: " ".join(text.split()) for name, text in texts.items()}
-
-        def type_of(parameter: inspect.Parameter) -> Any:
-            """The type, which is a text where the module postpones annotations; others may name what is not loaded."""
-            hint = parameter.annotation
-            return eval(hint, self.compute.__globals__) if isinstance(hint, str) else hint
-
-        return [
-            _option(parameter, type_of(parameter), meanings.get(parameter.name, ""))
-            for parameter in inspect.signature(self.compute).parameters.values()
-            if parameter.kind is parameter.KEYWORD_ONLY
-        ]
+        """The options by signature and docstring, without those that all questions have."""
+        return options_of(self.compute)
 
     def __call__(
         self,
@@ -230,15 +233,30 @@ def find_question(name: str) -> Question:
     return found
 
 
+def options_of(function: Callable[..., Any]) -> list[Option]:
+    """The options of a function: its keyword-only parameters, as signature and numpydoc docstring describe them."""
+    pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
+    texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
+    names = inspect.unwrap(function).__globals__
+    options = []
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY:
+            hint = parameter.annotation  # a text where the module postpones annotations
+            meaning = " ".join(texts.get(parameter.name, "").split())
+            options.append(_option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning))
+    return options
+
+
 def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     limits, metavar = None, None
     if get_origin(hint) is Annotated:
         hint, extra = get_args(hint)
         limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
     is_repeated = get_origin(hint) is tuple
-    kinds = [kind for kind in (bool, int, float) if kind is hint or kind in get_args(hint)]
+    kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
     kind = str if is_repeated or not kinds else kinds[0]
-    return Option(parameter.name, kind, limits, metavar, is_repeated, parameter.default, meaning)
+    choices = get_args(hint) if get_origin(hint) is Literal else ()
+    return Option(parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning)
 
 
 def _name(source: StudyLike | Results) -> str:

@@ -22,7 +22,6 @@ from safevar_sumo.questions.case import Case, UnanswerableError
 from safevar_sumo.questions.explain.answer import Explained
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_figures
-from safevar_sumo.questions.research_questions.tables import lay_out
 from safevar_sumo.questions.subject import Results
 from safevar_sumo.questions.tolerance.answer import Tolerance
 from safevar_sumo.questions.words import question_command
@@ -57,13 +56,12 @@ HIDDEN_COLUMNS = ("lower", "upper", "not_simulated")
 """Columns of an answer's frame that the table beside its figure leaves out."""
 
 
-def list_tables(cases: Sequence[Case]) -> list[JsonObject]:
-    """Every table of the research questions; if none can be answered, one table with the reason."""
+def render_tables(cases: Sequence[Case]) -> Markup:
+    """Every table of the research questions; if none can be answered, the reason."""
     try:
-        answers = answer_questions(cases)
+        return Markup(answer_questions(cases).render("html"))
     except UnanswerableError as error:
-        return [table_data(pd.DataFrame(), "RQ1 to RQ3", [f"{error.source}: {error.problem}."])]
-    return [table_data(table.frame, table.title, table.notes) for answer in answers for table in lay_out(answer)]
+        return Markup("<p>{}</p>").format(f"{error.source}: {error.problem}.")
 
 
 def figure_data(figure: Figure, frame: pd.DataFrame) -> JsonObject:
@@ -83,7 +81,7 @@ def limits_data(tolerance: Tolerance) -> JsonObject:
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
     """Draw every figure of the research questions as a picture to embed in the page."""
     try:
-        figures_by_name, _ = draw_figures(cases)
+        figures_by_name = draw_figures(cases)
     except UnanswerableError:
         return []
     return [_picture(name, figure) for name, figure in figures_by_name.items()]
@@ -130,8 +128,7 @@ def commands_to_reproduce(inputs: Sequence[ReportInput], sections: Collection[st
     if "compare" in sections:
         commands.append(("The comparison", f"{PROGRAM_COMMAND} compare {directories}{flags}"))
     if "questions" in sections:
-        commands.append(("The tables of RQ1 to RQ3", f"{PROGRAM_COMMAND} tables {directories}"))
-        commands.append(("The figures", f"{PROGRAM_COMMAND} figures {directories} --out figures"))
+        commands.append(("RQ1 to RQ3", f"{PROGRAM_COMMAND} tables {directories} --figures figures"))
     return commands
 
 
@@ -275,7 +272,7 @@ def make_page(
         title=f"Safety report: {names}",
         sections={name: heading for name, heading in SECTIONS.items() if name in sections},
         studies=studies,
-        tables=list_tables(cases) if cases else [],
+        tables=render_tables(cases) if cases else "",
         figures=embed_figures(cases) if cases else [],
         commands=commands_to_reproduce(inputs, sections) if "reproduce" in sections else [],
         general_limits=GENERAL_LIMITS,

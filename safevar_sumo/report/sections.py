@@ -19,7 +19,6 @@ from safevar_sumo.questions.explain.causes import MIN_ROBUST_SHARE, Cause
 from safevar_sumo.questions.explain.failure import Explanation
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.opinion import assemble_both_systems, judge_causes
-from safevar_sumo.questions.research_questions.tables import BoldText
 from safevar_sumo.questions.words import number_of, points_in_words, question_command
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
@@ -46,10 +45,7 @@ def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> Js
     return {
         "title": title,
         "heads": [] if frame.empty else [*frame.index.names, *columns.get_level_values(-1)],
-        "rows": [
-            [{"text": _cell_text(cell), "bold": isinstance(cell, BoldText)} for cell in row]
-            for row in frame.reset_index().to_numpy(dtype=object).tolist()
-        ],
+        "rows": [[*map(_cell_text, row)] for row in frame.reset_index().to_numpy(dtype=object).tolist()],
         "labels": labels,
         "spans": [("", labels), *blocks.items()] if blocks else [],
         "notes": list(notes),

@@ -218,4 +218,4 @@ def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
         'extends = "smoke"\n[search]\nalgorithms = ["mine:Mine"]\nruns = 1\nevaluations = 4\npopulation = 4\n'
     )
     results = sv.run("mine.toml", jobs=1)
-    assert "My own search" in sv.tables(results, question="rq1")._repr_markdown_()
+    assert "My own search" in sv.tables(results).only("rq1").render("text")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import json
 import os
-import pkgutil
 import re
 import subprocess
 import sys
@@ -20,7 +18,6 @@ import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
 
-from safevar_sumo import cli
 from safevar_sumo.cli.arguments import Condition
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
@@ -45,12 +42,14 @@ def loaded(code: str) -> set[str]:
     )
 
 
-def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
-    for module in pkgutil.iter_modules(cli.__path__):
-        importlib.import_module(f"safevar_sumo.cli.{module.name}")
-    assert set(commands.commands) | set(QUESTIONS) == set(COMMANDS)
+def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() -> None:
+    assert set(QUESTIONS) <= set(COMMANDS)
     output = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
-    assert all(f" {name} {sentence}" in output for name, (_, sentence) in COMMANDS.items())
+    for name in COMMANDS:
+        found = commands.get_command(None, name)  # type: ignore[arg-type]
+        assert found is not None
+        sentence, _, _ = (found.help or "").partition("\n\n")
+        assert f" {name} {' '.join(sentence.split())}" in output
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))

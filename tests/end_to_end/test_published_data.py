@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -58,12 +57,13 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_figures_are_files_of_the_kind_asked_for(results: Path, in_tmp: Path) -> None:
-    done = run("figures", str(results), "--out", "pictures", "--format", "svg")
+def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
+    run("tables", str(results), "--figures", "pictures", "--plot", "counts.svg")
     files = sorted(Path("pictures").iterdir())
-    assert len(files) == 5
-    assert sorted(done.stdout.split()) == [str(path) for path in files]
-    assert all(path.read_bytes().startswith(b"<?xml") for path in files)
+    assert len(files) == 10
+    starts = {".png": b"\x89PNG", ".pdf": b"%PDF"}
+    assert all(path.read_bytes().startswith(starts[path.suffix]) for path in files)
+    assert Path("counts.svg").read_bytes().startswith(b"<?xml")
 
 
 def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Path) -> None:
@@ -87,17 +87,17 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()
     Path("part/solutions.csv").unlink()
-    output = run("tables", "part").stdout
-    assert "unfinished, rs 1 of 2 runs" in output
+    output = json_of("tables", "part")
+    assert "unfinished, rs 1 of 2 runs" in str(output["tables"]["remarks"])
     assert "rs 1 of 2 runs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
-    records = json.loads(run("tables", "part", "--rq", "rq2", "--format", "json").stdout)
+    records = output["tables"]["rq2"]["rows"]
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
-    against = json.loads(run("tables", "part", "--rq", "rq2", "--algorithm", "rs", "--format", "json").stdout)
+    against = json_of("tables", "part", "--algorithm", "rs")["tables"]["rq2"]["rows"]
     assert {(one["algorithm"], one["baseline"]) for one in against} == {("rs", "nsga2")}
     sizes = zip([one["effect_size"] for one in records], [1 - one["effect_size"] for one in against], strict=True)
     assert all(one == pytest.approx(other) for one, other in sizes), "the same pair from the other side"
     Path("part/runs/rs-00.jsonl").unlink()
-    refused("tables", "part", "--rq", "rq2", message=("only nsga2",))
+    assert "only nsga2" in run("tables", "part", "--table", "rq2").stdout
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
     refused("tables", "part", message=("no finished run",))

@@ -230,7 +230,7 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
     page = report(place, paper=True, jobs=2)
     commands_of_page = [shlex.split(html.unescape(line)) for line in re.findall("<code>(python -m .*?)</code>", page)]
     printed = {typed[3]: typed[3:] for typed in commands_of_page}
-    assert {"explain", "tolerance", "risk", "rules", "simulate", "tables", "figures"} <= set(printed)
+    assert {"explain", "tolerance", "risk", "rules", "simulate", "tables"} <= set(printed)
 
     text = words_of(page)
     for question in ("explain", "tolerance", "risk", "rules"):

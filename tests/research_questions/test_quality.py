@@ -5,7 +5,6 @@ same numbers in every format, LaTeX that compiles, figures that can be read.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import re
 import shutil
@@ -22,7 +21,6 @@ from hypothesis import given, strategies as st
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_convergence, draw_pareto_fronts
-from safevar_sumo.questions.research_questions.formats import as_json, as_latex, as_markdown, as_text
 from safevar_sumo.questions.research_questions.fronts import (
     compute_convergence,
     compute_indicators,
@@ -166,7 +164,7 @@ def rich_case(**changes: Any) -> Case:
 
 
 def special_case() -> Case:
-    """Names and units with the characters that LaTeX and Markdown read as commands."""
+    """Names and units with the characters that LaTeX reads as commands."""
     tables = {
         name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2)
         for name in ("a&b", "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star|", "µ ° ² ä")
@@ -197,8 +195,7 @@ DOCUMENT = r"""\documentclass{article}
 @pytest.mark.slow
 @pytest.mark.parametrize("cases", CASES.values(), ids=CASES)
 def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
-    answers = answer_questions(cases)
-    document = DOCUMENT % as_latex(answers)
+    document = DOCUMENT % answer_questions(cases).render("latex")
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
     done = subprocess.run(
         ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"],
@@ -212,7 +209,7 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("question", "keys"),
+    ("name", "columns"),
     [
         ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original enough_runs"),
         (
@@ -220,18 +217,32 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
             "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm enough_runs evaluations "
             "baseline_evaluations",
         ),
-        ("rq3.2", "setting characteristic j percent"),
+        (
+            "rq1-runs",
+            "setting algorithm metric p_value p_holm effect_size magnitude runs method mean original enough_runs",
+        ),
+        ("rq2-runs", "setting baseline metric p_value p_holm effect_size magnitude n1 n2 method algorithm enough_runs"),
+        ("evaluations", "setting algorithm run requested simulated budget"),
+        ("rq3.1", "setting run j count"),
+        ("rq3.2", "setting characteristic j percent rank"),
         ("rq3.3", "setting characteristic direction j pc delta n"),
         ("rq3.3-safety", "setting quantity j value percent n"),
         ("collisions", "setting algorithm solutions collisions share"),
+        ("combinations", "setting rank characteristics percent"),
+        (
+            "weather",
+            "setting other characteristic percent percent_other difference rank rank_other increase increase_other "
+            "decrease decrease_other",
+        ),
     ],
 )
-def test_json_records_have_the_promised_keys(question: str, keys: str) -> None:
-    for one in json.loads(as_json(answer_questions(CASES["one"], question)[:1])):
-        assert list(one) == [*keys.split(), *(["rank"] if question == "rq3.2" and one["j"] == "any" else [])]
-        assert all(
-            isinstance(one[name], int) for name in ("n1", "n2", "n", "rank", "solutions", "collisions") if name in one
-        )
+def test_tables_have_the_promised_columns(name: str, columns: str) -> None:
+    table = answer_questions(CASES["two"]).to_dict()["tables"][name]
+    assert set(table["columns"]) == {*columns.split(), *(["significant"] if "p_value" in columns else [])}
+    for cells in table["rows"]:
+        assert set(cells) == set(table["columns"])
+        counts = [cells.get(name) for name in ("n1", "n2", "n", "rank", "solutions", "collisions", "count")]
+        assert all(isinstance(count, int) for count in counts if count is not None)
 
 
 def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
@@ -241,17 +252,28 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     case = made_up(
         *(row(name, run=i % 7, sd=sd - i / 100) for name, sd in (("nsga2", 0.5), ("rs", 1.5)) for i in range(30))
     )
-    for question, stands_out in (("rq1", False), ("rq2", True)):
-        (answer,) = answer_questions([case], question)
-        lines = re.findall(".*<0.001.*", as_text([answer]))
-        assert lines
-        assert ("*" in str(lines)) is stands_out
-        assert ("too few runs of NSGA-II, RS for a test (8 are needed)" in str(answer.notes)) is not stands_out
-    (imported,) = answer_questions([dataclasses.replace(case, has_runs=False)], "rq1")
-    assert "*" in as_text([imported]).replace("(or *)", ""), "the runs of imported solutions are unknown"
+    answer = answer_questions([case])
+    few = "too few runs of NSGA-II, RS for a test (8 are needed)"
+    for name, stands_out in (("rq1", False), ("rq2", True)):
+        table, remarks = answer.only(name).tables.values()
+        assert (table["p_value"] < 0.001).any()
+        assert table["significant"].any() == stands_out
+        assert (few in "".join(remarks["remark"])) is not stands_out
+    imported = answer_questions([dataclasses.replace(case, has_runs=False)])
+    assert imported.tables["rq1"]["significant"].any(), "the runs of imported solutions are unknown"
 
 
 def test_every_rendering_has_every_effect() -> None:
-    answers = answer_questions([three_algorithms()])
-    for output in (render(answers) for render in (as_text, as_markdown, as_latex)):
-        assert all(f"{effect:.3f}" in output for answer in answers for effect in answer.frame.get("effect_size", ()))
+    answer = answer_questions([three_algorithms()])
+    effects = [effect for frame in answer.tables.values() for effect in frame.get("effect_size", ())]
+    for form in ("text", "latex", "html"):
+        output = answer.render(form)
+        assert all(f"{effect:.3f}" in output for effect in effects)
+
+
+def test_readers_see_a_long_table_crosswise_and_every_table_within_80_columns() -> None:
+    text = answer_questions(CASES["two"]).only("rq3.2").render("text")
+    assert re.search(r"setting +┃ *characteristic +┃ *1 ┃ *2 ┃ *3 ┃ *any ", text)
+    assert re.search(r"made-up +│ *mass +│", text)
+    for line in answer_questions(CASES["two"]).render("text").splitlines()[1:]:
+        assert len(line) <= 80

@@ -29,7 +29,6 @@ from safevar_sumo.questions.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.questions.research_questions.comparisons import rq1, rq1_runs, rq2, rq2_runs, summary_lines
-from safevar_sumo.questions.research_questions.formats import as_text
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
@@ -172,15 +171,14 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
         assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, 1 - expected.effect_size)
     without = made_up(*(row(name, run, sd=sd) for name, sd in (("rs", 1.0), ("mine", 2.0)) for run in (0, 1)))
     without = dataclasses.replace(without, titles={"mine": "My search"})
-    (answer,) = answer_questions([without], "rq2")
-    assert set(zip(answer.frame["algorithm"], answer.frame["baseline"], strict=True)) == {("rs", "mine")}
-    assert only(answer.frame, metric="safety_degree")["effect_size"] == 1
-    text = as_text([answer])
-    assert "RQ2: RS against the other algorithms" in text
-    assert "A12 above 0.5: RS is better." in text
-    assert "My search" in text
-    with pytest.raises(UnanswerableError, match="no finished run of nsga2"):
-        answer_questions([without], "rq2", "nsga2")
+    answer = answer_questions([without]).only("rq2")
+    table = answer.tables["rq2"]
+    assert set(zip(table["algorithm"], table["baseline"], strict=True)) == {("rs", "mine")}
+    assert only(table, metric="safety_degree")["effect_size"] == 1
+    assert re.search(r"RS +│My search", answer.render("text"))
+    asked = answer_questions([without], "nsga2").only("rq2")
+    assert asked.tables["rq2"].empty
+    assert "no finished run of nsga2" in " ".join(asked.tables["remarks"]["remark"])
 
 
 def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> None:
@@ -193,14 +191,15 @@ def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> Non
     case = made_up(*rows, evaluations=seen)
     counts = count_evaluations(case)
     assert counts[["requested", "simulated"]].to_numpy().tolist() == [[100, 46]] * 2 + [[40, 40]] * 2
-    (answer,) = answer_questions([case], "rq2")
-    assert answer.frame[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [[46, 40]]
+    answer = answer_questions([case])
+    table = answer.tables["rq2"]
+    assert table[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [[46, 40]]
     note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it stops by its own rule)."
-    assert f"made-up: settings that a run simulates, mean: {note}" in answer.notes
-    assert "46" in as_text(answer_questions([case], "evaluations"))
-    (imported,) = answer_questions([made_up(*rows, has_runs=False)], "rq2")
-    assert imported.frame["evaluations"].isna().all()
-    assert "number of evaluations" in "".join(imported.notes)
+    assert f"made-up: settings that a run simulates, mean: {note}" in [*answer.tables["remarks"]["remark"]]
+    assert "46" in answer.only("evaluations").render("text")
+    imported = answer_questions([made_up(*rows, has_runs=False)])
+    assert imported.tables["rq2"]["evaluations"].isna().all()
+    assert "number of evaluations" in "".join(imported.tables["remarks"]["remark"])
 
 
 def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
@@ -212,9 +211,11 @@ def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
     assert re.search(rf"A12 of NSGA-II against the original vehicle: SD 0\.00, .*{few}", lines)
     assert re.search(r"A12 of NSGA-II against RS: IGD (?!.*too few)", lines), "five runs can differ significantly"
     assert "RQ2 over runs: only nsga2 has finished runs" in "\n".join(summary_lines(made_up(row())))
-    notes = ["".join(answer_questions([five], name)[0].notes) for name in ("rq1-runs", "rq2-runs")]
-    assert "too few runs for all 8 tests of RQ1 (8 are needed)" in notes[0]
-    assert "too few runs" not in notes[1]
+    remarks = answer_questions([five]).tables["remarks"]
+    assert "too few runs for all 8 tests of RQ1 (8 are needed)" in "".join(
+        remarks[remarks["table"] == "rq1-runs"]["remark"]
+    )
+    assert "rq2-runs" not in [*remarks["table"]]
 
 
 def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
@@ -328,7 +329,9 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     with pytest.raises(
         InputError, match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold, step_length"
     ):
-        answer_questions([clear, other], "weather")
+        find_weather_pairs([clear, other])
+    remarks = answer_questions([clear, other]).only("weather").tables["remarks"]["remark"]
+    assert "differ in the weather alone" in " ".join(remarks)
     with pytest.raises(InputError, match="these two have equally clear weather"):
         find_weather_pairs([clear, clear])
 

@@ -1,86 +1,117 @@
-"""Answers to the research questions, by name and over several cases: tidy frames, and notes on missing data.
-
-In the frames, the columns `setting` and `other` hold the names of cases.
-"""
+"""The research questions of the paper, answered about results as tables and figures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from safevar_sumo.errors import unknown_name
-from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, solutions_for_metric
-from safevar_sumo.questions.research_questions import changes, comparisons
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, load_cases, solutions_for_metric
+from safevar_sumo.questions.research_questions import changes
+from safevar_sumo.questions.research_questions.comparisons import titles_of
+from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.questions.research_questions.statistics import FEWEST_RUNS
+from safevar_sumo.questions.research_questions.tables import RQ2_TABLES, TABLES, WEATHER
 
-SAFETY_TABLE = "rq3.3-safety"
-"""Name of the table of effects on safety, the footer of the paper's table of RQ3.3.
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-The question rq3.3 is answered by both tables.
-"""
-WEATHER, EVALUATIONS = "weather", "evaluations"
-FRAMES: Mapping[str, Callable[..., pd.DataFrame]] = {
-    "rq1": comparisons.rq1,
-    "rq2": comparisons.rq2,
-    "rq1-runs": comparisons.rq1_runs,
-    "rq2-runs": comparisons.rq2_runs,
-    EVALUATIONS: count_evaluations,
-    "rq3.1": changes.rq31,
-    "rq3.2": changes.rq32,
-    "rq3.3": changes.rq33,
-    SAFETY_TABLE: changes.rq33_safety,
-    "collisions": changes.count_collisions,
-    "combinations": changes.frequent_combinations,
-    WEATHER: changes.compare_weathers,
-}
-"""Functions that answer a question from one case, and about the weather from all."""
-QUESTION_NAMES = tuple(FRAMES)
+    from safevar_sumo.questions.subject import Results
+
+REMARKS = {"table": Column("", "table"), "remark": Column("", "what is missing or left out there, and why")}
 
 
-class TableAnswer(NamedTuple):
-    """The answer to the question `name`: a tidy frame over all cases, empty if no case has an answer, and its notes."""
+def tables(*results: Results | str | Path, algorithm: str = "", figures: Path | None = None) -> Answer:
+    """Answer the research questions of the paper from results, one for each case, as tables and figures.
 
-    name: str
-    frame: pd.DataFrame
-    notes: tuple[str, ...]
-    cases: Sequence[Case] = ()
+    Parameters
+    ----------
+    algorithm
+        The algorithm that RQ2 compares with all others; by default NSGA-II or, without it, the study's first.
+    figures
+        Draw every figure into this directory, as png and pdf.
+    """
+    cases = _cases_of(results)
+    answer = answer_questions(cases, algorithm)
+    if figures is not None:
+        save_figures(cases, figures)
+    return answer
 
 
-def answer_questions(cases: Sequence[Case], question: str | None = None, algorithm: str = "") -> list[TableAnswer]:
-    """Answer one question, or all questions; RQ2 compares `algorithm`, by default NSGA-II, with the others.
+def figures(*results: Results | str | Path) -> dict[str, Figure]:
+    """Every figure of results by name, such as "pareto-fronts"; of several results, the case's name comes first:
+    "rain-pareto-fronts".
 
     Raises
     ------
     InputError
-        If there is no such question, or no case has an answer.
+        If no figure can be drawn.
     """
-    if question is not None and question not in QUESTION_NAMES:
-        raise unknown_name("question", f"there is no question {question!r}", question, QUESTION_NAMES)
-    names = QUESTION_NAMES if question is None else (question,)
-    if question == "rq3.3":
-        names = (question, SAFETY_TABLE)
-    answers, all_errors = [], []
-    for name in names:
-        frames, notes, case_notes = [], [], []
+    return draw_figures(_cases_of(results))
+
+
+def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
+    return load_cases([source if isinstance(source, str | Path) else source.directory for source in results])
+
+
+def answer_questions(cases: Sequence[Case], algorithm: str = "") -> Answer:
+    """Every table of the cases; a table that no case answers has no row, and a remark says why.
+
+    Raises
+    ------
+    UnanswerableError
+        If no question has an answer.
+    """
+    words = titles_of(cases)
+    frames: dict[str, pd.DataFrame] = {}
+    remarks, errors = list[tuple[str, str]](), list[UnanswerableError]()
+    for name, (title, compute, columns, wide) in TABLES.items():
+        parts = list[pd.DataFrame]()
         for group in [cases] if name == WEATHER else [[case] for case in cases]:
             try:
-                frame = FRAMES[name](*group, algorithm) if name in ("rq2", "rq2-runs") else FRAMES[name](*group)
+                part = compute(*group, *([algorithm] if name in RQ2_TABLES else []))
             except UnanswerableError as error:
-                all_errors.append(error)
-                notes.append(f"{error.source}: {error.problem}.")
+                errors.append(error)
+                remarks.append((name, f"{error.source}: {error.problem}."))
             else:
-                frames.append(frame)
-                compared = {*frame["setting"], *frame["other"]} if name == WEATHER else {case.name for case in group}
-                case_notes += [note for case in group if case.name in compared for note in _notes(name, case, frame)]
-        table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
-        answers.append(TableAnswer(name, table, tuple(dict.fromkeys([*notes, *case_notes])), cases))
-    if all_errors and all(answer.frame.empty for answer in answers):
-        raise all_errors[0]
-    return answers
+                parts.append(part)
+                remarks += [(name, note) for case in group for note in _remarks(name, case, part)]
+        shown = {
+            key: column._replace(is_shown=len(cases) > 1) if key == "setting" else column
+            for key, column in columns.items()
+        }
+        frames[name] = tabulate(
+            title, shown, pd.concat(parts, ignore_index=True) if parts else [], wide=wide, words=words
+        )
+    if all(frame.empty for frame in frames.values()):
+        raise errors[0]
+    remarks = [("all", remark) for case in cases for remark in case.remarks] + remarks
+    frames["remarks"] = tabulate("Remarks", REMARKS, list(dict.fromkeys(remarks)))
+    return Answer(
+        question="tables",
+        study=cases[0].study,
+        verdict=" ".join(map(_verdict, cases)),
+        numbers={"cases": len(cases), "solutions": sum(len(case.solutions) for case in cases)},
+        tables=frames,
+        draw=lambda answer: draw_change_counts(cases),
+    )
+
+
+def _verdict(case: Case) -> str:
+    """How many of a case's solutions collide, and how many of NSGA-II's are critical."""
+    collisions = are_collisions(case.solutions).sum()
+    text = f"{case.name}: {collisions} of {len(case.solutions)} solutions collide"
+    try:
+        critical = len(changes.critical_solutions(case))
+    except UnanswerableError:
+        return f"{text}."
+    of_all = len(case.solutions_of(NSGA2))
+    return f"{text}; {critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle."
 
 
 def describe_evaluations(case: Case) -> str:
@@ -95,42 +126,34 @@ def describe_evaluations(case: Case) -> str:
     return f"settings that a run simulates, mean: {'; '.join(texts)}."
 
 
-def _notes(question: str, case: Case, frame: pd.DataFrame) -> Iterator[str]:
-    """Notes on a case for the readers of its frame."""
-    yield from case.remarks
-    prefix, rq = f"{case.name}: ", question.split("-")[0].upper()
-    if question in ("rq1", "rq2"):
-        few = frame.loc[~frame["enough_runs"], "algorithm" if question == "rq1" else "baseline"].unique()
+def _remarks(table: str, case: Case, frame: pd.DataFrame) -> Iterator[str]:
+    """What a case's frame leaves out."""
+    prefix, rq = f"{case.name}: ", table.split("-")[0].upper()
+    if table in ("rq1", "rq2"):
+        few = frame.loc[~frame["enough_runs"], "algorithm" if table == "rq1" else "baseline"].unique()
         if names := ", ".join(map(case.title_of, few)):
             yield (
                 f"{prefix}too few runs of {names} for a test ({FEWEST_RUNS[rq]} are needed): "
-                "no p-value of pooled solutions stands out."
+                "no p-value of pooled solutions is significant."
             )
         for metric in case.scoring.metrics:
             values = solutions_for_metric(case.solutions, metric)[metric.name]
             if undefined := int(values.isna().sum()):
-                share = f"{undefined} of {len(values)} solutions"
-                yield f"{prefix}{metric.name} is undefined in {share}, which the tests omit."
+                yield f"{prefix}{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
         undefined_names = ", ".join(metric for metric, value in case.original.items() if math.isnan(value))
-        if question == "rq1" and undefined_names:
+        if table == "rq1" and undefined_names:
             yield f"{prefix}the original vehicle's {undefined_names} is undefined, so that no test uses it."
-        if question == "rq2" and not case.has_runs:
+        if table == "rq2" and not case.has_runs:
             yield (
                 f"{prefix}igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is their "
                 "number of evaluations known."
             )
-        elif question == "rq2" and len(case.evaluations):
+        elif table == "rq2" and len(case.evaluations):
             yield prefix + describe_evaluations(case)
-    if question in ("rq1-runs", "rq2-runs"):
+    if table in ("rq1-runs", "rq2-runs"):
         tests = frame.dropna(subset="effect_size")
         if few_count := len(tests) - tests["enough_runs"].sum():
             how_many = "all" if few_count == len(tests) else f"{few_count} of the"
             yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({FEWEST_RUNS[rq]} are needed)."
-    if question.startswith("rq3") or question in ("combinations", WEATHER):
-        critical_count, solution_count = len(changes.critical_solutions(case)), len(case.solutions_of(NSGA2))
-        yield f"{prefix}{critical_count} of {case.title_of(NSGA2)}'s {solution_count} solutions are critical."
-    if question == "combinations" and frame.empty:
+    if table == "combinations" and frame.empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."
-    if question == "rq3.3":
-        units = (f"{item.name} {item.unit}" for item in case.characteristics if item.unit != "-")
-        yield f"Units of delta: {', '.join(units)}."

@@ -36,13 +36,6 @@ from safevar_sumo.questions.research_questions.statistics import (
 from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import JsonObject
 
-TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
-RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original", "enough_runs"]
-RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS, "algorithm", "enough_runs"]
-RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
-RQ1_RUNS_COLUMNS += ["mean", "original", "enough_runs"]
-RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS, "algorithm", "enough_runs"]
-
 MORE_UNSAFE = "below 0.5: the runs are more unsafe than the original vehicle"
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
@@ -54,7 +47,7 @@ def rq1(case: Case) -> pd.DataFrame:
     `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are more unsafe; `mean` is
     the mean over the algorithm's solutions, `original` the original vehicle's value.
     """
-    return pd.DataFrame(_test_original(case), columns=RQ1_COLUMNS)
+    return _with_significance(pd.DataFrame(_test_original(case)))
 
 
 def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
@@ -72,7 +65,7 @@ def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
         simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
     sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
     evaluations = {name: frame[side].map(simulated).astype(float) for name, side in sides.items()}
-    return frame[RQ2_COLUMNS].assign(**evaluations)
+    return _with_significance(frame.assign(**evaluations))
 
 
 def rq1_runs(case: Case) -> pd.DataFrame:
@@ -83,7 +76,7 @@ def rq1_runs(case: Case) -> pd.DataFrame:
     `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
     """
     tests = compare_over_runs(case)
-    return tests[tests.index == "RQ1"][RQ1_RUNS_COLUMNS]
+    return tests[tests.index == "RQ1"]
 
 
 def rq2_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
@@ -94,7 +87,7 @@ def rq2_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
     """
     tests = compare_over_runs(case, algorithm)
     opponents_of(case, algorithm)  # raises if RQ2 has no answer
-    return tests[tests.index == "RQ2"][RQ2_RUNS_COLUMNS]
+    return tests[tests.index == "RQ2"]
 
 
 def compare_over_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
@@ -103,7 +96,15 @@ def compare_over_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
     if len(case.algorithms) > 1:
         rows["RQ2"] = _test_opponents(case, algorithm, over_runs=True)
     tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]))
+    return _with_significance(tests.assign(p_holm=correct_by_holm(tests["p_value"])))
+
+
+def _with_significance(tests: pd.DataFrame) -> pd.DataFrame:
+    """Tests with the column `significant`: where p-values are corrected, the corrected one counts; where solutions of
+    runs are pooled, there have to be enough runs for a test.
+    """
+    is_significant = tests["p_holm"] < ALPHA if "p_holm" in tests else (tests["p_value"] < ALPHA) & tests["enough_runs"]
+    return tests.assign(significant=is_significant)
 
 
 def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:

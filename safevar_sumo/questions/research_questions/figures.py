@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
+from safevar_sumo.errors import warn
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.questions.case import Case, UnanswerableError
 from safevar_sumo.questions.figures import (
@@ -24,8 +26,7 @@ from safevar_sumo.questions.figures import (
     new_panels,
     save,
 )
-from safevar_sumo.questions.research_questions.answer import answer_questions
-from safevar_sumo.questions.research_questions.changes import ANY, changes_of, critical_solutions, rq32
+from safevar_sumo.questions.research_questions.changes import ANY, changes_of, critical_solutions, rq31, rq32
 from safevar_sumo.questions.research_questions.fronts import (
     REFERENCE_COORDINATE,
     compute_convergence,
@@ -148,16 +149,22 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     UnanswerableError
         If no case has an answer.
     """
-    (answer,) = answer_questions(cases, "rq3.1")
-    groups = answer.frame.groupby("setting", sort=False)
+    counts_by_case, errors = dict[str, pd.DataFrame](), list[UnanswerableError]()
+    for case in cases:
+        try:
+            counts_by_case[case.name] = rq31(case)
+        except UnanswerableError as error:
+            errors.append(error)
+    if not counts_by_case:
+        raise errors[0]
     title = "number of changed characteristics"
-    figure, axes = new_panels(title, len(groups), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
-    for axis, (name, counts) in zip(axes, groups, strict=True):
+    figure, axes = new_panels(title, len(counts_by_case), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
+    for axis, (name, counts) in zip(axes, counts_by_case.items(), strict=True):
         numbers, samples = zip(*counts.groupby("j", sort=False)["count"], strict=True)
         axis.boxplot(samples, tick_labels=numbers, widths=0.8, patch_artist=True, boxprops={"facecolor": SKY_BLUE})
         runs = counts["run"].nunique()
         axis.set(xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)")
-        axis.set_title(escape_dollars(str(name)), fontsize=FONT_SIZE)
+        axis.set_title(escape_dollars(name), fontsize=FONT_SIZE)
         axis.locator_params(axis="y", integer=True, min_n_ticks=1)
     return figure
 
@@ -231,7 +238,6 @@ def _critical_changes(case: Case) -> FloatArray:
     return changes
 
 
-FORMATS = ("png", "pdf", "svg")
 COUNTS_FIGURE = "rq3.1-number-of-changes"
 """The figure that has all cases side by side."""
 FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
@@ -242,9 +248,13 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 }
 
 
-def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
-    """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the
-    case's name.
+def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
+    """Every figure of the cases by name; with several cases, names start with the case's name.
+
+    Warns
+    -----
+    UserWarning
+        For each reason why figures are missing.
 
     Raises
     ------
@@ -262,22 +272,21 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
             errors.append(error)
     if not figures:
         raise errors[0]
-    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in errors))
+    for reason in dict.fromkeys(f"no figure: {error.source}: {error.problem}" for error in errors):
+        warn(reason)
+    return figures
 
 
-def save_figures(cases: Sequence[Case], directory: Path, file_format: str) -> tuple[list[Path], list[str]]:
-    """Draw every figure into a file; returns the files, and the reasons for missing figures.
+def save_figures(cases: Sequence[Case], directory: Path) -> None:
+    """Draw every figure into a png and a pdf file.
 
     Raises
     ------
     InputError
         If the directory cannot be written, or no figure can be drawn.
     """
-    figures, reasons = draw_figures(cases)
+    figures = draw_figures(cases)
     make_directory(directory)
-    files = []
-    for name, figure in figures.items():
+    for (name, figure), ending in product(figures.items(), ("png", "pdf")):
         file_name = re.sub(r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name).strip("-")
-        files.append(directory / f"{file_name}.{file_format}")
-        save(figure, files[-1])
-    return files, reasons
+        save(figure, directory / f"{file_name}.{ending}", "figures")

@@ -13,8 +13,7 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator, Interval
 from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, escape_dollars, new_figure
-from safevar_sumo.questions.research_questions.formats import LATEX_NEEDS, markdown_table, render_latex
-from safevar_sumo.questions.research_questions.tables import Table
+from safevar_sumo.questions.tables import Column, latex_table, tabulate
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
 from safevar_sumo.scenarios import Point, Scenario
@@ -249,9 +248,10 @@ class LimitsSheet:
         if format_name == "csv":
             return str(frame.to_csv(index=False, lineterminator="\n"))
         if format_name == "markdown":
-            return markdown_table([list(frame.columns), *frame.to_numpy().tolist()], 2) + "\n"
-        table = Table(f"Limits: {self.subject}", frame.set_index("characteristic"))
-        return f"{LATEX_NEEDS}\n{render_latex(table, 'limits')}"
+            rows = [[*frame.columns], [":---"] * len(frame.columns), *frame.to_numpy().tolist()]
+            return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+        columns = {str(name): Column("", "") for name in frame.columns}
+        return latex_table("limits", tabulate(f"Limits: {self.subject}", columns, frame))
 
     def parts(self) -> Iterator[WholeTable | str]:
         """The sheet as a table for the terminal, without columns that have no entry, and a sentence for each

@@ -1,0 +1,172 @@
+"""The command of a function: its parameters and its help are those of the function's signature and docstring."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import operator
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+from rich.console import Console
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.output import check_writable
+from safevar_sumo.questions.answer import FORMATS, Answer
+from safevar_sumo.questions.ask import Option, options_of
+from safevar_sumo.questions.changes import NUMBER_PATTERN
+from safevar_sumo.results import SOLUTIONS
+from safevar_sumo.study import study_names
+
+GATE_EXIT_CODE = 3
+"""Exit code of a command if a condition of --fail-if holds, or a limit is not kept."""
+PICTURE_ENDINGS = (".png", ".pdf", ".svg")
+LIBRARY_ONLY = ("pool", "progress")
+"""Options that only calls of the library have; a command shows its progress."""
+METAVARS = {"source": "STUDY|DIR", "subject": "STUDY|DIR", "case": "DIR", "results": "DIR", "directory": "DIR"}
+"""How the help names positional parameters, unless by their names."""
+OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
+CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
+
+
+def command_of(name: str, function: Callable[..., Any]) -> click.Command:
+    """The command that calls a function.
+
+    An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a condition of --fail-if
+    holds. A text is printed, too.
+    """
+    signature = inspect.signature(function)
+    positional = [one for one in signature.parameters.values() if one.kind is not one.KEYWORD_ONLY]
+    options = [option for option in options_of(function) if option.name not in LIBRARY_ONLY]
+    constants = {"progress": True} if "progress" in signature.parameters else {}
+
+    def call(**values: Any) -> Any:
+        subjects: list[Any] = []
+        for one in positional:
+            value = values.pop(one.name)
+            subjects += value if one.kind is one.VAR_POSITIONAL else [value]
+        return function(
+            *subjects, **{option.name: option.check(values[option.name]) for option in options}, **constants
+        )
+
+    def print_answer(
+        form: str, as_json: bool, table: str | None, plot: Path | None, fail_if: tuple[str, ...], **values: Any
+    ) -> None:
+        conditions = [_parse(text) for text in fail_if]
+        _check_picture(plot)
+        answer: Answer = call(**values)
+        _print(answer, "json" if as_json else form, table)
+        if plot is not None:
+            from safevar_sumo.questions.figures import save
+
+            save(answer.figure(), plot, "plot")
+        failures = [*answer.failures, *(text for condition in conditions for text in _fulfilments(answer, *condition))]
+        for sentence in failures:
+            click.echo(f"failed: {sentence}", err=True)
+        if failures:
+            click.get_current_context().exit(GATE_EXIT_CODE)
+
+    def print_text(**values: Any) -> None:
+        click.echo(call(**values))
+
+    gives_answer = signature.return_annotation in ("Answer", Answer)
+    return click.Command(
+        name,
+        params=[*map(_argument, positional), *map(_flag, options), *(_output_options() if gives_answer else [])],
+        callback=print_answer if gives_answer else print_text,
+        help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
+    )
+
+
+def _argument(parameter: inspect.Parameter) -> click.Argument:
+    is_repeated = parameter.kind is parameter.VAR_POSITIONAL
+    return click.Argument(
+        [parameter.name],
+        nargs=-1 if is_repeated else 1,
+        required=parameter.default is parameter.empty,
+        metavar=METAVARS.get(parameter.name, parameter.name.upper()) + "..." * is_repeated,
+        shell_complete=_complete_study,
+    )
+
+
+def _complete_study(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete names of studies, files and directories."""
+    names = [CompletionItem(name) for name in study_names() if name.startswith(incomplete)]
+    return [*names, CompletionItem(incomplete, type="file")]
+
+
+def _flag(option: Option) -> click.Option:
+    is_path = option.kind is Path
+    return click.Option(
+        [f"--{option.name.replace('_', '-')}", option.name],
+        type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if is_path else option.kind,
+        is_flag=option.kind is bool,
+        multiple=option.is_repeated,
+        required=option.default is inspect.Parameter.empty,
+        default=None if option.default is inspect.Parameter.empty else option.default,
+        show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
+        metavar=option.metavar or ("PATH" if is_path else None),
+        help=option.meaning + (f"  [{option.limits}]" if option.limits else ""),
+    )
+
+
+def _output_options() -> list[click.Option]:
+    """The options of every command that gives an answer."""
+    path = click.Path(path_type=Path)
+    return [
+        click.Option(
+            ["--format", "form"], type=click.Choice(FORMATS), default="text", show_default=True, help="How to print."
+        ),
+        click.Option(["--json", "as_json"], is_flag=True, help="Short for --format json."),
+        click.Option(["--table"], metavar="NAME", help="Print this table only.  [default: all; of csv the first]"),
+        click.Option(["--plot"], type=path, metavar="FILE", help="Draw the answer: png, pdf or svg."),
+        click.Option(
+            ["--fail-if"],
+            multiple=True,
+            metavar='"KEY > X"',
+            help="End with exit code 3 if a number, or a table's column in any row, is so; may be repeated.",
+        ),
+    ]
+
+
+def _check_picture(path: Path | None) -> None:
+    """Refuse, before anything is simulated, a picture with an unknown ending or that cannot be written."""
+    if path is None:
+        return
+    if path.name == SOLUTIONS and path.exists():
+        raise InputError("plot", f"{path} holds results", "another file")
+    if path.suffix.lower() not in PICTURE_ENDINGS:
+        raise InputError("plot", str(path), f"a file that ends in {', '.join(PICTURE_ENDINGS)}")
+    check_writable(path, "plot")
+
+
+def _print(answer: Answer, form: str, table: str | None) -> None:
+    if form == "text":
+        (answer.only(table) if table else answer).print(Console())
+    else:
+        click.echo(answer.render(form, table), nl=False)
+
+
+def _parse(text: str) -> tuple[str, str, float]:
+    """The key, the operator and the limit of a condition."""
+    match = CONDITION.fullmatch(text)
+    if match is None or not math.isfinite(limit := float(match[3])):
+        expected = '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"'
+        raise InputError("fail_if", repr(text), expected)
+    return match[1], match[2], limit
+
+
+def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[str]:
+    """A sentence for each number of the answer for which a condition holds; a note if no number is there."""
+    values = answer.values(key)
+    if None in values or not values:
+        click.echo(f"note: --fail-if: {key} is {'undefined' if values else 'in no row'} here", err=True)
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, int | float | None):
+            raise InputError("fail_if", f"{key} is no number", "the key of a number of the answer")
+        if value is not None and OPERATORS[sign](value, limit):
+            yield f"{key} = {value:g} {sign} {limit:g}"

@@ -1,0 +1,226 @@
+"""The tables of answers: frames with units and meanings, and how readers see them as text, HTML and LaTeX."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from html import escape
+from itertools import takewhile
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from safevar_sumo.terminal import WholeTable, printable_text
+
+LOW, HIGH = "_low", "_high"
+"""Ends of the names of two columns that hold the ends of the interval of a third column."""
+LATEX_PREAMBLE = "% In the preamble: " + " ".join(
+    rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
+)
+FIT_BEGIN = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%\n"
+LATEX_CODES = str.maketrans(
+    {
+        **{character: "\\" + character for character in "{}$&#%_"},
+        **{character: f"{{{character}}}" for character in "[]*"},  # LaTeX reads these as arguments of the line before
+        "\\": r"\textbackslash{}",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+    }
+)
+
+
+class Column(NamedTuple):
+    """A column of a table: its unit, its meaning, and how its numbers are written for readers, or whether JSON and CSV
+    alone have it.
+    """
+
+    unit: str
+    meaning: str
+    number_format: str = ".4g"
+    is_shown: bool = True
+
+
+class Wide(NamedTuple):
+    """How readers see a long table: one for each column of `values`, in which a row stands for each combination of
+    `labels` and a column for each value of `by`.
+    """
+
+    labels: Sequence[str]
+    by: str
+    values: Sequence[str]
+
+
+def tabulate(
+    title: str,
+    columns: Mapping[str, Column],
+    rows: pd.DataFrame | Iterable[Sequence[Any]],
+    *,
+    wide: Wide | None = None,
+    words: Mapping[str, str] | None = None,
+) -> pd.DataFrame:
+    """A table of an answer: a frame whose `attrs` hold its title and its columns' units and meanings.
+
+    A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name the ends, too.
+    Readers see the `words` in place of the texts that are their keys.
+    """
+    named = dict(columns)
+    frame = pd.DataFrame(rows, columns=[*named])
+    frame.attrs = {"title": title, "columns": named, "wide": wide, "words": words or {}}
+    return frame
+
+
+def with_interval(name: str, column: Column) -> dict[str, Column]:
+    """A column and the two that hold the ends of its interval."""
+    ends = {
+        f"{name}{end}": column._replace(meaning=f"{word} end of {name}")
+        for end, word in ((LOW, "lower"), (HIGH, "upper"))
+    }
+    return {name: column, **ends}
+
+
+def columns_of(frame: pd.DataFrame) -> dict[str, Column]:
+    return dict(frame.attrs.get("columns", {}))
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it, null where undefined."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    is_undefined = value is pd.NA or (isinstance(value, float) and not math.isfinite(value))
+    return None if is_undefined else value
+
+
+def text_of(value: Any, number_format: str = ".4g") -> str:
+    """A value for readers; `-` where undefined."""
+    value = plain(value)
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:{number_format}}"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {text_of(inner, number_format)}" for name, inner in value.items()) or "-"
+    if isinstance(value, list):
+        is_interval = len(value) == 2 and not isinstance(value[0], dict)
+        return (" to " if is_interval else "; ").join(text_of(inner, number_format) for inner in value) or "-"
+    return str(value)
+
+
+def csv_cell(value: Any) -> Any:
+    return " ".join(map(str, value)) if isinstance(value, list) else value
+
+
+def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """The tables that readers see in place of a frame, by name: itself, or those that `Wide` describes."""
+    wide, columns = frame.attrs.get("wide"), columns_of(frame)
+    if wide is None or frame.empty:
+        yield name, frame
+        return
+    heads, title, words = frame[wide.by].unique(), frame.attrs["title"], frame.attrs["words"]
+    for value in wide.values:
+        shown = {label: columns[label] for label in wide.labels}
+        shown |= {words.get(str(head), str(head)): columns[value]._replace(unit="") for head in heads}
+        rows = [
+            (*key, *group.set_index(wide.by)[value].reindex(heads))
+            for key, group in frame.groupby([*wide.labels], sort=False)
+        ]
+        heading = title if len(wide.values) == 1 else f"{title}: {columns[value].meaning}"
+        yield f"{name}-{value}", tabulate(heading, shown, rows, words=words)
+
+
+class _ReaderColumn(NamedTuple):
+    """A column as a reader sees it: its heading with the unit, its meaning, and texts."""
+
+    head: str
+    meaning: str
+    texts: list[str]
+    is_number: bool
+
+
+def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
+    """The columns of a table for readers: an interval stands in brackets behind its value."""
+    columns, words = columns_of(frame), frame.attrs.get("words", {})
+    for name in map(str, frame):
+        base = name.removesuffix(LOW).removesuffix(HIGH)
+        if base != name and base in frame:
+            continue
+        if len(frame) and frame[name].isna().all():  # undefined in every row
+            continue
+        column = columns.get(name, Column("", ""))
+        if not column.is_shown:
+            continue
+        texts = [text_of(value, column.number_format) for value in frame[name]]
+        texts = [words.get(text, text) for text in texts]
+        if f"{name}{LOW}" in frame:
+            ends = zip(frame[f"{name}{LOW}"], frame[f"{name}{HIGH}"], strict=True)
+            intervals = (text_of([low, high], column.number_format) for low, high in ends)
+            pairs = zip(texts, intervals, strict=True)
+            texts = [text if text == "-" else f"{text} ({interval})" for text, interval in pairs]
+        unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
+        is_number = pd.api.types.is_numeric_dtype(frame[name])
+        yield _ReaderColumn(f"{name.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
+
+
+def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable]:
+    """The table; columns that do not fit stand in further tables, in which the first columns of text are repeated."""
+    columns = list(reader_columns(frame))
+    labels = list(takewhile(lambda column: not column.is_number, columns))
+    blocks = [[*labels]]
+    for column in columns[len(labels) :]:
+        if len(blocks[-1]) > len(labels) and 1 + sum(map(_least_width, [*blocks[-1], column])) > width:
+            blocks.append([*labels])
+        blocks[-1].append(column)
+    for number, block in enumerate(blocks):
+        table = WholeTable(title="" if number else frame.attrs.get("title", ""))
+        for column in block:
+            table.add_column(printable_text(column.head), justify="right" if column.is_number else "left")
+        for cells in zip(*(column.texts for column in block), strict=True):
+            table.add_row(*cells)
+        yield table
+
+
+def _least_width(column: _ReaderColumn) -> int:
+    """The width of a column whose words are whole, with a line beside it [characters]."""
+    return 1 + max(len(word) for text in (column.head, *column.texts) for word in text.split() or [""])
+
+
+def html_table(frame: pd.DataFrame) -> str:
+    """A table with a caption, in which a screen reader finds the headings; texts have the class `label`."""
+    columns = list(reader_columns(frame))
+    classes = ["" if column.is_number else ' class="label"' for column in columns]
+    heads = "".join(
+        f'<th scope="col"{css} title="{escape(column.meaning)}">{escape(column.head)}</th>'
+        for css, column in zip(classes, columns, strict=True)
+    )
+    rows = (
+        "".join(f"<td{css}>{escape(cell)}</td>" for css, cell in zip(classes, cells, strict=True))
+        for cells in zip(*(column.texts for column in columns), strict=True)
+    )
+    body = "\n".join(f"<tr>{row}</tr>" for row in rows)
+    title = escape(frame.attrs.get("title", ""))
+    table = f"<table><caption>{title}</caption><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table>"
+    return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>' if body else ""
+
+
+def latex_table(label: str, frame: pd.DataFrame) -> str:
+    """A booktabs table that fits into the line."""
+    readable = pd.DataFrame({column.head: column.texts for column in reader_columns(frame)})
+    style = readable.style.hide().format(_escaped_for_latex).format_index(_escaped_for_latex, axis=1)
+    alignment = "".join("r" if column.is_number else "l" for column in reader_columns(frame))
+    caption = _escaped_for_latex(frame.attrs.get("title", ""))
+    table = style.to_latex(hrules=True, column_format=alignment, caption=caption, label=f"tab:{label}", position="htbp")
+    return table.replace(r"\begin{tabular}", FIT_BEGIN + r"\begin{tabular}").replace(
+        r"\end{tabular}", r"\end{tabular}}"
+    )
+
+
+def _escaped_for_latex(text: object) -> str:
+    """Plain text as LaTeX, with superscripts and minus signs."""
+    escaped = re.sub(r"\\textasciicircum\{\}(-?\d+)", r"\\textsuperscript{\1}", str(text).translate(LATEX_CODES))
+    return re.sub(r"(?<![\w)-])-(?=\.?\d)", r"\\textminus{}", escaped)
