@@ -6,6 +6,7 @@ from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.base import (
     REACTION_PARAMETERS as REACTION_PARAMETERS,
     Ads as Ads,
+    FullBrake as FullBrake,
     PerVehicleAds as PerVehicleAds,
     ScalarAds as ScalarAds,
 )

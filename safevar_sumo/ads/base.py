@@ -68,6 +68,16 @@ class Ads:
         return None
 
 
+class FullBrake(Ads):
+    """Brakes fully from the start on; drives where a scenario brakes by itself."""
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Command:
+        return Command(np.zeros(n), np.ones(n))
+
+    def drive(self, seen: Observation, memory: Command) -> tuple[Command, Command]:
+        return memory, memory
+
+
 class ScalarAds(ABC):
     """Base of an ADS for one vehicle; every simulated vehicle gets its own instance.
 

@@ -29,7 +29,7 @@ from safevar_sumo.cli.arguments import (
 )
 from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, STOPPING_DISTANCE
 from safevar_sumo.output import whole_file
 from safevar_sumo.questions.ask import find_question
 from safevar_sumo.questions.changes import read_changes
@@ -371,6 +371,8 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
 
 
 def _cell_text(result: JsonObject) -> Text:
+    if stop := result.get(STOPPING_DISTANCE.name):
+        return Text(f"{stop:.1f} m")
     if result["outcome"] == Outcome.INVALID_TEST:
         return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
     if result["impact_speed"] is None:

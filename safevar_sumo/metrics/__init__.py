@@ -17,6 +17,7 @@ from safevar_sumo.metrics.measures import (
     RATING_POINTS as RATING_POINTS,
     RMS_ACCELERATION,
     SAFETY_DEGREE_METRIC,
+    STOPPING_DISTANCE as STOPPING_DISTANCE,
     TET,
     TIT,
     time_to_collision as time_to_collision,
@@ -24,7 +25,7 @@ from safevar_sumo.metrics.measures import (
 from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe, margin_of as margin_of
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
-OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS)}
+OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE)}
 """Metrics that only the studies have that name them."""
 METRIC_OF_OBJECTIVE = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
 """The metric that an objective uses, by the objective's name."""

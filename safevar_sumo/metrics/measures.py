@@ -115,6 +115,34 @@ AVE_DECE = Metric(
 )
 
 
+PEDAL_ROUNDING = 1e-6
+"""Change of the brake pedal that is a rounding error of its delay [-]."""
+
+
+def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Distance from the first brake force to standstill [m]; shape (N,), NaN for a vehicle that does not brake or stop.
+
+    A sample's pedal acts in the step before it.
+    """
+    trace = runs.trace
+    pedal, vehicles = np.broadcast_to(trace.pedal, trace.speed.shape), np.arange(trace.speed.shape[1])
+    is_pressed = pedal > pedal[0] + PEDAL_ROUNDING
+    begin = np.maximum(np.argmax(is_pressed, axis=0) - 1, 0)
+    has_stopped = is_pressed.any(axis=0) & (trace.speed[-1] <= STANDSTILL)
+    distance = trace.position[-1] - trace.position[begin, vehicles]
+    return mask_collisions(runs, np.where(has_stopped, distance, np.nan))
+
+
+STOPPING_DISTANCE = Metric(
+    name="stopping_distance",
+    title="stop",
+    unit="m",
+    more_is_unsafe=True,
+    function=stopping_distance,
+    description="Distance from the first brake force to standstill; every study of the scenario stop has it.",
+)
+
+
 def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """NaN, shape (N,): a single cell has no points; the rater computes them from all cells of the matrix."""
     return np.full(len(runs.outcome), np.nan)

@@ -21,6 +21,7 @@ from safevar_sumo.scenarios.base import (
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
+from safevar_sumo.scenarios.stop import Stop
 from safevar_sumo.study import Weather
 
 SCENARIOS: Mapping[str, type] = {
@@ -29,6 +30,7 @@ SCENARIOS: Mapping[str, type] = {
     "car_to_car": CarToCar,
     "crossing": Crossing,
     "lead_vehicle_stopped": LeadVehicleStopped,
+    "stop": Stop,
 }
 
 _TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))

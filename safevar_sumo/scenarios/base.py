@@ -248,6 +248,8 @@ class Scenario:
     test_speed
         Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the speed
         tolerance before the ADS brakes is an invalid test. Only contacts at the vehicle's front are collisions.
+    brakes_fully
+        Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     RETURNS
         What the methods of a user's class must return.
     is_user_code
@@ -267,6 +269,7 @@ class Scenario:
     reactive_actors: bool = True
     grade: float = 0.0
     centre_to_centre: bool = False
+    brakes_fully: bool = False
     # A scenario may have fields or properties of these names: type checkers see properties. `duration` has no default.
     if TYPE_CHECKING:
 

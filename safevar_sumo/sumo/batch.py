@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.ads import Ads
+from safevar_sumo.ads import Ads, FullBrake
 from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
@@ -181,7 +181,7 @@ def enter(system: System, settings: FloatArray, world: World) -> tuple[Prepared,
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
-    ads = with_tau(system.ads, types.tau)
+    ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
     if not isinstance(ads, TraciController):
         return prepared, ads, world.enter(types)
     motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)

@@ -28,7 +28,11 @@ def why_no_verdict(system: System) -> str:
         results = simulate_all_points(replace(system, sees_nobody=True), system.characteristics.original[np.newaxis])
     except SimulationError:  # the study's own simulations decide, and report their errors
         return ""
-    problems = {result.point.name: problem for result in results if (problem := _problem(result.runs))}
+    problems = {
+        result.point.name: problem
+        for result in results
+        if not result.point.scenario.brakes_fully and (problem := _problem(result.runs))
+    }
     if not problems:
         return ""
     point, problem = next(iter(problems.items()))

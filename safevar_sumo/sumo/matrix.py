@@ -12,7 +12,7 @@ import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
 from safevar_sumo.records import (
@@ -73,6 +73,7 @@ def point_record(result: PointResult) -> JsonObject:
         "gap": evaluations.gaps(runs.trace.vehicle_length * result.point.scenario.centre_to_centre)[0],
         "test_speed_error": test_speed_error / KMH,
         "warning_ttc": warning_ttc,
+        **{name: values[0] for name, values in evaluations.metrics.items() if name == STOPPING_DISTANCE.name},
     }
     return {
         "point": result.point.name,

@@ -11,6 +11,7 @@ from safevar_sumo.metrics import (
     METRICS,
     OPTIONAL_METRICS,
     RATING_POINTS,
+    STOPPING_DISTANCE,
     Metric,
     Objective,
     Scoring,
@@ -54,7 +55,12 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     InputError
         If a metric or measure of change does not exist, is invalid, or has a name that is taken.
     """
-    metrics = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}
+    tests = [] if study.matrix is None else study.matrix.tests
+    has_stops = "stop" in (study.scenario.model, *(test.model for test in tests))
+    further = [
+        metric for metric, is_meant in ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops)) if is_meant
+    ]
+    metrics = {**METRICS, **{metric.name: metric for metric in further}}
     shipped: Mapping[str, Metric] = {**metrics, **OPTIONAL_METRICS}
     changes, user_records = dict[str, Change](), dict[str, Metric | Change]()
 

@@ -38,7 +38,7 @@ def test_the_original_vehicle_does_not_collide(any_system: System, request: pyte
         assert original.outcome[0] == Outcome.COLLISION
         return
     assert original.outcome[0] in (Outcome.STOPPED, Outcome.PASSED)
-    assert original.f_safe[0] > 0
+    assert original.f_safe[0] > 0 or any_system.points[0].scenario.brakes_fully  # where nobody is met
     assert original.f_diff[0] == original.f_num_diff[0] == 0
 
 

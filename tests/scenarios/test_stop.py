@@ -1,0 +1,67 @@
+"""The scenario `stop` against the closed form and against SUMO, with every shipped vehicle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
+
+
+def stops(weather: Any, *speeds: float, **tables: Any) -> System:
+    """The worn car's stops from `speeds` [km/h]."""
+    tests = [{"name": "stop", "over": {"speed": [*speeds]}}]
+    return assemble(
+        load_study({"extends": "stop", "name": "some", "weather": weather, "matrix": {"tests": tests}, **tables})
+    )
+
+
+def distances(system: System, **changes: float) -> FloatArray:
+    """Stopping distances of the original vehicle with some changes, from every speed [m]."""
+    values = dict(zip(system.characteristics.names, system.characteristics.original, strict=True)) | changes
+    results = simulate_all_points(system, np.array([[*values.values()]]))
+    return np.array([result.evaluations.metrics["stopping_distance"][0] for result in results])
+
+
+@pytest.mark.parametrize(("brake_response", "friction"), [(0.1, 0.3), (0.05, 0.75), (0.3, 0.5)])
+def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(brake_response: float, friction: float) -> None:
+    """From the first brake force on: a delay of the brake, here of whole steps, changes nothing."""
+    speeds = np.array([10.0, 30.0, 50.0, 80.0, 81.7, 120.0, 250.0])
+    system = stops({"name": "polished", "road_friction": friction, "visibility": 1.0}, *speeds.tolist())
+    mu = system.vehicle.tyre_friction * friction  # type: ignore[attr-defined]
+    expected = (speeds / KMH_PER_MS) ** 2 / (2 * mu * GRAVITY)
+    assert distances(system, brakeResponse=brake_response) == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["sun", "lgsvl", "native", "wear"])
+def test_sumo_repeats_the_stop_of_every_vehicle(name: str) -> None:
+    scenario = {"model": "stop", "parameters": {"speed": 50}}
+    study = {"extends": name, "name": "some", "scenario": scenario}
+    system = stops("wet", 50) if name == "wear" else assemble(load_study(study))
+    rng, domains = np.random.default_rng(1), system.characteristics
+    drawn = rng.uniform(domains.lower, domains.upper, (4, len(domains.names)))
+    settings = np.concatenate([domains.original[np.newaxis], drawn])
+    assert verify_in_sumo(system, settings) == ""
+    recorded, in_sumo = (
+        evaluate(system, settings, engine).metrics["stopping_distance"] for engine in (Engine.RECORDED, Engine.LIBSUMO)
+    )
+    np.testing.assert_array_equal(recorded, in_sumo)
+    np.testing.assert_array_equal(recorded[[2]], evaluate(system, settings[[2]]).metrics["stopping_distance"])
+    assert ((recorded > 9) & (recorded < 60)).all()
+
+
+def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> None:
+    study = {"extends": "sun", "name": "some", "scenario": {"model": "stop", "parameters": {"speed": 30}}}
+    stop, other = sv.simulate(study), sv.simulate({**study, "ads": {"model": "aeb"}})
+    assert stop.metrics == pytest.approx(other.metrics, nan_ok=True)
+    assert (stop.outcome, stop.no_verdict) == ("stopped", "")
+    assert stop.to_dict()["stopping_distance"] == stop.metrics["stopping_distance"] > 0
+    assert stop.units["stopping_distance"] == "m"
