@@ -127,7 +127,7 @@ MAPPINGS: Mapping[str, tuple[str, Represent]] = {
     "sumo": ("native", _represent_sumo),
 }
 """By the name of a shipped vehicle: a shipped study, which has the original value of each of its characteristics, and
-the equations of docs/opinion.md.
+the equations (docs/opinion.md).
 """
 NO_ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
 CARLA_ENGINE = ("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength")
