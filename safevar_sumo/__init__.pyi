@@ -8,9 +8,6 @@ from .questions.answer import Answer as Answer
 from .questions.ask import question as question
 from .questions.compare import compare as compare
 from .questions.explain import explain as explain
-from .questions.explain.answer import Explained as Explained
-from .questions.explain.causes import Cause as Cause
-from .questions.explain.failure import Explanation as Explanation
 from .questions.opinion import opinion as opinion
 from .questions.rating import rating as rating
 from .questions.repair import repair as repair

@@ -14,11 +14,10 @@ import pytest
 
 from safevar_sumo.campaign import local
 from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import ExplainOptions
-from safevar_sumo.questions.explain.answer import Explained
-from safevar_sumo.questions.explain.compute import explain_failures
+from safevar_sumo.questions.explain import explain
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, inline_worker, searched
@@ -106,6 +105,6 @@ def case(slippery: Path) -> Case:
 
 
 @pytest.fixture(scope="session")
-def explained(case: Case) -> Explained:
+def explained(case: Case) -> Answer:
     """Explanations of the failures in the results `slippery`."""
-    return explain_failures(case, ExplainOptions(top=3), Evaluator(case.study, InlinePool()))
+    return explain.compute(case, Evaluator(case.study, InlinePool()), top=3)

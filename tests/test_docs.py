@@ -205,6 +205,9 @@ def test_marked_numbers_are_those_that_their_commands_print(lines: tuple[str, ..
     ):
         result = records
         for key in path.split("."):
-            result = result[int(key) if isinstance(result, list) else key]
+            if isinstance(result, list) and not key.isdecimal():  # a row by its name
+                result = next(row for row in result if key in row.values())
+            else:
+                result = result[int(key) if isinstance(result, list) else key]
         unit = value.partition(" ")[2]
         assert value == (f"{100 * result:.0f} %" if unit == "%" else f"{result:.2f} {unit}"), f"{page}: {path}"

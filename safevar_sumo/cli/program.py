@@ -29,7 +29,7 @@ COMMANDS_BY_GROUP = {
     "From a driving system to a decision": {
         "study": "cli.study:study",
         "simulate": "cli.simulate:simulate_command",
-        "explain": "cli.questions:explain",
+        "explain": "questions.explain:explain",
         "tolerance": "cli.questions:tolerance",
         "risk": "questions.risk:risk",
         "report": "cli.handover:report",

@@ -1,8 +1,7 @@
-"""Commands that simulate many settings to answer a question, such as explain and tolerance."""
+"""Commands that simulate many settings to answer a question, such as tolerance."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,13 +25,11 @@ from safevar_sumo.cli.arguments import (
     load_results_or_study,
     point_option,
 )
-from safevar_sumo.cli.program import commands, print_json, print_note
+from safevar_sumo.cli.program import commands, print_json
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.explain import ExplainOptions
 from safevar_sumo.questions.options import Options
 from safevar_sumo.questions.subject import answer_question
 from safevar_sumo.questions.tolerance import ToleranceOptions
-from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import print_answer
 
 
@@ -72,41 +69,6 @@ def _show(result: Any, as_json: bool | None, plot: Path | None = None) -> JsonAn
         from safevar_sumo.questions.figures import save
 
         save(result.figure(), plot, "--plot")
-    return answer
-
-
-@add_question(
-    ExplainOptions,
-    "DIR|STUDY",
-    click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
-    file_option("--out", "Write causes.json, causes.csv and a figure there.", metavar="DIR"),
-)
-def explain(
-    source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: OptionValue
-) -> JsonAnswer:
-    """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change
-    is enough, why.
-    """
-    from safevar_sumo.questions.explain.compute import explain_failures
-    from safevar_sumo.questions.figures import save
-    from safevar_sumo.questions.model_spread import remarks_on_sets
-
-    subject = load_results_or_study(source, point)
-    if out is not None:
-        make_directory(out)
-    result = answer_question(explain_failures, subject, ExplainOptions(**values), jobs=jobs)
-    for remark in remarks_on_sets(result.study) if result.across_fits else []:
-        print_note(remark)
-    answer = result.to_dict()
-    if as_json:
-        print_json(answer)
-    else:
-        print_answer(Console(), result.study, result.no_verdict, result.parts(source, point or "", full=full))
-    if out is not None:
-        write_whole(out / "causes.json", json.dumps(answer, indent=2, allow_nan=False) + "\n")
-        write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
-        save(result.figure(), out / "necessity.png")
-        click.echo(f"Causes: {out}", err=as_json)
     return answer
 
 

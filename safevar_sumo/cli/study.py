@@ -19,9 +19,10 @@ from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option, split_names
 from safevar_sumo.cli.program import commands, print_json, print_remarks, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.words import question_command, two_decimals
-from safevar_sumo.records import JsonObject, Outcome, finite_or_none
-from safevar_sumo.results import evaluations_frame, failure_lines, record, solutions_frame
+from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.questions.words import ending_in_words, list_of_changes, question_command, two_decimals
+from safevar_sumo.records import Evaluations, JsonObject, Outcome, finite_or_none
+from safevar_sumo.results import CHOICES, evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.scenarios import degree_note
 from safevar_sumo.study import Study, label_of, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
@@ -31,6 +32,8 @@ from safevar_sumo.terminal import WholeTable, open_progress, print_text
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from safevar_sumo.questions.case import Case
 
 
 @commands.command()
@@ -200,7 +203,6 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     two commands.
     """
     from safevar_sumo.questions.case import build_case
-    from safevar_sumo.questions.explain.answer import study_verdict
 
     # Loads more slowly than all other modules.
     from safevar_sumo.questions.research_questions.comparisons import summary_lines
@@ -215,7 +217,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         tuple(run.key for run in campaign.runs),
         scoring=campaign.scoring,
     )
-    for line in [campaign.no_verdict] if campaign.no_verdict else study_verdict(case, campaign.original):
+    for line in [campaign.no_verdict] if campaign.no_verdict else _verdict(case, campaign.original):
         print_text(console, line)
     console.print(_summary_table(study, campaign, solutions))
     lines = [degree_note(contact_degree(assemble(study))), "TET, TIT: over solutions without collision."]
@@ -230,6 +232,26 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     commands = (question_command(name, str(directory)) for name in ("explain", "tolerance"))
     for line in (*lines, *summary_lines(case), f"Next: {', '.join(commands)}"):
         print_text(console, line)
+
+
+def _verdict(case: Case, original: Evaluations) -> list[str]:
+    """How many solutions are unsafe, and how little is enough."""
+    system, unsafe, names = assemble(case.study), case.unsafe, list(case.characteristics.names)
+    if original.collided[0] and not system.rater:
+        return ["The original vehicle itself collides: no change is needed."]
+    solutions = case.solutions.drop_duplicates(names)
+    if solutions.empty:
+        return ["No solution."]
+    failures = solutions[unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
+    counts = f"{len(failures)} of {len(solutions)} different solutions are unsafe: {unsafe.description}."
+    if failures.empty:
+        return [counts]
+    fewest = failures.iloc[0]
+    ending = ending_in_words(fewest["outcome"], fewest["f_safe"], contact_degree(system))
+    if system.rater:
+        ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
+    changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})
+    return [f"{counts} With the fewest changes it {ending}: {changes}."]
 
 
 def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) -> WholeTable:

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 QUESTIONS = {
-    name: f"safevar_sumo.questions.{name}" for name in ("compare", "opinion", "rating", "repair", "risk", "rules")
+    name: f"safevar_sumo.questions.{name}"
+    for name in ("compare", "explain", "opinion", "rating", "repair", "risk", "rules")
 } | {"validate": "safevar_sumo.reference.agreement"}
 """The module of each question, whose function has the question's name."""
 

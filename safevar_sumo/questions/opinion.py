@@ -5,10 +5,9 @@ CommonRoad's multi-body vehicle, B; the driving system keeps its knowledge of ou
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -18,9 +17,8 @@ from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.compare import SETTING_COLUMNS, counts_of, draw_pairs, paired_test, table_of_pairs
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import ExplainOptions
-from safevar_sumo.questions.explain.causes import MIN_ROBUST_SHARE, Cause, draw_neighbours
-from safevar_sumo.questions.explain.compute import explain_failures
+from safevar_sumo.questions.explain import explain
+from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, draw_neighbours, robustness_in_words
 from safevar_sumo.questions.multi_body import load_bmw_parameters
 from safevar_sumo.questions.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of
@@ -59,22 +57,21 @@ def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = 
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
     assemble_both_systems(subject.study)
-    options = ExplainOptions(solutions=solution, unsafe=unsafe, limit=SIMULATION_LIMIT, fits=0)
-    explained = explain_failures(subject, options, evaluator)
-    causes = [(failure.name, cause) for failure in explained.explanations for cause in failure.causes]
-    frame, originals = judge_causes(subject.study, causes, explained.unsafe, evaluator.progress)
+    explained = explain.compute(subject, evaluator, solution=solution, unsafe=unsafe, limit=SIMULATION_LIMIT, fits=0)
+    criterion, causes = Unsafe.parse(explained.numbers["unsafe"]), explained.tables["causes"]
+    frame, originals = judge_causes(subject.study, causes, criterion, evaluator.progress)
     driven = frame[frame["opinion"] != "outside"]
     p, a12 = paired_test(*driven[["a_degree", "b_degree"]].dropna().to_numpy(float).T)
     found = Counter(frame["opinion"])
-    numbers: JsonObject = {"unsafe": str(explained.unsafe), **counts_of(driven), "p": p, "a12": a12}
+    numbers: JsonObject = {"unsafe": str(criterion), **counts_of(driven), "p": p, "a12": a12}
     numbers |= {verdict: found[verdict] for verdict in get_args(Verdict)} | originals
     total = number_of(len(frame), "minimal cause")
     verdict = (
         f"CommonRoad's multi-body vehicle confirms {found['confirmed']} of {total} and contradicts "
         f"{found['contradicted']}; {found['borderline']} are borderline, and it has no answer on {found['outside']} "
-        f"({explained.unsafe.description})."
+        f"({criterion.description})."
     )
-    if safe := [failure.name for failure in explained.explanations if not failure.causes]:
+    if safe := [name for name in explained.tables["solutions"]["solution"] if name not in {*causes["solution"]}]:
         verdict += f" Not unsafe, without a cause: {join_phrases(safe)}."
     return Answer(
         question="opinion",
@@ -100,30 +97,31 @@ def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
 
 
 def judge_causes(
-    study: Study, causes: Sequence[tuple[str, Cause]], unsafe: Unsafe, progress: Progress = show_no_progress
+    study: Study, causes: pd.DataFrame, unsafe: Unsafe, progress: Progress = show_no_progress
 ) -> tuple[pd.DataFrame, JsonObject]:
-    """Simulate minimal causes of solutions, named by their handles, with both models: a row of `COLUMNS` for each, and
-    how both original vehicles end. Raises the errors of `assemble_both_systems`.
+    """Simulate minimal causes, rows of the table `causes` of `explain`, with both models: a row of `COLUMNS` for each,
+    and how both original vehicles end. Raises the errors of `assemble_both_systems`.
     """
     system, vehicle = assemble_both_systems(study)
     second_system, characteristics = replace(system, vehicle=vehicle), system.characteristics
     original, contact = characteristics.original, contact_degree(system)
-    settings = np.stack([original, *(cause.setting(characteristics) for _, cause in causes)])
+    changed = [characteristics.setting(changes, "cause", beyond=True) for changes in causes["changes"]]
+    settings = np.stack([original, *changed])
     progress(STAGE, 0, len(settings))
     # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
     ours, theirs = evaluate(system, settings), evaluate(second_system, np.concatenate([settings, scaled]))
     fails_there = unsafe.of(theirs)
     fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
-    frame = table_of_pairs(["", *(name for name, _ in causes)], ours, theirs.take(range(len(settings))), unsafe)
+    frame = table_of_pairs(["", *causes["solution"]], ours, theirs.take(range(len(settings))), unsafe)
     here, there = (
         [ending_in_words(*end, contact) for end in zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)]
         for side in "ab"
     )
 
-    def judge(row: int, cause: Cause) -> tuple[Verdict, str]:
+    def judge(row: int, cause: dict[Any, Any]) -> tuple[Verdict, str]:
         """The verdict on a cause, and its reason."""
-        if reasons := vehicle.reasons_to_omit(cause.changes):
+        if reasons := vehicle.reasons_to_omit(cause["changes"]):
             return "outside", "; ".join(reasons)
         if unsafe.of(ours)[0]:
             return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
@@ -141,17 +139,18 @@ def judge_causes(
             because = (
                 f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[0]}. "
                 f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
-                f"model, {cause.fraction:.1%} with ours"
+                f"model, {cause['fraction']:.1%} with ours"
             )
-        reason = _why_borderline(second_system, settings[row], cause, fails_there[row], unsafe, study.search.seed)
+        robust = cause["robust_share"]
+        reason = _why_borderline(second_system, settings[row], robust, fails_there[row], unsafe, study.search.seed)
         return ("borderline", f"{reason}; {because}") if reason else (verdict, because)
 
     judged = list[tuple[Verdict, dict[str, float], str]]()
-    for row, (_, cause) in enumerate(causes, 1):
+    for row, cause in enumerate(causes.to_dict("records"), 1):
         verdict, because = judge(row, cause)
-        judged.append((verdict, cause.changes, f"with our model it {here[row]}; {because}"))
+        judged.append((verdict, cause["changes"], f"with our model it {here[row]}; {because}"))
         progress(STAGE, row + 1, len(settings))
-        if vehicle.reasons_to_omit(cause.changes):
+        if vehicle.reasons_to_omit(cause["changes"]):
             frame.loc[row, ["b_outcome", "b_degree"]] = None, np.nan
     originals = {str(name): frame[name][0] for name in frame.columns.drop(["solution", "unsafe_in"])}
     frame = frame.iloc[1:].reset_index(drop=True)
@@ -161,13 +160,13 @@ def judge_causes(
 
 
 def _why_borderline(
-    second_system: System, setting: FloatArray, cause: Cause, is_unsafe: bool, unsafe: Unsafe, seed: int
+    second_system: System, setting: FloatArray, robust_share: float, is_unsafe: bool, unsafe: Unsafe, seed: int
 ) -> str:
     """Why a cause is borderline, by its neighbours in our model, else in the second; empty if it is not."""
-    if cause.neighbours is None:  # in a rated study, whose neighbours take too long
+    if np.isnan(robust_share):  # in a rated study, whose neighbours take too long
         return ""
-    if cause.neighbours.borderline:
-        return f"with our model {cause.neighbours}"
+    if robust_share < MIN_ROBUST_SHARE:
+        return f"with our model {robustness_in_words(robust_share)}"
     neighbours = draw_neighbours(second_system.characteristics, setting[np.newaxis], seed)
     runs = evaluate(second_system, neighbours[second_system.region.feasible(neighbours)])
     share = np.mean((unsafe.of(runs) == is_unsafe)[runs.valid]) if runs.valid.any() else 0.0

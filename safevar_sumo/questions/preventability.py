@@ -11,7 +11,6 @@ brakes with 5 m/s^2 or less: there are two conventions, and both are computed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from msgspec.structs import replace
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reference_drivers import ANY_BRAKING
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.questions.words import number_of, points_named, share_in_words
+from safevar_sumo.questions.tables import Column, with_interval
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
@@ -46,108 +45,30 @@ DRIVERS: dict[str, tuple[str, JsonObject]] = {
 """Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
 TITLES = {
     LETTER: "a competent driver",
-    ANY_LEADER: "one who reacts to any braking of a leader, not only above 5 m/s^2,",
+    ANY_LEADER: "one who reacts to any braking of a leader, not only above 5 m/s^2",
     FULL: "full braking at the first possible moment",
 }
+NOBODY, NO_VERDICT = "nobody: physically unavoidable", "no verdict"
+"""In the place of a driver who avoids a collision."""
+COLUMNS = {
+    "driver": Column("", f"reference driver in the same vehicle: {'; '.join(TITLES.values())}"),
+    "avoided": Column("", "collisions that he avoids"),
+    "later": Column("", f"collisions that he avoids if he needs {DELAY:g} s longer"),
+    "no_verdict": Column("", "collisions at points where he collides in the original vehicle, too: no verdict"),
+    **with_interval("share", Column("-", "share that he avoids of those with a verdict", ".2f")),
+    "later_share": Column("-", f"the share if he needs {DELAY:g} s longer", is_shown=False),
+    "no_verdict_points": Column("", "points without a verdict", is_shown=False),
+}
+"""The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for the finite
+population), the share itself if all collisions were simulated.
+"""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Preventability:
-    """What the reference drivers do in collisions, or in a random sample of them.
-
-    The collisions are the distinct solutions that collide; without results, the settings drawn from the study's domain
-    that collide.
-
-    Attributes
-    ----------
-    verdicts
-        The result of `judge_collisions` for the simulated collisions.
-    collisions
-        Number of all these collisions, simulated with the reference drivers or not.
-    """
-
-    verdicts: pd.DataFrame
-    collisions: int
-
-    @property
-    def shares(self) -> dict[str, float]:
-        """The share that each driver avoids of the collisions on which he has a verdict; without a verdict no share."""
-        shares = ((driver, float(self.verdicts[driver].mean())) for driver in DRIVERS)
-        return {driver: share for driver, share in shares if not np.isnan(share)}
-
-    @property
-    def drivers(self) -> list[JsonObject]:
-        """A row for each driver, if a collision was simulated.
-
-        The numbers of collisions that he has `avoided`, avoids with a `later` reaction, and has `no_verdict` on; the
-        `share` that he avoids of those with a verdict, with the ends `share_low` and `share_high` of its 95 % interval:
-        Clopper and Pearson's for a sample (slightly too wide, without a correction for the finite population), the
-        share itself if all collisions were simulated; the share with the later reaction; and the names of the points
-        without a verdict.
-        """
-        rows, verdicts, shares = list[JsonObject](), self.verdicts, self.shares
-        for driver in TITLES if len(verdicts) else ():
-            later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
-            low = high = shares.get(driver)
-            if number and len(verdicts) < self.collisions:
-                low, high = clopper_pearson(avoided, number)
-            rows.append(
-                {
-                    "driver": driver,
-                    "avoided": avoided,
-                    "later": int(verdicts[later].sum()) if later in verdicts else None,
-                    "no_verdict": len(verdicts) - number,
-                    "share": shares.get(driver),
-                    "share_low": low,
-                    "share_high": high,
-                    "later_share": shares.get(later),
-                    "no_verdict_points": [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())],
-                }
-            )
-        return rows
-
-    def to_dict(self) -> JsonObject:
-        """The simulated collisions and `drivers`, for JSON."""
-        return {"looked_at": len(self.verdicts), "later_reaction": LATER["reaction_time"], "drivers": self.drivers}
-
-    def __str__(self) -> str:
-        """What each driver avoids, and where he has no verdict; empty if no collision was simulated."""
-        verdicts, phrases, silences = self.verdicts, list[str](), list[str]()
-        for row in self.drivers:
-            driver, silent = row["driver"], row["no_verdict"]
-            if driver == ANY_LEADER and verdicts[driver].equals(verdicts[LETTER]):
-                continue
-            if silent:
-                points = points_named(row["no_verdict_points"])
-                silences.append(
-                    f" No verdict of {TITLES[driver]} on {silent}{points and f', at {points}'}: there the original "
-                    "vehicle collides with that driver, too."
-                )
-            if row["share"] is None:
-                phrases.append(f"{TITLES[driver]} has no verdict")
-                continue
-            later = row["later_share"]
-            delayed = "" if later is None else f" ({share_in_words(later)} if he needs {DELAY:g} s longer)"
-            of_number = f" of the {len(verdicts) - silent} with a verdict" if silent else ""
-            phrases.append(f"{TITLES[driver]} avoids {share_in_words(row['share'])}{of_number}{delayed}")
-        sample = "" if len(verdicts) == self.collisions else f", drawn at random from {self.collisions}"
-        collisions = f"{number_of(len(verdicts), 'collision')}{sample}"
-        return f"In the same vehicle, of {collisions}, {'; '.join(phrases)}.{''.join(silences)}" if phrases else ""
-
-
-def avoided_by(verdicts: Mapping[Any, Any]) -> str:
-    """The weakest driver who avoids a collision, in words; `verdicts` is a row of `judge_collisions`."""
-    by = next((title for driver, title in TITLES.items() if verdicts[driver] == 1), "")
-    if not by:
-        return "no verdict" if np.isnan(verdicts[FULL]) else "physically unavoidable"
-    silent = f" (no verdict of {TITLES[LETTER]})" if np.isnan(verdicts[LETTER]) else ""
-    return f"preventable by {by}{silent}"
-
-
-def assess_preventability(
+def judge_sample(
     evaluator: Evaluator, collisions: Evaluations, max_simulations: int = MAX_SIMULATIONS
-) -> Preventability:
-    """Which of M evaluated collisions the drivers avoid; equal settings count once.
+) -> tuple[pd.DataFrame, int]:
+    """The result of `judge_collisions` for evaluated collisions, of which equal settings count once, and the number of
+    these collisions.
 
     If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the
     study's seed.
@@ -155,7 +76,38 @@ def assess_preventability(
     _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
     sample = shuffled[: max(max_simulations // len(TITLES), 1)]
-    return Preventability(verdicts=judge_collisions(evaluator, collisions.take(sample)), collisions=len(distinct))
+    return judge_collisions(evaluator, collisions.take(sample)), len(distinct)
+
+
+def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
+    """The share that each driver avoids of the collisions on which he has a verdict; without a verdict no share."""
+    return verdicts[[*DRIVERS]].mean().dropna()
+
+
+def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
+    """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of `judge_sample`."""
+    rows, share_of = list[tuple[Any, ...]](), avoided_shares(verdicts)
+    for driver in TITLES if len(verdicts) else ():
+        later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
+        low = high = share_of.get(driver)
+        if number and len(verdicts) < collisions:
+            low, high = clopper_pearson(avoided, number)
+        avoided_later = int(verdicts[later].sum()) if later in verdicts else None
+        points = [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())]
+        counts = (driver, avoided, avoided_later, len(verdicts) - number)
+        rows.append((*counts, share_of.get(driver), low, high, share_of.get(later), points))
+    frame = pd.DataFrame(rows, columns=[*COLUMNS])
+    return frame.astype(
+        {"later": "Int64", "share": float, "share_low": float, "share_high": float, "later_share": float}
+    )
+
+
+def avoided_by(verdicts: Mapping[Any, Any]) -> str:
+    """The weakest driver who avoids a collision, in words; `verdicts` is a row of `judge_collisions`."""
+    by = next((title for driver, title in TITLES.items() if verdicts[driver] == 1), "")
+    if not by:
+        return NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
+    return by + (f" (no verdict of {TITLES[LETTER]})" if np.isnan(verdicts[LETTER]) else "")
 
 
 def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:

@@ -144,7 +144,7 @@ class _ReaderColumn(NamedTuple):
 
 
 def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
-    """The columns of a table for readers: an interval stands in brackets behind its value."""
+    """The columns of a table for readers: an interval stands in brackets behind its value, unless that is exact."""
     columns, words = columns_of(frame), frame.attrs.get("words", {})
     for name in map(str, frame):
         base = name.removesuffix(LOW).removesuffix(HIGH)
@@ -158,10 +158,11 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         texts = [text_of(value, column.number_format) for value in frame[name]]
         texts = [words.get(text, text) for text in texts]
         if f"{name}{LOW}" in frame:
-            ends = zip(frame[f"{name}{LOW}"], frame[f"{name}{HIGH}"], strict=True)
-            intervals = (text_of([low, high], column.number_format) for low, high in ends)
-            pairs = zip(texts, intervals, strict=True)
-            texts = [text if text == "-" else f"{text} ({interval})" for text, interval in pairs]
+            rows = zip(texts, frame[f"{name}{LOW}"], frame[f"{name}{HIGH}"], strict=True)
+            texts = [
+                text if text == "-" or low == high else f"{text} ({text_of([low, high], column.number_format)})"
+                for text, low, high in rows
+            ]
         unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
         is_number = pd.api.types.is_numeric_dtype(frame[name])
         yield _ReaderColumn(f"{name.replace('_', ' ')}{unit}", column.meaning, texts, is_number)

@@ -13,8 +13,6 @@ import numpy as np
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.ask import find_question
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.explain import ExplainOptions
-from safevar_sumo.questions.explain.compute import explain_failures
 from safevar_sumo.questions.options import Options
 from safevar_sumo.questions.subject import answer_question, at_point, changes_since
 from safevar_sumo.questions.tolerance import ToleranceOptions
@@ -32,9 +30,8 @@ from safevar_sumo.terminal import Progress
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from safevar_sumo.questions.explain.failure import Explanation
 
-QUESTIONS: Mapping[str, Callable[..., Any]] = {"explain": explain_failures, "tolerance": find_tolerances}
+QUESTIONS: Mapping[str, Callable[..., Any]] = {"tolerance": find_tolerances}
 """The functions that answer the questions of a page, by their commands."""
 SAMPLES: Mapping[str, JsonObject] = {"risk": {"samples": 4000}, "rules": {"samples": 4000}}
 """The number of vehicles sampled for these sections."""
@@ -69,11 +66,7 @@ class ReportInput:
     @cached_property
     def options(self) -> Mapping[str, Options]:
         """Each question's options on the page: smaller samples than the commands take."""
-        all_options: tuple[Options, ...] = (
-            ExplainOptions(limit=EXPLAIN_SIMULATIONS),
-            ToleranceOptions(margin=self.margin),
-        )
-        return {options.question: options for options in all_options}
+        return {"tolerance": ToleranceOptions(margin=self.margin)}
 
     @cached_property
     def values(self) -> Mapping[str, JsonObject]:
@@ -84,6 +77,7 @@ class ReportInput:
         return {
             **SAMPLES,
             "compare": {},
+            "explain": {"limit": EXPLAIN_SIMULATIONS},
             "opinion": {},
             "rating": {"solution": solution},
             "repair": {"margin": self.margin},
@@ -143,9 +137,9 @@ class ReportInput:
         comparison = compare_setting(self.case.study, self.system, setting)
         return comparison, {**player_data(lay_out_scene(comparison)), "point": comparison.point}
 
-    def draw_failure(self, failure: Explanation) -> Figure:
+    def draw_failure(self, handle: str) -> Figure:
         """The figure of a failure beside the original vehicle."""
-        return draw_comparison(compare_setting(self.case.study, self.system, np.array(list(failure.setting.values()))))
+        return draw_comparison(compare_setting(self.case.study, self.system, self.setting_of(handle)))
 
     def anchor(self, *parts: object) -> str:
         """The HTML anchor of an element of the page, in this study's section."""

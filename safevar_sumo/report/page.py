@@ -19,7 +19,7 @@ from markupsafe import Markup
 from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, UnanswerableError
-from safevar_sumo.questions.explain.answer import Explained
+from safevar_sumo.questions.explain.failures import DISTINCT_CAUSE
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.subject import Results
@@ -285,10 +285,12 @@ def _study_data(
     data: ReportInput, sections: Collection[str], answers: Mapping[str, Any], progress: Progress
 ) -> JsonObject:
     """The data of one study that the templates of these sections need."""
-    explained: Explained | None = answers.get("explain")
-    choices, tolerance = explained.choices if explained else [], answers.get("tolerance")
+    explained: Answer | None = answers.get("explain")
+    failures = explained.tables["solutions"].to_dict("records") if explained else []
+    choices: list[Any] = [row for row in failures if row["reason"] != DISTINCT_CAUSE]
+    tolerance = answers.get("tolerance")
     rendered = {name: answer for name, answer in answers.items() if isinstance(answer, Answer)}
-    about_domain = {name: answer for name, answer in answers.items() if name not in {"explain", *rendered}}
+    about_domain = {name: answer for name, answer in answers.items() if name not in rendered}
     replays = replay_solutions(data, explained, progress) if "causes" in sections else []
     different = [solution["handle"] for solution in replays if solution["differences"]]
     why = why_different(is_imported=not data.case.has_runs)
@@ -307,7 +309,9 @@ def _study_data(
         "replays": replays,
         "limits": limits_data(tolerance) if tolerance else None,
         "failures": [describe_failure(data, failure) for failure in choices],
-        "picture": _picture("failure", data.draw_failure(choices[0])) if choices and "verdict" in sections else None,
+        "picture": _picture("failure", data.draw_failure(choices[0]["solution"]))
+        if choices and "verdict" in sections
+        else None,
         "sheet": _picture("limits", tolerance.sheet.figure()) if tolerance else None,
         "different": different,
         "why_different": why,
@@ -315,8 +319,10 @@ def _study_data(
         "no_verdict": why_no_verdict(data.system),
         "later_changes": data.later_changes,
         "opinion_problem": reason_without_opinion(data),
-        "statistics": figure_data(explained.figure(), explained.necessity)
-        if explained and explained.analysed
+        "statistics": figure_data(
+            explained.figure(), explained.tables["characteristics"].drop(columns="needed_in_fits")
+        )
+        if explained and explained.numbers["analysed"]
         else None,
         "answers": {
             name: [part for part in answer.sentences() if isinstance(part, str)]

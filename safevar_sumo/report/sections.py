@@ -14,9 +14,9 @@ import pandas as pd
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.explain.answer import Explained
-from safevar_sumo.questions.explain.causes import MIN_ROBUST_SHARE, Cause
-from safevar_sumo.questions.explain.failure import Explanation
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, robustness_in_words
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.opinion import assemble_both_systems, judge_causes
 from safevar_sumo.questions.words import number_of, points_in_words, question_command
@@ -60,73 +60,66 @@ def _cell_text(value: Any) -> str:
     return format_number(value) if isinstance(value, float) else str(value)
 
 
-def make_verdict(data: ReportInput, explained: Explained | None) -> JsonObject:
+def make_verdict(data: ReportInput, explained: Answer | None) -> JsonObject:
     """The verdict: the sentences of `explain`, and the commands that repeat the study and the failure."""
     commands = [question_command(name, str(data.directory), data.point) for name in ("explain", "tolerance")]
     if explained is None:
         return {"sentences": ["No solution was found."], "is_bad": False, "commands": commands}
-    sentences = [explained.no_verdict] if explained.no_verdict else explained.verdict
-    if explained.choices and explained.choices[0].handle:
+    for handle in explained.tables["solutions"]["solution"].head(1):
         simulate = question_command("simulate", str(data.directory), data.point)
-        commands.append(f"{simulate} --solution {explained.choices[0].name} --plot it.png")
-    return {"sentences": [*sentences, explained.counts], "is_bad": explained.failures > 0, "commands": commands}
+        commands.append(f"{simulate} --solution {handle} --plot it.png")
+    return {"sentences": [explained.verdict], "is_bad": explained.numbers["failures"] > 0, "commands": commands}
 
 
-def describe_failure(data: ReportInput, failure: Explanation) -> JsonObject:
-    """A failure that the verdict names: its effect, size and changes."""
-    setting, matrix = np.array(list(failure.setting.values())), data.system.matrix
-    largest = float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
+def describe_failure(data: ReportInput, failure: JsonObject) -> JsonObject:
+    """A failure of the table `solutions` of `explain`: its size and changes."""
+    setting, matrix = data.setting_of(failure["solution"]), data.system.matrix
     return {
         "failure": failure,
-        "effect": failure.effect,
-        "size": f"{len(failure.changed)} of {len(setting)} characteristics changed, by at most {100 * largest:.0f} %",
-        "anchor": data.anchor("replay", failure.name),
+        "size": f"{failure['changed']} of {len(setting)} characteristics changed, by at most "
+        f"{100 * failure['largest_change']:.0f} %",
+        "robust": robustness_in_words(failure["robust_share"]),
+        "anchor": data.anchor("replay", failure["solution"]),
         "changes": data.list_changes(setting),
-        "points": points_in_words(failure.points, len(matrix)) if matrix and not data.point else "",
+        "points": points_in_words(failure["points"], len(matrix)) if matrix and not data.point else "",
     }
 
 
-def make_cause_sections(data: ReportInput, explained: Explained) -> list[JsonObject]:
-    """A section for one minimal cause of each set of characteristics.
-
-    The first is the cause that the verdict names; the others follow in order of their robustness, then of their size.
-    """
-    causes = [(cause, failure) for failure in explained.explanations for cause in failure.causes if cause.changes]
-    named = explained.explanations[0].cause if causes else None
-    causes.sort(key=lambda pair: (pair[0] is not named, -(pair[0].robustness or 0.0), len(pair[0].changes)))
-    distinct: dict[tuple[str, ...], tuple[Cause, Explanation]] = {}
-    for cause, failure in causes:
-        distinct.setdefault(tuple(cause.changes), (cause, failure))
-    selection = list(distinct.values())[:MAX_CAUSES]
+def make_cause_sections(data: ReportInput, explained: Answer) -> list[JsonObject]:
+    """A section for one minimal cause of each set of characteristics; the first is the one that the verdict names."""
+    causes = explained.tables["causes"]
+    causes = causes[causes["size"] > 0]
+    selection = causes[~causes["changes"].map(tuple).duplicated()].head(MAX_CAUSES).reset_index(drop=True)
     opinions: list[Any] = [None] * len(selection)
-    if selection and not reason_without_opinion(data):
-        judged = [(failure.name, cause) for cause, failure in selection]
-        opinions = [*judge_causes(data.case.study, judged, explained.unsafe)[0].itertuples()]
+    if len(selection) and not reason_without_opinion(data):
+        unsafe = Unsafe.parse(explained.numbers["unsafe"])
+        opinions = [*judge_causes(data.case.study, selection, unsafe)[0].itertuples()]
+    ends = dict(explained.tables["solutions"][["solution", "ends"]].to_numpy())
     return [
-        _make_cause_section(data, rank, *pair, opinion)
-        for rank, (pair, opinion) in enumerate(zip(selection, opinions, strict=True), 1)
+        _make_cause_section(data, rank, cause, ends[cause["solution"]], opinion)
+        for rank, (cause, opinion) in enumerate(zip(selection.to_dict("records"), opinions, strict=True), 1)
     ]
 
 
-def _make_cause_section(data: ReportInput, rank: int, cause: Cause, failure: Explanation, opinion: Any) -> JsonObject:
-    comparison, player = data.play(data.case.characteristics.setting(cause.changes, "cause", beyond=True))
-    title, rows = f"Cause {rank}: {', '.join(cause.changes)}", {}
+def _make_cause_section(data: ReportInput, rank: int, cause: Mapping[Any, Any], ends: str, opinion: Any) -> JsonObject:
+    comparison, player = data.play(data.case.characteristics.setting(cause["changes"], "cause", beyond=True))
+    title, rows = f"Cause {rank}: {', '.join(cause['changes'])}", {}
     for item in data.case.characteristics:
-        if item.name in cause.changes:
-            values = (item.original, cause.changes[item.name], cause.boundary[item.name])
+        if item.name in cause["changes"]:
+            values = (item.original, cause["changes"][item.name], cause["boundary"][item.name])
             rows[f"{item.name} ({item.short_name})"] = [f"{format_number(value)}{item.suffix}" for value in values]
     frame = pd.DataFrame.from_dict(rows, "index", columns=["original", "here", "limit (all scaled)"])
     return {
         "title": title,
         "anchor": data.anchor("cause", rank),
         "cause": cause,
-        "failure": failure,
+        "robust": robustness_in_words(cause["robust_share"]),
         "table": table_data(frame.rename_axis("characteristic"), f"Changes of {title}"),
         "end": comparison.verdict(comparison.rows[-1]),
         "opinion": opinion,
-        "reason": failure.endings,
+        "reason": ends,
         "player_data": player,
-        "replay_anchor": data.anchor("replay", failure.name),
+        "replay_anchor": data.anchor("replay", cause["solution"]),
     }
 
 
@@ -139,9 +132,9 @@ def reason_without_opinion(data: ReportInput) -> str:
     return ""
 
 
-def replay_solutions(data: ReportInput, explained: Explained | None, progress: Progress) -> list[JsonObject]:
+def replay_solutions(data: ReportInput, explained: Answer | None, progress: Progress) -> list[JsonObject]:
     """Replay the solutions that `FIRST_CHOICES` select and the explained ones."""
-    failures = [failure.name for failure in explained.explanations if failure.handle] if explained else []
+    failures = explained.tables["solutions"]["solution"].tolist() if explained else []
     handles, entries = list(dict.fromkeys([*data.select_handles(*FIRST_CHOICES), *failures])), []
     for index, handle in enumerate(handles):
         progress("replays", index, len(handles))
@@ -243,20 +236,19 @@ def describe_agreement(study: Study) -> JsonObject | None:
     )
 
 
-def describe_limits(data: ReportInput, explained: Explained | None) -> JsonObject:
+def describe_limits(data: ReportInput, explained: Answer | None) -> JsonObject:
     """How far the findings of one study hold: remarks, the vehicle model's own uncertainty, and the original vehicle's
     published metrics beside those here.
     """
-    case, failures, tables = data.case, explained.explanations if explained else (), []
+    case, tables, shares = data.case, [], explained.tables["solutions"]["robust_share"] if explained else pd.Series()
     remarks = [
         f"{count} of {len(case.evaluations)} settings {words}."
         for outcome, words in NO_RESULT.items()
         if (count := int((case.evaluations["outcome"] == str(outcome)).sum()))
     ]
-    if failures:
-        borderline = sum(failure.robustness.borderline for failure in failures)
+    if len(shares):
         remarks.append(
-            f"{borderline} of {len(failures)} failures analysed are borderline: fewer than "
+            f"{(shares < MIN_ROBUST_SHARE).sum()} of {len(shares)} failures analysed are borderline: fewer than "
             f"{100 * MIN_ROBUST_SHARE:.0f} % of their neighbours are unsafe too."
         )
     if case.study.spread:

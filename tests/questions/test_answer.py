@@ -22,7 +22,6 @@ import safevar_sumo as sv
 from safevar_sumo.cli.program import COMMANDS, commands, first_sentence
 from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
-from safevar_sumo.questions.explain import ExplainOptions
 from safevar_sumo.questions.options import Options
 from safevar_sumo.questions.tolerance import ToleranceOptions
 from safevar_sumo.study import load_study
@@ -139,7 +138,7 @@ def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypa
     assert answer["numbers"]["unsafe_ends"] == sum(row["safety_degree"] < 2.2 for row in rows)
 
 
-@pytest.mark.parametrize("options", [ExplainOptions, ToleranceOptions])
+@pytest.mark.parametrize("options", [ToleranceOptions])
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)
     arguments = inspect.signature(function).parameters
@@ -158,11 +157,7 @@ def test_a_function_takes_and_documents_the_options_of_its_record(options: type[
 
 @pytest.mark.parametrize(
     "options",
-    [
-        ExplainOptions(),
-        ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
-        ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), margin=0.5),
-    ],
+    [ToleranceOptions(), ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), margin=0.5)],
 )
 def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
     """The command, parsed by its own flags, makes the record that printed it."""

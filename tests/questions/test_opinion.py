@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+import pandas as pd
 import pytest
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.explain.answer import Explained
-from safevar_sumo.questions.explain.causes import Cause, Robustness
 from safevar_sumo.questions.multi_body import (
     MultiBodyState,
     Plant,
@@ -31,7 +30,7 @@ from safevar_sumo.questions.multi_body import (
 from safevar_sumo.questions.opinion import Verdict, assemble_both_systems, judge_causes
 from safevar_sumo.questions.second_vehicle import MAPPINGS, OUTSIDE
 from safevar_sumo.records import GRAVITY
-from safevar_sumo.report import input as report_input, report
+from safevar_sumo.report import report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
@@ -40,17 +39,9 @@ from tests.in_process import json_of
 ONE = np.ones(1)
 
 
-def judged(solution: str, changes: dict[str, float], fraction: float, robustness: float) -> tuple[str, Cause]:
-    """A cause of a solution, as `explain` finds it."""
-    return solution, Cause(
-        changes=changes,
-        boundary={},
-        fraction=fraction,
-        alone={},
-        outcome="collision",
-        safety_degree=None,
-        neighbours=Robustness({0.05: robustness}),
-    )
+def causes(*rows: tuple[str, dict[str, float], float, float]) -> pd.DataFrame:
+    """Causes of solutions, as `explain` finds them."""
+    return pd.DataFrame(rows, columns=["solution", "changes", "fraction", "robust_share"])
 
 
 def bmw() -> Plant:
@@ -170,7 +161,7 @@ ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 4
 
 def test_the_gap_stands_beside_a_safety_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
-    frame, ends = judge_causes(load_study("native"), [judged("nsga2:0:0", {"maxSpeed": 12.0}, 0.99, 1.0)], Unsafe())
+    frame, ends = judge_causes(load_study("native"), causes(("nsga2:0:0", {"maxSpeed": 12.0}, 0.99, 1.0)), Unsafe())
     gap = f"safety degree {frame['a_degree'][0]:.2f} m from centre to centre (gap {frame['a_degree'][0] - 4.7:.2f} m)"
     assert gap in frame["because"][0]
     assert ends["a_outcome"] == ends["b_outcome"]
@@ -193,8 +184,8 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(tmp_path: Path, monk
             "vehicle": {"model": "glitch:Made", "characteristics": rows},
         }
     )
-    causes = [judged("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0), judged("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0)]
-    frame, _ = judge_causes(study, causes, Unsafe())
+    two = ("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0), ("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0)
+    frame, _ = judge_causes(study, causes(*two), Unsafe())
     planted, true = frame.itertuples()
     assert (planted.solution, planted.changes, planted.opinion) == ("nsga2:0:0", {"payload": 300.0}, "contradicted")
     assert (planted.a_outcome, planted.b_outcome, planted.unsafe_in) == ("collision", "passed", "a")
@@ -209,10 +200,10 @@ def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatc
     """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at
     8 m/s.
     """
-    cause = judged("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
-    (calm,) = judge_causes(load_study("rain"), [cause], Unsafe())[0].itertuples()
+    cause = causes(("nsga2:24:1", WORN_TYRES, 0.99, 1.0))
+    (calm,) = judge_causes(load_study("rain"), cause, Unsafe())[0].itertuples()
     monkeypatch.setattr("safevar_sumo.questions.multi_body.TRACTION_SHARE", np.inf)
-    (spinning,) = judge_causes(load_study("rain"), [cause], Unsafe())[0].itertuples()
+    (spinning,) = judge_causes(load_study("rain"), cause, Unsafe())[0].itertuples()
     assert (spinning.opinion, spinning.b_outcome) == ("outside", "collision")
     assert "spin" in spinning.because
     assert calm.b_degree > -4 > -7 > spinning.b_degree
@@ -222,16 +213,16 @@ def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatc
 def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> None:
     """In ours by its robustness; in the second by the neighbours, here of the smallest change at which it collides."""
     study = load_study("sun")
-    (here,) = judge_causes(study, [judged("nsga2:0:0", WORN_TYRES, 0.99, 0.79)], Unsafe())[0].itertuples()
+    (here,) = judge_causes(study, causes(("nsga2:0:0", WORN_TYRES, 0.99, 0.79)), Unsafe())[0].itertuples()
     assert here.opinion == "borderline"
-    assert "; with our model borderline: only 79 % of the neighbours are unsafe too;" in here.because
+    assert "; with our model borderline: only 79 % of its neighbours are unsafe too;" in here.because
     system, vehicle = assemble_both_systems(study)
     frictions, characteristics = np.linspace(1.0, 3.5, 60), system.characteristics
     settings = np.stack([characteristics.setting({**WORN_TYRES, "tireFric": one}, "cause") for one in frictions])
     runs = evaluate(replace(system, vehicle=vehicle), settings)
     least = float(frictions[runs.collided].max())
-    cause = judged("nsga2:0:0", {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)
-    (there,) = judge_causes(study, [cause], Unsafe())[0].itertuples()
+    cause = causes(("nsga2:0:0", {**WORN_TYRES, "tireFric": least}, 0.99, 1.0))
+    (there,) = judge_causes(study, cause, Unsafe())[0].itertuples()
     assert (there.opinion, there.b_outcome) == ("borderline", "collision")
     assert re.search(r"with the second model only \d\d% of the neighbours are unsafe, too; also unsafe", there.because)
 
@@ -258,9 +249,8 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 
 @pytest.mark.slow
 def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(
-    slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch
+    slippery: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(report_input.QUESTIONS, "explain", lambda *_, **__: explained)
     page = report(slippery, only=["causes", "reproduce"], jobs=1)
     verdicts = re.findall(r"second vehicle model: (\w+)", page)
     assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0

@@ -4,7 +4,6 @@ when a vehicle begins to brake.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 import msgspec
@@ -16,20 +15,10 @@ import scipy
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.causes import (
-    STEP_FACTORS,
-    Robustness,
-    estimate_robustness,
-    find_smallest_robust_failure,
-)
-from safevar_sumo.questions.explain.compute import PointComparison, compare_at_points
-from safevar_sumo.questions.preventability import (
-    DRIVERS,
-    Preventability,
-    assess_preventability,
-    avoided_by,
-    judge_collisions,
-)
+from safevar_sumo.questions.explain import _avoided_in_words
+from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
+from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure, robust_shares
+from safevar_sumo.questions.preventability import DRIVERS, avoided_by, drivers_frame, judge_collisions, judge_sample
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -44,12 +33,11 @@ COLLISION = Unsafe()
 def test_robust_is_what_its_neighbours_are_too() -> None:
     evaluator = made_up_evaluator(2, box)
     threshold = evaluator.characteristics.threshold[0]
-    deep, edge = estimate_robustness(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
-    assert deep.shares_by_step == {0.1: 1.0, 0.05: 1.0, 0.2: 1.0}
-    assert edge.share == pytest.approx(0.5, abs=0.2)
-    assert (deep.borderline, edge.borderline) == (False, True)
-    (beyond,) = estimate_robustness(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
-    assert beyond.share == 1.0
+    deep, edge = robust_shares(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
+    assert deep.tolist() == [1.0, 1.0, 1.0]
+    assert edge.mean() == pytest.approx(0.5, abs=0.2)
+    (beyond,) = robust_shares(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
+    assert beyond.mean() == 1.0
 
 
 @pytest.mark.parametrize(
@@ -67,12 +55,10 @@ def test_a_failure_is_robust_by_the_mean_of_all_time_steps(
     """Whatever the study's own time step says, if the other steps can make up for it."""
     evaluator = made_up_evaluator(2, box)
 
-    def estimates(_: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe) -> list[Robustness]:
-        of_settings = [shares[int(setting[0]) - 8] for setting in settings]
-        steps = [step * factor for factor in STEP_FACTORS]
-        return [Robustness(dict(zip(steps, of_setting, strict=True))) for of_setting in of_settings]
+    def estimates(_: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe) -> FloatArray:
+        return np.array([shares[int(setting[0]) - 8] for setting in settings])
 
-    monkeypatch.setattr("safevar_sumo.questions.explain.causes.estimate_robustness", estimates)
+    monkeypatch.setattr("safevar_sumo.questions.explain.robustness.robust_shares", estimates)
     failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")
     assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=100) == row
 
@@ -112,41 +98,20 @@ def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> 
     return pd.DataFrame(dict(zip(DRIVERS, drivers, strict=True))).assign(point=points or "")
 
 
-def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> None:
-    seven = verdicts([1.0] * 5 + [0.0] * 2, [1.0] * 5 + [0.0] * 2, [1.0] * 6 + [0.0], *[[1.0] * 3 + [0.0] * 4] * 2)
+def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None:
     many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
-    for found, number, told in (
-        (
-            seven,
-            7,
-            "7 collisions, a competent driver avoids 71 % (43 % if he needs 0.4 s longer); full braking at the "
-            "first possible moment avoids 86 %.",
-        ),
-        (
-            many,
-            3000,
-            "1000 collisions, drawn at random from 3000, a competent driver avoids nearly all (39 % if he needs "
-            "0.4 s longer); full braking at the first possible moment avoids all.",
-        ),
-    ):
-        assert str(Preventability(verdicts=found, collisions=number)) == f"In the same vehicle, of {told}"
+    assert _avoided_in_words(many) == (
+        "In the same vehicle, of 1000 collisions a competent driver avoids nearly all and full braking at the first "
+        "possible moment avoids all."
+    )
+    assert _avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
 
 
 def test_who_has_no_verdict_is_counted_with_the_points() -> None:
     """By the letter he collides in the original vehicle at the point b, where any braking is a danger to the other."""
     nan = np.nan
     two = verdicts([1.0, nan], [1.0, 1.0], [1.0, nan], [0.0, nan], [0.0, 0.0], points=["a", "b"])
-    found = Preventability(verdicts=two, collisions=2)
-    both, letter, full = str(found).split(". ")
-    assert both == (
-        "In the same vehicle, of 2 collisions, a competent driver avoids all of the 1 with a verdict (none if he needs "
-        "0.4 s longer); one who reacts to any braking of a leader, not only above 5 m/s^2, avoids all (none if he "
-        "needs 0.4 s longer); full braking at the first possible moment avoids all of the 1 with a verdict"
-    )
-    there = "on 1, at b: there the original vehicle collides with that driver, too"
-    assert letter == f"No verdict of a competent driver {there}"
-    assert full == f"No verdict of full braking at the first possible moment {there}."
-    rows = found.drivers
+    rows = drivers_frame(two, 2).replace({pd.NA: None}).to_dict("records")
     assert [(row["avoided"], row["later"], row["no_verdict"], row["no_verdict_points"]) for row in rows] == [
         (1, 0, 1, ["b"]),
         (2, 0, 0, []),
@@ -155,20 +120,20 @@ def test_who_has_no_verdict_is_counted_with_the_points() -> None:
     only_any, nobody = verdicts([nan], [1.0], [1.0], [nan], [nan]), verdicts(*[[nan]] * 5)
     assert avoided_by(only_any.iloc[0].to_dict()).endswith("(no verdict of a competent driver)")
     assert avoided_by(nobody.iloc[0].to_dict()) == "no verdict"
-    json.dumps(Preventability(verdicts=nobody, collisions=1).to_dict(), allow_nan=False)
+    assert drivers_frame(nobody, 1)[["share", "share_low", "share_high"]].isna().all(axis=None)
 
 
 @pytest.mark.slow
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
     found = avoiders(evaluator(test="CPFA", speed=30), vehicle(), vehicle(brakes=0.1))
-    assert found == ["preventable by a competent driver", "physically unavoidable"]
+    assert found == ["a competent driver", "nobody: physically unavoidable"]
 
 
 @pytest.mark.slow
 def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
     """He hits it in the original vehicle."""
     found = avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99))
-    assert found == ["preventable by full braking at the first possible moment (no verdict of a competent driver)"]
+    assert found == ["full braking at the first possible moment (no verdict of a competent driver)"]
 
 
 @pytest.mark.slow
@@ -176,12 +141,12 @@ def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_ve
     tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
     here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
-    found = assess_preventability(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
-    letter, any_braking, _ = found.drivers
-    assert (letter["no_verdict"], letter["share"], any_braking["share"]) == (2, None, 1.0)
+    found = drivers_frame(*judge_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9))))
+    letter, any_braking, _ = found.to_dict("records")
+    assert (letter["no_verdict"], any_braking["share"]) == (2, 1.0)
+    assert np.isnan(letter["share"])
     (point,) = letter["no_verdict_points"]
     assert point.startswith("CCRb, speed 50")
-    assert f"No verdict of a competent driver on 2, at {point}: " in str(found)
 
 
 @pytest.mark.slow
@@ -192,16 +157,16 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     here = evaluator(test="CPFA", speed=30)
     brakeless = (vehicle(0.1, 1 - (30 - k) / 1e6) for k in range(20))
     every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10)))
-    whole = assess_preventability(here, Evaluations.concatenate([every, every]))
-    assert (len(whole.verdicts), whole.collisions) == (30, 30)
-    letter = whole.drivers[0]
+    whole, number = judge_sample(here, Evaluations.concatenate([every, every]))
+    assert (len(whole), number) == (30, 30)
+    letter = drivers_frame(whole, number).iloc[0]
     assert (letter["avoided"], letter["later"], letter["no_verdict"]) == (10, 10, 0)
     assert [letter[name] for name in ("share", "share_low", "share_high", "later_share")] == [pytest.approx(1 / 3)] * 4
-    sample = assess_preventability(here, every, max_simulations=45)
-    assert len(sample.verdicts) == 15
+    sample, number = judge_sample(here, every, max_simulations=45)
+    assert (len(sample), number) == (15, 30)
     reverse = every.take(np.arange(30)[::-1])
-    assert sample.to_dict() == assess_preventability(here, reverse, max_simulations=45).to_dict()
-    letter = sample.drivers[0]
+    pd.testing.assert_frame_equal(sample, judge_sample(here, reverse, max_simulations=45)[0])
+    letter = drivers_frame(sample, number).iloc[0]
     hits = letter["avoided"]
     expected = scipy.stats.beta.ppf(0.025, hits, 16 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 15 - hits)
     assert (letter["share_low"], letter["share_high"]) == pytest.approx(expected)

@@ -12,12 +12,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.cli.study import _verdict
 from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import ExplainOptions
-from safevar_sumo.questions.explain.answer import study_verdict
-from safevar_sumo.questions.explain.compute import compare_at_cells, explain_failures
+from safevar_sumo.questions.explain import explain
+from safevar_sumo.questions.explain.failures import compare_at_cells
 from safevar_sumo.questions.tolerance import ToleranceOptions
 from safevar_sumo.questions.tolerance.compute import find_tolerances
 from safevar_sumo.study import load_study
@@ -82,15 +82,15 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_po
     case = case_of(STUDY, original, evaluations)
     points = float(original.column("rating_points")[0])
     assert points > evaluations.column("rating_points")[1]
-    options = ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}")
-    (failure,) = explain_failures(case, options, evaluator).explanations
-    assert failure.points
-    assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
-    assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
-    situation, fewest = study_verdict(case, original)
-    assert f"the original vehicle earns {points:.2f} points" in situation
+    answer = explain.compute(case, evaluator, solution=("nsga2:0:0",), unsafe=f"points={points - 1e-3}")
+    (failure,) = answer.tables["solutions"].to_dict("records")
+    assert failure["points"]
+    assert all(name.startswith(("CCRs", "CPNA")) for name in failure["points"])
+    assert [sorted(changes) for changes in answer.tables["causes"]["changes"]] == [["brakeTorque"]]
+    assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [None] * 3
+    (verdict,) = _verdict(case, original)
     kept = evaluations.column("rating_points")[case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]]
-    assert fewest.startswith(f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> ")
+    assert f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

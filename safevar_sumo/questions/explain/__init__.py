@@ -1,87 +1,331 @@
-"""Why does a vehicle fail? Which changes cause the failure, how small a change is enough, and is the failure robust?
-
-The options and the function of the library are defined here, so that a command's help can be shown without loading the
-computation.
+"""Why does a vehicle fail? Which changes cause the failure, how small a change is enough, is the failure robust, and
+would a reference driver have avoided it?
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
-from safevar_sumo.questions.options import Options, document_options, option, unsafe_option
-from safevar_sumo.questions.subject import Results, answer_call
-from safevar_sumo.study import StudyLike
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.ask import Count, Criterion, Range, question
+from safevar_sumo.questions.case import Case, are_collisions
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain.across_fits import Ranges, count_holding, ranges_across_fits
+from safevar_sumo.questions.explain.causes import (
+    Cause,
+    count_distinct_causes,
+    count_needed,
+    find_limits,
+    find_minimal_causes,
+    settings_of,
+)
+from safevar_sumo.questions.explain.failures import (
+    REQUESTED,
+    Population,
+    Reasons,
+    choose_failures,
+    compare_at_cells,
+    compare_at_points,
+    find_failures,
+    time_step,
+)
+from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
+from safevar_sumo.questions.preventability import (
+    COLUMNS as DRIVER_COLUMNS,
+    FULL,
+    LETTER,
+    TITLES,
+    avoided_by,
+    avoided_shares,
+    drivers_frame,
+    judge_collisions,
+    judge_sample,
+)
+from safevar_sumo.questions.tables import Column, tabulate, with_interval
+from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of, share_in_words
+from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import contact_degree
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import constraints_in_words
 
 if TYPE_CHECKING:
-    from safevar_sumo.campaign.pool import Pool
-    from safevar_sumo.metrics import Criterion
-    from safevar_sumo.questions.explain.answer import Explained
-    from safevar_sumo.terminal import Progress
+    from matplotlib.figure import Figure
+
+MAX_DISTINCT = 10
+"""Maximum number of distinct causes in their table."""
+COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
+SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the whole domain"
+"""What the settings are of which some are unsafe."""
+CAUSE_COLUMNS = {
+    "solution": Column("", "handle of the failure"),
+    "changes": Column("", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False),
+    "boundary": Column("", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"),
+    "single_boundary": Column("", "of each, the value if this change alone is scaled back", ".5g", is_shown=False),
+    "fraction": Column("-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False),
+    "end": Column("", "what lies just below the boundary", is_shown=False),
+    "size": Column("", "number of changes", is_shown=False),
+    "outcome": Column("", "outcome with these changes only", is_shown=False),
+    "safety_degree": Column("m", "safety degree with these changes only; -m/s on a collision", is_shown=False),
+    "robust_share": Column("-", "share of the neighbours of these changes that are unsafe, too", ".2f"),
+    "fits_holding": Column("", "number of fitted vehicle models in which these changes are a cause, too"),
+    "avoided_by": Column("", "weakest reference driver who avoids the failure", is_shown=False),
+}
+SOLUTION_COLUMNS = {
+    "solution": Column("", "handle"),
+    "reason": Column("", "why it is explained"),
+    "outcome": Column("", "outcome", is_shown=False),
+    "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
+    "changed": Column("", "number of changes"),
+    "largest_change": Column("-", "largest change, as a share of the original value", is_shown=False),
+    "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
+    "ends": Column("", "how the original vehicle and this one end, where this one is worst", is_shown=False),
+    "points": Column("", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False),
+    "avoided_by": Column("", "weakest reference driver who avoids it, in the same vehicle"),
+}
+CHARACTERISTIC_COLUMNS = {
+    "characteristic": Column("", "characteristic of the vehicle"),
+    "changed": Column("-", "share of the failures that change it", ".2f"),
+    **with_interval("needed", Column("-", "share of the failures of which every minimal cause contains it", ".2f")),
+    "in_some": Column("-", "share of the failures of which some minimal cause contains it", ".2f"),
+}
+"""The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else the share itself."""
+DISTINCT_COLUMNS = {
+    "cause": Column("", "a minimal cause, without the sizes of its changes"),
+    "failures": Column("", "failures with this cause"),
+    "share": Column("-", "their share", ".2f"),
+}
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExplainOptions(Options):
-    """Options of the explanation of failures."""
-
-    question: ClassVar[str] = "explain"
-    solutions: tuple[str, ...] = option(
-        (),
-        "Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]",
-        flag="--solution",
-        metavar="ALG:RUN:N",
-        form="repeated",
-        python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, '
-        "the failures with the "
-        "fewest changes and with the smallest largest change, the most severe failure, and one failure of "
-        "each distinct cause, the "
-        "most frequent first.",
-    )
-    unsafe: str | None = unsafe_option()
-    top: int = option(8, "Maximum number of failures explained in full.", kind=int, low=1, high=1000)
-    limit: int = option(
-        40_000,
-        "Approximate number of simulations for the minimal causes of all failures; if all failures would take "
-        "more, a random sample is analysed.",
-        kind=int,
-        low=1,
-        metavar="N",
-    )
-    fits: int = option(
-        20,
-        "Number of vehicle models that fit the published data about as well (sets of [spread]) with which each "
-        "conclusion is drawn again; 0 leaves this out.",
-        kind=int,
-        low=0,
-        high=1000,
-        metavar="N",
-    )
-
-
-@document_options(ExplainOptions)
+@question
 def explain(
-    source: StudyLike | Results,
+    subject: Study | Case,
+    evaluator: Evaluator,
     *,
-    solutions: Sequence[str] = ExplainOptions.solutions,
-    unsafe: Criterion | None = None,
-    top: int = ExplainOptions.top,
-    limit: int = ExplainOptions.limit,
-    fits: int = ExplainOptions.fits,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: bool | Progress = False,
-    as_it_is_now: bool = False,
-    point: str | None = None,
-) -> Explained:
-    """Explain failures: their minimal causes with boundaries, the reason in words, and the robustness.
+    solution: tuple[str, ...] = (),
+    unsafe: Criterion = None,
+    top: Annotated[int, Range(1, 1000)] = 8,
+    limit: Count = 40_000,
+    fits: Annotated[int, Range(0, 1000)] = 20,
+) -> Answer:
+    """Explain failures: which changes cause them, how small a change is enough, and who would have avoided them.
+
+    Of a study without results, failures among settings drawn from its whole domain are explained.
 
     Parameters
     ----------
-    source
-        Results or their directory: their solutions are explained. A study: failures drawn from its whole domain are
-        explained.
+    solution
+        Handle of a solution, such as nsga2:3:0; may be repeated. By default the robust failure with the fewest changes,
+        those with the fewest and the smallest changes, the most severe one, and one of each distinct cause.
+    unsafe
+        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    top
+        Largest number of failures that are explained.
+    limit
+        Approximate number of simulations for the minimal causes of all failures; if all would take more, a random
+        sample is analysed.
+    fits
+        Number of vehicle models that fit the published data about as well (sets of [spread]) with which each conclusion
+        is drawn again; 0 leaves this out.
     """
-    from safevar_sumo.questions.explain.compute import explain_failures
+    study, reasons = evaluator.study, Reasons()
+    population = find_failures(subject, evaluator, solution, unsafe)
+    rows, runs = population.rows, population.evaluations
+    if solution:
+        reasons, sample = dict.fromkeys(rows, REQUESTED), rows
+        causes = dict(zip(rows, find_minimal_causes(evaluator, runs.settings[rows], population.unsafe), strict=True))
+    else:  # an evaluation simulates a setting at every point
+        points = len(assemble(study).points)
+        reasons, sample, causes = choose_failures(population, evaluator, limit // points, top)
+    changed = evaluator.characteristics.changed(runs.settings[sample])
+    needed = count_needed(evaluator.characteristics, changed, [causes[row] for row in sample], len(rows))
+    # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
+    verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
+    models, ranges = evaluator.for_sets(fits if len(runs) else 0), Ranges()
+    if models:
+        shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
+        ranges = ranges_across_fits(models, runs, population.unsafe, *shares)
+    solutions = _solutions_frame(population, evaluator, reasons)
+    tables = {
+        "causes": _causes_table(population, evaluator, models, solutions, [causes[row] for row in reasons]),
+        "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
+        **_statistics(evaluator, needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
+        "distinct_causes": _distinct_table(evaluator, [causes[row] for row in sample]),
+    }
+    numbers: JsonObject = {
+        **_counts(population, subject),
+        "analysed": len(sample),
+        "explained": len(solutions),
+        **(dict.fromkeys(COLLISION_NUMBERS) if is_rated(study) else _collision_numbers(verdicts, collisions)),
+        "fits": len(models),
+        "unsafe_in_fits": ranges.get(("unsafe", "")),
+    }
+    kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
+    sentences = [_verdict(evaluator, population, kind, len(models), tables["causes"]), _avoided_in_words(verdicts)]
+    verdict = " ".join([*filter(None, sentences), *constraints_in_words(study)])
+    return Answer(question="explain", study=study, verdict=verdict, numbers=numbers, tables=tables, draw=draw_needed)
 
-    return answer_call(explain_failures, ExplainOptions, locals())
+
+def _counts(population: Population, subject: Study | Case) -> JsonObject:
+    """The numbers of settings, how the original vehicle ends, and the number of collisions that the search simulated
+    but its objectives leave out of the solutions.
+    """
+    runs, original, left_out = population.evaluations, population.original, 0
+    if isinstance(subject, Case) and not subject.study.origin.point and not runs.collided.any():
+        left_out = int(are_collisions(subject.evaluations).sum())
+    return {
+        "unsafe": str(population.unsafe),
+        "settings": len(runs),
+        "failures": int(population.unsafe.of(runs).sum()),
+        "other_outcomes": population.otherwise,
+        "left_out": left_out,
+        "original_outcome": str(original.outcome[0]),
+        "original_degree": float(original.f_safe[0]),
+    }
+
+
+def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
+    """The numbers of all collisions, of those judged that some driver avoids, and that even full braking does not."""
+    is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
+    unavoidable = verdicts[FULL].notna() & ~is_avoided
+    return dict(zip(COLLISION_NUMBERS, (collisions, int(is_avoided.sum()), int(unavoidable.sum())), strict=True))
+
+
+def _solutions_frame(population: Population, evaluator: Evaluator, reasons: Reasons) -> pd.DataFrame:
+    """A row of `SOLUTION_COLUMNS` for each chosen failure."""
+    if not reasons:
+        return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
+    study, failures = evaluator.study, population.evaluations.take(list(reasons))
+    settings, original, unsafe = failures.settings, population.original.settings, population.unsafe
+    if is_rated(study):  # each neighbour is simulated in all cells
+        factors, comparisons = STEP_FACTORS[:1], compare_at_cells(evaluator, original, settings)
+    else:
+        factors, comparisons = STEP_FACTORS, compare_at_points(assemble(study), original, settings, unsafe)
+    is_judged = failures.collided & (not is_rated(study))
+    judged = iter(judge_collisions(evaluator, failures.take(is_judged)).to_dict("records"))
+    columns = {
+        "solution": [population.names[row] for row in reasons],
+        "reason": [*reasons.values()],
+        "outcome": failures.outcome,
+        "safety_degree": failures.f_safe,
+        "changed": failures.f_num_diff.astype(int),
+        "largest_change": failures.f_diff,
+        "robust_share": robust_shares(evaluator, settings, time_step(study), unsafe, factors).mean(axis=1),
+        "ends": [sentence for sentence, _ in comparisons],
+        "points": [list(points) for _, points in comparisons],
+        "avoided_by": [avoided_by(next(judged)) if flag else None for flag in is_judged],
+    }
+    return pd.DataFrame(columns)
+
+
+def _causes_table(
+    population: Population,
+    evaluator: Evaluator,
+    models: Sequence[Evaluator],
+    solutions: pd.DataFrame,
+    causes_of: Sequence[Sequence[Cause]],
+) -> pd.DataFrame:
+    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure; of a failure the most robust one first."""
+    study, unsafe = evaluator.study, population.unsafe
+    causes = [cause for group in causes_of for cause in group]
+    robust = np.full(len(causes), np.nan)
+    if causes and not is_rated(study):
+        settings = settings_of(evaluator.characteristics, causes)
+        robust = robust_shares(evaluator, settings, time_step(study), unsafe).mean(axis=1)
+    shrunk, holding = find_limits(evaluator, causes, unsafe), count_holding(models, causes, unsafe)
+    numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), list[tuple[Any, ...]]()
+    for index in np.lexsort([-robust, numbers]).tolist():
+        cause, failure = causes[index], solutions.iloc[numbers[index]]
+        own = (len(cause.changes), cause.outcome, cause.safety_degree, robust[index])
+        holds = holding[index] if models else None
+        rows.append((failure["solution"], cause.changes, *shrunk[index], *own, holds, failure["avoided_by"]))
+    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
+    return tabulate("Minimal causes, all else as in the original", CAUSE_COLUMNS, frame)
+
+
+def _statistics(
+    evaluator: Evaluator, needed: pd.DataFrame, drivers: pd.DataFrame, ranges: Ranges, failures: int, collisions: int
+) -> dict[str, pd.DataFrame]:
+    """The tables of characteristics and of drivers, with ranges over the fitted vehicle models."""
+    in_fits = Column("-", "range over the fitted vehicle models", ".2f")
+    of_characteristics = [ranges.get(("needed", str(name))) for name in needed["characteristic"]]
+    of_drivers = [ranges.get(("avoided", str(name))) for name in drivers["driver"]]
+    return {
+        "characteristics": tabulate(
+            f"Changed and needed, in {number_of(failures, 'failure')}",
+            {**CHARACTERISTIC_COLUMNS, "needed_in_fits": in_fits},
+            needed.assign(needed_in_fits=pd.Series(of_characteristics, dtype=object)),
+        ),
+        "drivers": tabulate(
+            f"Other drivers in the same vehicle, in {number_of(collisions, 'collision')}",
+            {**DRIVER_COLUMNS, "share_in_fits": in_fits},
+            drivers.assign(share_in_fits=pd.Series(of_drivers, dtype=object)),
+        ),
+    }
+
+
+def _distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
+    distinct = count_distinct_causes(evaluator.characteristics, causes)
+    rows = distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT)
+    return tabulate(f"The most frequent of {number_of(len(distinct), 'distinct cause')}", DISTINCT_COLUMNS, rows)
+
+
+def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int, causes: pd.DataFrame) -> str:
+    """How little is enough, how sure that is, and how many settings are unsafe."""
+    unsafe, contact, runs = population.unsafe, contact_degree(assemble(evaluator.study)), population.evaluations
+    counts = f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe ({unsafe.description})."
+    if causes.empty:
+        nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
+        ends = [
+            f"the {who} {ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)}"
+            for who, run in (("worst", nearest), ("original", population.original))
+            if len(run)
+        ]
+        return f"{counts} {join_phrases(ends)}.".replace(" the", " The", 1)
+    leading = causes.iloc[0]
+    if not leading["changes"]:
+        return f"The original vehicle itself is unsafe: no change is needed. {counts}"
+    limits = [
+        f"{item.short_name} {'above' if value > item.original else 'below'} {item.text(value)}{item.suffix}"
+        for item in evaluator.characteristics
+        if (value := leading["boundary"].get(item.name)) is not None
+    ]
+    sure = [robustness_in_words(leading["robust_share"])]
+    sure += [f"in {leading['fits_holding']} of {fits} fitted vehicle models"] if fits else []
+    notes = f" ({'; '.join(filter(None, sure))})" if any(sure) else ""
+    verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
+    return f"With {join_phrases(limits)} the vehicle {verb}{notes}. {counts}"
+
+
+def _avoided_in_words(verdicts: pd.DataFrame) -> str:
+    """What a competent driver, and full braking, would have avoided."""
+    shares = avoided_shares(verdicts)
+    phrases = [f"{TITLES[name]} avoids {share_in_words(shares[name])}" for name in (LETTER, FULL) if name in shares]
+    number = number_of(len(verdicts), "collision")
+    return f"In the same vehicle, of {number} {join_phrases(phrases)}." if phrases else ""
+
+
+def draw_needed(answer: Answer) -> Figure:
+    """How often each characteristic is needed, beside how often it is changed."""
+    from safevar_sumo.questions.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, escape_dollars, new_figure
+
+    frame = answer.tables["characteristics"].iloc[::-1]  # bars are drawn from the bottom up
+    size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
+    figure, ((axis,),) = new_figure(f"{answer.study.name}: changed and needed", 1, 1, size)
+    names: Any = [escape_dollars(name) for name in frame["characteristic"]]
+    for column, label, colour, height in (
+        ("changed", "changed", GREY, 0.8),
+        ("in_some", "in some minimal cause", SKY_BLUE, 0.5),
+        ("needed", "needed: in every minimal cause", BLUE, 0.24),
+    ):
+        axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
+    axis.set_xlim(0, 100)
+    axis.set_xlabel(f"share of {answer.numbers['analysed']} failures [%]")
+    axis.grid(visible=False, axis="y")
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=FONT_SIZE)
+    return figure

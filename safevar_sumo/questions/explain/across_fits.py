@@ -5,18 +5,16 @@ These are the parameter sets of a study's table [spread].
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator, Interval
-from safevar_sumo.questions.explain.causes import Cause, find_minimal_causes, necessity_frame
-from safevar_sumo.questions.preventability import Preventability, assess_preventability
-from safevar_sumo.questions.words import number_of, share_in_words
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject
+from safevar_sumo.questions.explain.causes import Cause, count_needed, find_minimal_causes, settings_of
+from safevar_sumo.questions.preventability import avoided_shares, judge_sample
+from safevar_sumo.records import BoolArray, Evaluations
 
 MAX_SHARE_SETS = 8
 """Maximum number of sets with which shares are computed; the first sets lie farthest apart."""
@@ -27,46 +25,13 @@ collisions the reference drivers avoid.
 MAX_FAILURES = 20
 """Maximum number of failures, those with the fewest changes, whose minimal causes are found with each set."""
 STAGE = "other fitted vehicle models"
+Ranges = dict[tuple[str, str], Interval]
+"""Ranges over parameter sets by kind and name of a share: (`unsafe`, ""), the settings that are unsafe; (`needed`, a
+characteristic), the failures that need it; (`avoided`, a driver), the collisions that he avoids.
 
-
-class AcrossFits(NamedTuple):
-    """Ranges of shares over the parameter sets of a study's table [spread].
-
-    The ends of a range are the share with the study's own parameters plus the least, and plus the greatest difference
-    that another set makes on a sample.
-
-    Attributes
-    ----------
-    sets
-        Number of parameter sets with which the shares were computed, the study's own among them.
-    ranges
-        The ends of each range by kind and name of the share: (`unsafe`, ""), the settings that are unsafe;
-        (`necessary`, a characteristic), the failures that need it; (`preventable`, a driver),
-        the collisions that he avoids of those with a verdict, if there is one.
-    """
-
-    sets: int
-    ranges: Mapping[tuple[str, str], Interval]
-
-    def __str__(self) -> str:
-        sentence = (
-            f"With {number_of(self.sets, 'vehicle model')} that fit the published data about as well, "
-            f"{self._words('unsafe', '')} of them are unsafe"
-        )
-        if ("preventable", "competent_driver") not in self.ranges:
-            return f"{sentence}."
-        avoided = self._words("preventable", "competent_driver")
-        return f"{sentence}; a competent driver avoids {avoided} of the collisions."
-
-    def _words(self, kind: str, name: str) -> str:
-        return " to ".join(dict.fromkeys(map(share_in_words, self.ranges[kind, name])))
-
-    def to_dict(self) -> JsonObject:
-        """The entry `across_fits` of a summary in JSON: the ranges under the names of the shares."""
-        kinds: dict[str, JsonObject] = {"unsafe": {}, "necessary": {}, "preventable": {}}
-        for (kind, name), ends in self.ranges.items():
-            kinds[kind][name] = {"sets": self.sets, "range": list(ends)}
-        return {**kinds, "unsafe": kinds["unsafe"][""]}
+The ends of a range are the share with the study's own parameters plus the least, and plus the greatest difference that
+another set makes on a sample.
+"""
 
 
 def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[Cause], unsafe: Unsafe) -> list[int]:
@@ -76,9 +41,8 @@ def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[Cause], unsa
     counts = np.zeros(len(causes), dtype=int)
     if not causes or not evaluators:
         return counts.tolist()
-    characteristics, groups = evaluators[0].characteristics, list[FloatArray]()
-    for cause in causes:
-        setting = cause.setting(characteristics)
+    characteristics, groups = evaluators[0].characteristics, []
+    for setting in settings_of(characteristics, causes):
         is_changed = setting != characteristics.original
         is_left_out = np.diag(is_changed)[is_changed]
         groups.append(np.vstack([setting, np.where(is_left_out, characteristics.original, setting)]))
@@ -90,17 +54,19 @@ def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[Cause], unsa
     return counts.tolist()
 
 
-def measure_across_fits(
+def ranges_across_fits(
     evaluators: Sequence[Evaluator],
     evaluations: Evaluations,
     unsafe: Unsafe,
-    necessity: pd.DataFrame,
-    preventability: Preventability,
-) -> AcrossFits:
-    """The ranges of the shares over the sets of `evaluators`.
+    needed: pd.Series[float],
+    avoided: pd.Series[float],
+) -> Ranges:
+    """The ranges of the shares over the sets of `evaluators`, of which the first has the study's own parameters.
 
-    `evaluations`, `necessity` and `preventability` give the shares with the study's own parameters.
+    With these, the shares of failures that need a characteristic are `needed`, and of collisions that a driver avoids
+    `avoided`.
     """
+    evaluators = evaluators[:MAX_SHARE_SETS]
     order = np.random.default_rng(evaluators[0].study.search.seed).permutation(len(evaluations))
     vehicles = evaluations.settings[order[:MAX_VEHICLES]]
     failures = evaluations.take(unsafe.of(evaluations))
@@ -111,26 +77,25 @@ def measure_across_fits(
         causes = find_minimal_causes(evaluator, failures.settings, unsafe)
         rows = [row for row, of_failure in enumerate(causes) if of_failure]
         changed = evaluator.characteristics.changed(failures.settings[rows])
-        frame = necessity_frame(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
+        frame = count_needed(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
         runs = evaluator.evaluate(vehicles, STAGE)
-        avoided = assess_preventability(evaluator, runs.take(runs.collided)).shares if preventability.shares else {}
-        return _shares_by_kind(unsafe.of(runs), frame, avoided)
+        avoided_here = (
+            avoided if avoided.empty else avoided_shares(judge_sample(evaluator, runs.take(runs.collided))[0])
+        )
+        return _shares_by_kind(unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here)
 
-    shares = _shares_by_kind(unsafe.of(evaluations), necessity, preventability.shares)
-    samples = pd.concat(list(map(sample_shares, evaluators[:MAX_SHARE_SETS])), axis=1).reindex(shares.index)
+    shares = _shares_by_kind(unsafe.of(evaluations), needed, avoided)
+    samples = pd.concat(list(map(sample_shares, evaluators)), axis=1).reindex(shares.index)
     # Column 0 has the study's own parameters. There is no share where a sample has no failure, or no collision.
     differences = samples.sub(samples[0].fillna(shares), axis=0)
     lows, highs = (
         (shares + extremes.fillna(0.0)).clip(0.0, 1.0).tolist()
         for extremes in (differences.min(axis=1), differences.max(axis=1))
     )
-    return AcrossFits(samples.shape[1], dict(zip(shares.index, zip(lows, highs, strict=True), strict=True)))
+    return dict(zip(shares.index, zip(lows, highs, strict=True), strict=True))
 
 
-def _shares_by_kind(
-    is_unsafe: BoolArray, necessity: pd.DataFrame, preventable: Mapping[str, float]
-) -> pd.Series[float]:
-    necessary = necessity.set_index("characteristic")["necessary"]
-    kinds = {"unsafe": {"": is_unsafe.mean()}, "necessary": necessary, "preventable": preventable}
+def _shares_by_kind(is_unsafe: BoolArray, needed: pd.Series[float], avoided: pd.Series[float]) -> pd.Series[float]:
+    kinds = {"unsafe": {"": is_unsafe.mean()}, "needed": needed, "avoided": avoided}
     shares: pd.Series[float] = pd.concat({kind: pd.Series(values, dtype=float) for kind, values in kinds.items()})
     return shares

@@ -18,7 +18,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Margin, question
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
-from safevar_sumo.questions.explain.causes import describe_causes, find_minimal_causes
+from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
 from safevar_sumo.questions.repair.answer import answer_of, check_file, write_repair
 from safevar_sumo.questions.repair.attack import Proof, find_failures, prove
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
@@ -136,5 +136,5 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     driver, unsafe = problem.best_driver, Unsafe(problem.margin)
     chosen = failures[np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)]
     causes = [cause for group in find_minimal_causes(driver, chosen, unsafe) for cause in group]
-    limits = [cause.boundary for cause in describe_causes(driver, causes, unsafe)]
+    limits = [one.boundary for one in find_limits(driver, causes, unsafe)]
     return [limit for number, limit in enumerate(limits) if limit not in limits[:number]]

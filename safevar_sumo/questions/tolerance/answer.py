@@ -13,7 +13,6 @@ from rich.table import Table
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import CONFIDENCE
-from safevar_sumo.questions.explain.answer import situation_in_words
 from safevar_sumo.questions.figures import (
     BLUE,
     DEGREE_LABEL,
@@ -30,7 +29,6 @@ from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study
 from safevar_sumo.sumo.empty_road import driven_entry
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, answer_as_html, constraints_in_words, meanings
 
 if TYPE_CHECKING:
@@ -146,7 +144,7 @@ class Tolerance:
 
     def sentences(self) -> Iterator[str | Table]:
         """The verdict, the limits that may be obeyed together with the test of them, and each characteristic alone."""
-        yield f"Unsafe: {self.unsafe.description}. {situation_in_words(assemble(self.study), self.original)}"
+        yield f"Unsafe: {self.unsafe.description}."
         if not self.no_verdict:
             yield self.verdict
         yield from constraints_in_words(self.study)

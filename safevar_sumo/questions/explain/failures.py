@@ -1,0 +1,204 @@
+"""Which failures are explained: those that matter among the solutions of results, or among settings drawn from a
+study's whole domain; and how each of them ends beside the original vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain.causes import (
+    Cause,
+    count_distinct_causes,
+    directions,
+    find_minimal_causes,
+    select_affordable_rows,
+)
+from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure
+from safevar_sumo.questions.words import ending_in_words
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import contact_degree, evaluate, simulate, simulate_all_points, worst_points
+from safevar_sumo.sumo.system import System, assemble
+
+Reasons = dict[int, str]
+"""The rows of the chosen failures, with the reasons for their choice."""
+ROBUST = "smallest robust"
+"""The reason for choosing the robust failure with the fewest changes."""
+REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest": "smallest changes"}
+"""The other reasons for choosing a failure, by the name of the choice in `CHOICES`."""
+REQUESTED = "requested"
+"""The reason for explaining a solution that the user names."""
+DISTINCT_CAUSE = "a cause of its own"
+"""The reason for choosing the simplest failure with a cause that no other chosen failure has."""
+SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
+"""Number of settings drawn from the whole domain if there are no results, in an unrated and in a rated study."""
+
+
+class Population(NamedTuple):
+    """Evaluated settings, safe ones too, and the failures among them.
+
+    Attributes
+    ----------
+    original
+        Evaluation of the original vehicle.
+    evaluations
+        Equal solutions of several runs are one row.
+    names
+        The handle of each row; `drawn:N` if the setting is no solution.
+    unsafe
+        The criterion.
+    rows
+        The unsafe rows, or those that the user names.
+    otherwise
+        Number of rows with another outcome than in the results.
+    """
+
+    original: Evaluations
+    evaluations: Evaluations
+    names: Sequence[str]
+    unsafe: Unsafe
+    rows: list[int]
+    otherwise: int
+
+
+def find_failures(
+    subject: Study | Case, evaluator: Evaluator, solutions: Sequence[str], criterion: str | None
+) -> Population:
+    """Evaluate all solutions of results, or settings drawn from a study's whole domain.
+
+    Raises
+    ------
+    InputError
+        If the criterion or a handle cannot be read, or a handle is no solution of the results.
+    """
+    unsafe = None if criterion is None else evaluator.parse_criterion(criterion)
+    named = [SolutionId.parse(text) for text in solutions]
+    original = evaluator.evaluate_original()
+    if isinstance(subject, Study):
+        if named:
+            raise InputError("solution", f"{subject.name!r} is a study and has no solutions", "a results directory")
+        number = RATED_SAMPLED_SETTINGS if is_rated(subject) else SAMPLED_SETTINGS
+        drawn = evaluator.feasible_settings(number, subject.search.seed, feasible_after_filter=True)
+        settings = evaluator.characteristics.filter(drawn)
+        names, recorded = [f"drawn:{row}" for row in range(len(settings))], np.full(len(settings), UNKNOWN)
+    else:
+        table, characteristics = subject.solutions, list(evaluator.characteristics.names)
+        named_rows = [row_of_handle(table, handle) for handle in named]
+        distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
+        chosen = list(dict.fromkeys([*named_rows, *distinct]))  # the named ones first
+        settings, handles = table[characteristics].to_numpy(dtype=float)[chosen], handles_of(table)
+        names, recorded = [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen]
+    evaluations = evaluator.evaluate(settings, "settings to explain")
+    unsafe = unsafe or Unsafe.default_among(evaluations, original)
+    rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
+    otherwise = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
+    return Population(original, evaluations, names, unsafe, rows, int(otherwise))
+
+
+def choose_failures(
+    population: Population, evaluator: Evaluator, limit: int, top: int
+) -> tuple[Reasons, list[int], dict[int, list[Cause]]]:
+    """At most `top` failures that matter, the rows of a sample of all failures, and the minimal causes of both by row.
+
+    The sample are all failures, if that takes at most about `limit` simulations. What matters: the smallest robust
+    failure, a failure for each of `REASONS`, and the simplest failure with each minimal cause that these do not have.
+    """
+    rows, settings = population.rows, population.evaluations.settings
+    sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
+    reasons = _failures_that_matter(population, evaluator, limit)
+    analysed = sorted({*sample, *reasons})
+    found = find_minimal_causes(evaluator, settings[analysed], population.unsafe)
+    causes = dict(zip(analysed, found, strict=True))
+    reasons, runs = dict(list(reasons.items())[:top]), population.evaluations
+    keys = {row: {directions(evaluator.characteristics, cause.changes) for cause in causes[row]} for row in causes}
+    for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])["cause"]:
+        if len(reasons) < top and not any(key in keys[row] for row in reasons):
+            of_this_cause = [row for row in sample if key in keys[row]]
+            simplest = min(of_this_cause, key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row))
+            reasons[simplest] = DISTINCT_CAUSE
+    return reasons, sample, causes
+
+
+def _failures_that_matter(population: Population, evaluator: Evaluator, limit: int) -> Reasons:
+    """The smallest robust failure, and a failure for each of `REASONS`."""
+    reasons, failures = Reasons(), population.evaluations.take(population.rows)
+    if not population.rows:
+        return reasons
+    if not is_rated(evaluator.study) and not population.unsafe.of(population.original)[0]:
+        step = time_step(evaluator.study)
+        index = find_smallest_robust_failure(evaluator, failures, step, population.unsafe, limit)
+        if index is not None:
+            reasons[population.rows[index]] = ROBUST
+    for choice, reason in REASONS.items():
+        order = np.lexsort([failures.column(name) for name in reversed(CHOICES[choice])])
+        row = population.rows[order[0]]
+        reasons[row] = f"{reasons[row]}; {reason}" if row in reasons else reason
+    return reasons
+
+
+def time_step(study: Study) -> float:
+    """The time step of the simulations [s]."""
+    system = assemble(study)
+    return simulate(system.at(system.points[0]), system.characteristics.original[np.newaxis]).trace.step
+
+
+PointComparison = tuple[str, tuple[str, ...]]
+"""How the runs of the original vehicle and of a failure end at the failure's worst point, in a sentence; and the names
+of the points of a test matrix at which it is unsafe (in a rated study, of the cells whose colour is worse than the
+original's), in the study's order.
+"""
+
+
+def _endings_in_words(system: System, point: str, evaluations: Evaluations, row: int) -> str:
+    """How the runs of the original vehicle, in row 0, and of another vehicle end at a point."""
+    contact = contact_degree(system)
+    original, changed = (
+        ending_in_words(str(evaluations.outcome[k]), float(evaluations.f_safe[k]), contact) for k in (0, row)
+    )
+    return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
+
+
+def compare_at_points(
+    system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe
+) -> list[PointComparison]:
+    """Compare settings, shape (M, n), with the original, shape (1, n)."""
+    results = simulate_all_points(system, np.concatenate([original, settings]))
+    at_points = [result.evaluations for result in results]
+    is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)
+    comparisons = []
+    for vehicle in range(1, len(worst)):  # vehicle 0 is the original
+        names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
+        at_worst = results[worst[vehicle]]
+        sentence = _endings_in_words(system, at_worst.point.name, at_worst.evaluations, vehicle)
+        comparisons.append((sentence, tuple(filter(None, names))))  # without a matrix, the only point has no name
+    return comparisons
+
+
+def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> list[PointComparison]:
+    """Compare settings with the original as `compare_at_points` does, for a rated study: at the cell whose colour
+    worsens most.
+
+    An unknown colour is neither better nor worse.
+    """
+    system = assemble(evaluator.study)
+    assert system.rater is not None
+    cells = evaluator.simulate_cells(np.concatenate([original, settings]), "cells whose colour is worse")
+    colours = system.rater.points(cells).colours.astype(int)
+    # Steps by which a colour is worse; the original is in row 0.
+    losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
+    comparisons = []
+    for setting, loss in zip(settings, losses, strict=True):
+        point = system.matrix[int(np.argmax(loss))]
+        evaluations = evaluate(system.at(point), np.stack([original[0], setting]))
+        worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
+        comparisons.append((_endings_in_words(system, point.name, evaluations, 1), worse_cells))
+    return comparisons
