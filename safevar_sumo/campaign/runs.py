@@ -11,11 +11,11 @@ import numpy as np
 
 from safevar_sumo.campaign.evaluation import VERIFIED_SETTINGS
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.plugins import Lookup, instance_of
+from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import Failure, Journal, failures_of, run_name
-from safevar_sumo.search import ALGORITHMS, Algorithm, Search
-from safevar_sumo.study import SearchTable, Study
+from safevar_sumo.search import ALGORITHMS, DESCRIPTIONS, PYMOO_ALGORITHMS, Algorithm, Search, pymoo_algorithm
+from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
 
 
 class RunKey(NamedTuple):
@@ -56,6 +56,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     """
     source, search = study.source, study.search
     name, key = search.labels.get(label, label), f"search.{label}"
+    parameters_of = {label_of(table): parameters for table, parameters in search.parameters.items()}
     if len(search.labels) < len(search.algorithms):
         raise InputError(
             source,
@@ -63,12 +64,18 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             "algorithms with different names",
         )
     for table in search.parameters:
-        if table not in ALGORITHMS and table not in search.labels:
-            legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
-            raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
+        if not (table in PYMOO_ALGORITHMS or table in ALGORITHMS or label_of(table) in search.labels):
+            legal = dict.fromkeys((*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels))
+            problem = f"search.{table}: there is no such key and no such algorithm"
+            raise unknown_name(source, problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal)
     lookup = Lookup.of(study)
-    member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
-    parameters = lookup.with_paths(member, search.parameters.get(label, {}), key)
+    if PYMOO + name in PYMOO_ALGORITHMS:
+        raise InputError(source, f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
+    if name.startswith(PYMOO):
+        member, key = Member(pymoo_algorithm(name, source)), f"search.{name!r}"
+    else:
+        member = lookup.class_of({**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm)
+    parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
     algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     return algorithm
 

@@ -15,7 +15,7 @@ from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS,
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
-from safevar_sumo.search import ALGORITHMS
+from safevar_sumo.search import DESCRIPTIONS
 from safevar_sumo.study import Study, load_study, study_names
 from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import CHANGES, VEHICLES, CharacteristicSet
@@ -98,7 +98,7 @@ def _catalogue(
     descriptions: dict[str, Mapping[str, object]] = {
         "ads": ADS,
         "scenarios": SCENARIOS,
-        "algorithms": ALGORITHMS,
+        "algorithms": DESCRIPTIONS,
         "metrics": {name: metric.description for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()},
         "objectives": objectives,
     }

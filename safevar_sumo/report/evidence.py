@@ -160,7 +160,7 @@ class Packed:
         """
         study, prefix = self.case.study, f"{CODE}/"
         files = [name.removeprefix(prefix) for name in self.files if name.startswith(prefix)]
-        return [*files, *user_code_names(study), *(name for name in study.search.algorithms if ":" in name)]
+        return [*files, *user_code_names(study)]
 
 
 def read_table(content: bytes) -> pd.DataFrame:

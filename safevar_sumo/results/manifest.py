@@ -19,7 +19,7 @@ from msgspec import Struct
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import DESCRIPTION_KEYS, Study, convert_table, tables_of
+from safevar_sumo.study import DESCRIPTION_KEYS, PYMOO, Study, convert_table, tables_of
 from safevar_sumo.study.schema import Tables
 
 FORMAT = 5
@@ -29,6 +29,8 @@ RESULTS = 8
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Packages on whose versions a single simulation depends."""
 PACKAGES = ("safevar_sumo", *SIMULATORS, "deap", "numpy")
+PYMOO_PACKAGES = ("pymoo", "cma")
+"""Packages on whose versions the searches of pymoo depend, named in the manifest of a study that has some."""
 KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "title",
     "published",
@@ -137,11 +139,12 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     identity
         Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.identity.identity_of`.
     """
+    has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     return {
         "format": FORMAT,
         "study": tables_of(study),
         **identity,
-        "versions": {name: version(name) for name in PACKAGES},
+        "versions": {name: version(name) for name in (*PACKAGES, *(PYMOO_PACKAGES if has_pymoo else ()))},
     }
 
 
@@ -166,8 +169,10 @@ def identity_in(manifest: JsonObject) -> JsonObject:
 
 
 def identity_digest(manifest: JsonObject) -> str:
-    """The digest that identifies a manifest's study in its journals."""
-    return sha256(json.dumps(identity_in(manifest), sort_keys=True).encode()).hexdigest()
+    """The digest that identifies a manifest's study in its journals, whether or not it has searches of pymoo."""
+    layers = identity_in(manifest)
+    versions = {name: value for name, value in layers["versions"].items() if name not in PYMOO_PACKAGES}
+    return sha256(json.dumps({**layers, "versions": versions}, sort_keys=True).encode()).hexdigest()
 
 
 def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
@@ -178,6 +183,8 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
     """
     for layer, inputs in identity_in(now).items():
         for key, before, after in changed_values(identity_in(stored)[layer], inputs):
+            if key in PYMOO_PACKAGES and None in (before, after):
+                continue
             if layer == "files":
                 change = "is new" if before is None else "has changed since"
                 text = f"{key} no longer exists" if after is None else f"{key} {change}"

@@ -21,6 +21,7 @@ from safevar_sumo.study.file import (
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,
+    PYMOO as PYMOO,
     SAFETY_DEGREE as SAFETY_DEGREE,
     FreeParameter as FreeParameter,
     MatrixTable as MatrixTable,

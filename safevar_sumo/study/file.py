@@ -19,6 +19,7 @@ from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
+    PYMOO,
     Origin,
     Parameters,
     RepairTable,
@@ -262,7 +263,7 @@ def user_code(study: Study) -> list[tuple[str, str]]:
         "scenario.model": [study.scenario.model, *tests],
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
-        "search.algorithms": study.search.algorithms,
+        "search.algorithms": [name for name in study.search.algorithms if not name.startswith(PYMOO)],
     }
     fmus = fmus_of(study)
     return [

@@ -117,8 +117,8 @@ class SearchTable(Table, frozen=True, kw_only=True):
     `population`; `seed` is the seed of all random numbers.
 
     A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises `objectives`, and drives
-    metrics in their unsafe direction. `parameters` hold the parameters of algorithms by label; a file has them in
-    tables such as [search.nsga2].
+    metrics in their unsafe direction. `parameters` hold the parameters of algorithms by name or label; a file has them
+    in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
@@ -138,9 +138,13 @@ class SearchTable(Table, frozen=True, kw_only=True):
         return {label_of(name): name for name in self.algorithms}
 
 
+PYMOO = "pymoo:"
+"""Prefix of the names of pymoo's algorithms."""
+
+
 def label_of(algorithm: str) -> str:
-    """Label of an algorithm in results: the Name of `package.module:Name`."""
-    return algorithm.rpartition(":")[2]
+    """Label of an algorithm in results: pymoo_NSGA3 for `pymoo:NSGA3`, the Name of any other `package.module:Name`."""
+    return algorithm.replace(":", "_") if algorithm.startswith(PYMOO) else algorithm.rpartition(":")[2]
 
 
 class MatrixTest(Table, frozen=True, kw_only=True):

@@ -18,7 +18,7 @@ from jmetal.util.termination_criterion import StoppingByEvaluations
 
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.search import ALGORITHMS, Problem
+from safevar_sumo.search import ALGORITHMS, Problem, Search
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.test_algorithms import evaluated
 
@@ -77,7 +77,9 @@ class StandardScoring:
         return np.ones(len(evaluations), dtype=bool)
 
 
-def front_of_ours(standard: StandardProblem, seed: int) -> FloatArray:
+def standard_problem(
+    standard: StandardProblem, evaluations: int = EVALUATIONS, population: int = POPULATION
+) -> Problem:
     unit = Unfiltered(
         tuple(
             Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0)
@@ -85,20 +87,28 @@ def front_of_ours(standard: StandardProblem, seed: int) -> FloatArray:
         )
     )
     scoring: Any = StandardScoring(standard)
-    problem = Problem(
+    return Problem(
         characteristics=unit,
         original=evaluated(unit, unit.original[np.newaxis], np.zeros(1)),
-        evaluations=EVALUATIONS,
-        population=POPULATION,
+        evaluations=evaluations,
+        population=population,
         scoring=scoring,
     )
-    search = ALGORITHMS["nsga2"]().search(problem, np.random.default_rng(seed))
+
+
+def result_of(search: Search, problem: Problem) -> Evaluations:
     asked = next(search)
     while True:
         try:
-            asked = search.send(evaluated(unit, asked, np.zeros(len(asked))))
+            asked = search.send(evaluated(problem.characteristics, asked, np.zeros(len(asked))))
         except StopIteration as end:
-            return scoring.values(end.value)
+            return end.value  # type: ignore[no-any-return]
+
+
+def front_of_ours(standard: StandardProblem, seed: int) -> FloatArray:
+    problem = standard_problem(standard)
+    result = result_of(ALGORITHMS["nsga2"]().search(problem, np.random.default_rng(seed)), problem)
+    return problem.scoring.values(result)
 
 
 def front_of_jmetal(standard: StandardProblem, seed: int) -> FloatArray:

@@ -1,0 +1,245 @@
+"""The algorithms of pymoo (Blank and Deb 2020) by name, such as `pymoo:NSGA3`: its ask and tell behind our contract."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+from types import SimpleNamespace
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from safevar_sumo.errors import InputError, describe_error, unknown_name
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.search.base import Algorithm, Problem, Search
+from safevar_sumo.study import PYMOO, label_of
+
+MODULES = {
+    "moo.age": "AGEMOEA",
+    "moo.age2": "AGEMOEA2",
+    "moo.cmopso": "CMOPSO",
+    "moo.ctaea": "CTAEA",
+    "moo.gde3": "GDE3 GDE3MNN GDE32NN GDE3PCD",
+    "moo.moead": "MOEAD ParallelMOEAD",
+    "moo.mopso_cd": "MOPSO_CD",
+    "moo.nsde": "NSDE",
+    "moo.nsder": "NSDER",
+    "moo.nsga2": "NSGA2",
+    "moo.nsga3": "NSGA3",
+    "moo.omni": "OmniOptimizer",
+    "moo.rnsga2": "RNSGA2",
+    "moo.rnsga3": "RNSGA3",
+    "moo.rvea": "RVEA",
+    "moo.sms": "SMSEMOA",
+    "moo.spea2": "SPEA2",
+    "moo.unsga3": "UNSGA3",
+    "soo.nonconvex.brkga": "BRKGA",
+    "soo.nonconvex.cmaes": "CMAES SimpleCMAES BIPOPCMAES",
+    "soo.nonconvex.de": "DE",
+    "soo.nonconvex.direct": "DIRECT",
+    "soo.nonconvex.es": "ES",
+    "soo.nonconvex.g3pcx": "G3PCX",
+    "soo.nonconvex.ga": "GA",
+    "soo.nonconvex.ga_niching": "NicheGA",
+    "soo.nonconvex.isres": "ISRES",
+    "soo.nonconvex.nelder": "NelderMead",
+    "soo.nonconvex.nrbo": "NRBO",
+    "soo.nonconvex.pattern": "PatternSearch",
+    "soo.nonconvex.pso": "PSO",
+    "soo.nonconvex.pso_ep": "EPPSO",
+    "soo.nonconvex.sres": "SRES",
+}
+"""pymoo's algorithms for real numbers by their module: `moo` for several objectives, `soo` for one."""
+PYMOO_ALGORITHMS = {PYMOO + name: module for module, names in MODULES.items() for name in names.split()}
+"""The module of each algorithm, by its name in a study. Not here: algorithms for problems that change over time
+(DNSGA2, KGB), for bits (BGA) and for a person who decides (PINSGA2), and a second random search.
+"""
+PARTITIONS = 12
+"""Partitions of each objective in Das and Dennis's directions (1998), where a study gives no others."""
+Count = Annotated[int, Meta(ge=1, le=100_000)]
+TYPES: dict[str, Any] = {
+    "ref_dirs": Count | list[list[float]],
+    "ref_points": list[list[float]],
+    "pop_per_ref_point": Count,
+    "pop_size": Count,
+    "n_offsprings": Count,
+    "weights": list[float],
+    "F": float | list[float],
+}
+"""Types of arguments whose default value in pymoo does not tell them."""
+HIDDEN = {"verb_log", "cmaes_verbose", "maxfevals", "n_diffs", "advance_after_initial_infill"}
+"""Arguments that write files, print, or are no choice of the user's."""
+FAILED = 1e9
+"""Objectives and violation, for pymoo, of a setting that could not be scored."""
+
+
+class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An algorithm of pymoo; its fields are those arguments of pymoo's class that are plain values.
+
+    A population that has a size by default has the study's. `ref_dirs` are reference directions, or the number of
+    partitions of Das and Dennis's. The variables are the characteristics' unfiltered values; an algorithm for one
+    objective minimises the first. The result is pymoo's optimum, together with the settings of an incomplete last
+    generation. A setting that could not be scored is infeasible.
+    """
+
+    name: ClassVar[str]
+
+    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+        randomness, known, left = (
+            _Randomness(self.name, rng),
+            dict[bytes, tuple[Evaluations, int]](),
+            problem.evaluations,
+        )
+        with randomness:
+            from pymoo.core.individual import Individual
+            from pymoo.core.population import Population
+            from pymoo.util.optimum import filter_optimum
+
+            algorithm, optimum = self.begin(problem, randomness.seed), Population()
+        while left and algorithm.has_next():
+            with randomness:
+                asked = algorithm.ask()
+            group = [asked] if isinstance(asked, Individual) else asked
+            if group is None or not len(group):
+                break
+            new = [individual for individual in group if not individual.evaluated]
+            batch, left = Population.create(*new[:left]), left - len(new)
+            if new:
+                evaluations = yield _settings(batch, problem)
+                known |= {setting.tobytes(): (evaluations, row) for row, setting in enumerate(evaluations.settings)}
+                _score(batch, evaluations, problem, algorithm)
+            with randomness:
+                if left >= 0:
+                    algorithm.tell(infills=asked)
+                    optimum = algorithm.opt
+                else:
+                    optimum = filter_optimum(Population.merge(optimum, batch), least_infeasible=True)
+            left = max(left, 0)
+        found = [known[setting.tobytes()] for setting in _settings(optimum, problem)]
+        batches = [evaluations.take([row]) for evaluations, row in found]
+        result = Evaluations.concatenate([problem.original.take([]), *batches])
+        return result.take(problem.scoring.valid(result))
+
+    def begin(self, problem: Problem, seed: int) -> Any:
+        """pymoo's algorithm before its first request."""
+        from pymoo.core.problem import Problem as PymooProblem
+        from pymoo.util.ref_dirs import get_reference_directions
+
+        objectives = len(problem.scoring.objectives) if PYMOO_ALGORITHMS[self.name].startswith("moo.") else 1
+        defaults = _plain_arguments(self.name)
+        given = {name: value for name in defaults if (value := getattr(self, name)) is not UNSET}
+        given |= {name: np.array(value) for name, value in given.items() if isinstance(value, list) and name != "F"}
+        if isinstance(defaults.get("pop_size"), int):
+            given = {"pop_size": problem.population, **given}
+        if "ref_dirs" in defaults:
+            partitions = given.get("ref_dirs", PARTITIONS)
+            if isinstance(partitions, int):
+                given["ref_dirs"] = get_reference_directions("das-dennis", objectives, n_partitions=partitions)
+            if given.get("pop_size", np.inf) < len(given["ref_dirs"]):
+                raise ValueError(f"pop_size is less than the {len(given['ref_dirs'])} reference directions")
+        lower, upper = problem.characteristics.lower, problem.characteristics.upper
+        constraints = 0 if self.name.endswith("MOEAD") else 1  # it refuses constraints
+        task = PymooProblem(len(lower), objectives, n_ieq_constr=constraints, xl=lower, xu=upper)
+        algorithm = copy.deepcopy(_class_of(self.name)(**given))  # runs share the defaults of pymoo's classes
+        return algorithm.setup(task, termination=("n_eval", problem.evaluations), seed=seed)
+
+
+def _settings(population: Any, problem: Problem) -> FloatArray:
+    """The filtered settings of pymoo's individuals, shape (k, n)."""
+    characteristics = problem.characteristics
+    values = np.clip(population.get("X").astype(float), characteristics.lower, characteristics.upper)
+    return characteristics.filter(problem.repaired(values))
+
+
+def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:
+    """Give pymoo's individuals their objectives and violations."""
+    valid, values = problem.scoring.valid(evaluations), problem.scoring.values(evaluations)
+    values = np.where(valid[:, np.newaxis], values, FAILED)[:, : algorithm.problem.n_obj]
+    population.set("F", values, "G", np.where(valid, 0.0, FAILED)[:, np.newaxis])
+    population.apply(lambda individual: individual.evaluated.update("FGH"))
+    algorithm.evaluator.n_eval += len(evaluations)
+
+
+class _Randomness:
+    """Blocks in which the randomness of pymoo is that of one run, and its errors are the user's.
+
+    pymoo and pycma draw from numpy's global state, and from generators without a seed, too.
+    """
+
+    def __init__(self, name: str, rng: np.random.Generator) -> None:
+        self._name, self._unseeded, self.seed = name, rng.spawn(1)[0], int(rng.integers(2**31))
+        self._inside = np.random.RandomState(self.seed).get_state()
+
+    def default_rng(self, seed: int | None) -> np.random.Generator:
+        """What pymoo takes for numpy's function."""
+        return self._unseeded if seed is None else np.random.default_rng(seed)
+
+    def __enter__(self) -> None:
+        import pymoo.util
+
+        self._outside = np.random.get_state()
+        np.random.set_state(self._inside)
+        pymoo.util.np = SimpleNamespace(random=self)
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        import pymoo.util
+
+        self._inside = np.random.get_state()
+        np.random.set_state(self._outside)
+        pymoo.util.np = np
+        if isinstance(error, Exception):
+            raise InputError(self._name, describe_error(error), "other arguments or objectives") from error
+
+
+def pymoo_algorithm(name: str, source: str) -> type[PymooAlgorithm]:
+    """The class of an algorithm of pymoo by its name in a study, `source`.
+
+    Raises
+    ------
+    InputError
+        If pymoo is not installed or has no such algorithm.
+    """
+    if name not in PYMOO_ALGORITHMS:
+        raise unknown_name(source, f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
+    fields = list[Any]()
+    for argument, default in _plain_arguments(name).items():
+        kind = TYPES.get(argument, type(default))
+        is_required = default is inspect.Parameter.empty and argument != "ref_dirs"
+        fields.append((argument, kind) if is_required else (argument, kind | UnsetType, UNSET))
+    namespace = {"name": name, "title": f"{name.removeprefix(PYMOO)} (pymoo)"}
+    algorithm: Any = msgspec.defstruct(label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace)
+    return algorithm  # type: ignore[no-any-return]
+
+
+def _class_of(name: str) -> Any:
+    """pymoo's class of an algorithm; raises an InputError if pymoo is not installed."""
+    try:
+        from pymoo.config import Config
+    except ImportError:
+        problem = "pymoo, the library of search algorithms, is not installed"
+        raise InputError(name, problem, "in the checkout: pip install '.[pymoo]'") from None
+    Config.warnings["not_compiled"] = False
+    from pymoo.functions import FunctionLoader
+
+    # Its compiled crowding distances end the process (GDE3PCD in 0.6.2), and all machines have the other ones.
+    FunctionLoader.get_instance().is_compiled = False
+    return getattr(importlib.import_module(f"pymoo.algorithms.{PYMOO_ALGORITHMS[name]}"), name.removeprefix(PYMOO))
+
+
+def _plain_arguments(name: str) -> dict[str, Any]:
+    """Arguments of an algorithm's class and its bases that a file can give, with their default values."""
+    algorithm = _class_of(name)
+    arguments = dict[str, inspect.Parameter]()
+    variant = getattr(importlib.import_module(algorithm.__module__), "Variant", algorithm)  # takes those of DE
+    for one in (*algorithm.__mro__[:-2], variant):
+        arguments = {**inspect.signature(one.__init__).parameters, **arguments}
+    if "ref_points" in arguments:
+        arguments.pop("ref_dirs", None)
+    return {
+        argument: parameter.default
+        for argument, parameter in arguments.items()
+        if argument not in HIDDEN and (argument in TYPES or isinstance(parameter.default, bool | int | float | str))
+    }

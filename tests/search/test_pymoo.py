@@ -1,0 +1,246 @@
+"""The algorithms of pymoo behind the contract of our own."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from safevar_sumo.campaign.runs import algorithm_of
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.results import load_runs, read_manifest
+from safevar_sumo.results.manifest import write_manifest
+from safevar_sumo.search import Algorithm, Problem
+from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
+from safevar_sumo.study import Study, load_study
+from tests.campaign.formulas import FormulaPool, carried_out, solutions
+from tests.search.test_algorithms import SUN, sphere
+from tests.search.test_standard_problems import PROBLEMS, result_of, standard_problem
+
+REQUIRED: dict[str, dict[str, Any]] = {
+    "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
+    "pymoo:RNSGA3": {"ref_points": [[0.5, 0.3, 6.0]], "pop_per_ref_point": 21},
+}
+NOT_OFFERED = {
+    "DNSGA2": "problems that change over time",
+    "KGB": "problems that change over time",
+    "PINSGA2": "asks a person",
+    "BGA": "bits",
+    "RandomSearch": "rs",
+    "Optuna": "another library",
+}
+POPULATION = 20
+
+
+def built(name: str, **arguments: Any) -> Algorithm:
+    algorithm: Algorithm = msgspec.convert(REQUIRED.get(name, {}) | arguments, pymoo_algorithm(name, "study"))
+    return algorithm
+
+
+def failing(settings: FloatArray) -> Evaluations:
+    """The sphere, where a part of the domain cannot be simulated."""
+    good, fails = sphere(SUN, settings), settings[:, 0] < 5600
+    outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
+    metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
+    return dataclasses.replace(good, outcome=outcome, metrics=metrics)
+
+
+def begun(
+    algorithm: Algorithm, seed: int, evaluations: int = 130, formula: Callable[[FloatArray], Evaluations] = failing
+) -> Iterator[Any]:
+    """A run; yields each request, then the result."""
+    original = sphere(SUN, SUN.original[np.newaxis])
+    problem = Problem(characteristics=SUN, original=original, evaluations=evaluations, population=POPULATION)
+    search, answer = algorithm.search(problem, np.random.default_rng(seed)), None
+    try:
+        while True:
+            asked = search.send(answer)  # type: ignore[arg-type]
+            yield asked
+            answer = formula(asked)
+    except StopIteration as end:
+        yield end.value
+
+
+SLOW = ("pymoo:AGEMOEA", "pymoo:AGEMOEA2")
+"""Compiled by numba at their first call."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in sorted(PYMOO_ALGORITHMS)]
+)
+def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(name: str) -> None:
+    """Two runs that take turns, while others draw from numpy's global state."""
+    alone = [list(begun(built(name), seed)) for seed in (1, 2)]
+    np.random.seed(5)
+    in_turn: list[list[Any]] = [[], []]
+    runs = [begun(built(name), seed) for seed in (1, 2)]
+    while any([extend(steps, run) for steps, run in zip(in_turn, runs, strict=True)]):
+        state = np.random.random()
+    np.random.seed(5)
+    assert state == [np.random.random() for _ in range(max(map(len, in_turn)))][-1], "the caller's random state"
+    for steps, expected in zip(in_turn, alone, strict=True):
+        *asked, result = steps
+        assert all(map(np.array_equal, asked, expected[:-1]))
+        assert np.array_equal(result.settings, expected[-1].settings)
+        every = np.concatenate(asked)
+        assert 0 < len(every) <= 130
+        assert np.all((every >= SUN.lower) & (every <= SUN.upper))
+        assert np.array_equal(SUN.filter(every), every)
+        assert len(result)
+        assert {row.tobytes() for row in result.settings} <= {row.tobytes() for row in every}
+        assert result.valid.all()
+    assert not np.array_equal(in_turn[0][0], in_turn[1][0]) or name == "pymoo:DIRECT", "another seed"
+
+
+def extend(steps: list[Any], run: Iterator[Any]) -> bool:
+    """Take a step of a run; returns whether it had one."""
+    step = next(run, None)
+    steps += [] if step is None else [step]
+    return step is not None
+
+
+@pytest.mark.parametrize("name", ["pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"])
+@pytest.mark.parametrize("evaluations", [1, 7, POPULATION, 3 * POPULATION + 1])
+def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> None:
+    *asked, result = begun(built(name), 1, evaluations)
+    assert sum(map(len, asked)) == evaluations
+    assert len(result)
+
+
+def test_every_algorithm_of_pymoo_for_real_numbers_has_a_name() -> None:
+    from pymoo.core.algorithm import Algorithm as PymooAlgorithm
+
+    names = set[str]()
+    for folder in ("moo", "soo.nonconvex"):
+        package = importlib.import_module(f"pymoo.algorithms.{folder}")
+        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith(".optuna"):
+                members = vars(importlib.import_module(module.name)).values()
+                classes = [one for one in members if inspect.isclass(one) and one.__module__ == module.name]
+                names |= {one.__name__ for one in classes if issubclass(one, PymooAlgorithm)}
+    assert {f"pymoo:{name}" for name in names - set(NOT_OFFERED)} == set(PYMOO_ALGORITHMS)
+
+
+def test_arguments_reach_the_algorithm() -> None:
+    """Das and Dennis's directions: C(p + 2, 2) for p partitions and three objectives."""
+    sizes = {
+        number: len(next(begun(built("pymoo:NSGA3", **arguments), 1, 300)))
+        for number, arguments in ((91, {}), (15, {"ref_dirs": 4}), (2, {"ref_dirs": [[1.0, 0, 0], [0, 0, 1.0]]}))
+    }
+    assert sizes == {91: 91, 15: 15, 2: 2}
+    assert [len(asked) for asked in begun(built("pymoo:GA"), 1, 60)][:3] == [POPULATION] * 3, "the study's population"
+    assert [len(asked) for asked in begun(built("pymoo:GA", pop_size=9), 1, 60)][:3] == [9] * 3
+
+
+@pytest.mark.parametrize("name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA"])
+def test_an_algorithm_for_one_objective_minimises_the_first_alone(name: str) -> None:
+    """The sphere's minimum over the domains, 0, is at their lower ends, where many characteristics are changed."""
+    *_, result = begun(built(name), 1, 3000, formula=lambda settings: sphere(SUN, settings))
+    assert len(result) == 1
+    assert result.f_safe[0] < 0.05 < sphere(SUN, SUN.original[np.newaxis]).f_safe[0]
+
+
+@pytest.mark.parametrize("name", ["NSGA2", "NSGA3", "RVEA", "SMSEMOA", "SPEA2"])
+def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
+    """`minimize` with the same seed finds the same settings, to the bit, on DTLZ2."""
+    from pymoo.core.problem import Problem as PymooProblem
+    from pymoo.optimize import minimize
+
+    standard, evaluations, population = PROBLEMS["dtlz2"], 364, 91
+    problem = standard_problem(standard, evaluations, population)
+
+    class Theirs(PymooProblem):
+        def __init__(self) -> None:
+            super().__init__(standard.variables, 3, n_ieq_constr=1, xl=1.0, xu=2.0)
+
+        def _evaluate(self, x: FloatArray, out: dict[str, FloatArray], *_: object, **__: object) -> None:
+            out["F"], out["G"] = standard.objectives(x - 1), np.zeros((len(x), 1))
+
+    ours = result_of(built(f"pymoo:{name}").search(problem, np.random.default_rng(3)), problem)
+    seed = int(np.random.default_rng(3).integers(2**31))
+    again = built(f"pymoo:{name}").begin(problem, seed)  # type: ignore[attr-defined]
+    again.problem = None  # not begun
+    theirs = minimize(Theirs(), again, termination=("n_eval", evaluations), seed=seed)
+    assert np.array_equal(ours.settings, theirs.X)
+
+
+def with_pymoo(algorithms: list[str], **search: Any) -> Study:
+    return load_study("smoke", search={"algorithms": algorithms, **search})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "table", "error"),
+    [
+        ("NSGA3", {}, "'NSGA3'\nexpected: 'pymoo:NSGA3'"),
+        ("pymoo:NSAG3", {}, "'pymoo:NSAG3'; did you mean 'pymoo:NSGA3'?"),
+        ("pymoo:NSGA3", {"pymoo:NSAG3": {}}, "did you mean 'pymoo:NSGA3'?"),
+        ("pymoo:NSGA3", {"pymoo:NSGA3": {"ref_dir": 3}}, "search.'pymoo:NSGA3'.ref_dir: there is no such key; did you"),
+        ("pymoo:NSGA3", {"pymoo:NSGA3": {"ref_dirs": 0}}, "a whole number >= 1"),
+        ("pymoo:GA", {"pymoo:GA": {"seed": 1}}, "there is no such key"),
+        ("pymoo:DE", {"pymoo:DE": {"CR": "high"}}, "search.'pymoo:DE'.CR = 'high'\nexpected: a number"),
+        ("pymoo:RNSGA2", {}, "ref_points is missing"),
+    ],
+)
+def test_a_mistake_in_a_study_names_key_and_nearest_name(algorithm: str, table: JsonObject, error: str) -> None:
+    study = with_pymoo([algorithm], parameters=table)
+    with pytest.raises(InputError) as refused:
+        algorithm_of(next(iter(study.search.labels)), study)
+    assert error in str(refused.value)
+    assert str(refused.value).count("\n") <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "error"),
+    [
+        ("pymoo:NSGA3", {"pop_size": 5}, "91 reference directions"),
+        ("pymoo:NSGA3", {"ref_dirs": [[1.0, 0.0]]}, "2 != 3"),
+        ("pymoo:DE", {"variant": "DE/best"}, "DE/<selection>/<n_diffs>/<crossover>"),
+    ],
+)
+def test_what_pymoo_refuses_is_an_error_of_the_user(name: str, arguments: dict[str, Any], error: str) -> None:
+    with pytest.raises(InputError, match=error):
+        next(begun(built(name, **arguments), 1))
+
+
+def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymoo.config", None)
+    with pytest.raises(InputError, match=r"pip install '\.\[pymoo\]'"):
+        pymoo_algorithm("pymoo:GA", "study")
+
+
+MIXED = ["nsga2", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
+
+
+def test_an_interrupted_study_ends_as_if_it_had_never_been_and_batches_change_nothing(tmp_path: Path) -> None:
+    study = with_pymoo(MIXED, evaluations=60, parameters={"pymoo:NSGA3": {"ref_dirs": 3}})
+    carried_out(study, tmp_path / "whole")
+    with pytest.raises(SafevarError, match="broken down"):
+        carried_out(study, tmp_path / "out", FormulaPool(limit=9), batch=7)
+    carried_out(study, tmp_path / "out", batch=11)
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
+    names = set(load_runs(tmp_path / "out").solutions["algorithm"])
+    assert names == {"nsga2", "pymoo_NSGA3", "pymoo_CMAES", "pymoo_MOEAD"}
+
+
+def test_an_algorithm_may_come_later_but_not_with_another_pymoo(tmp_path: Path) -> None:
+    study = with_pymoo(["nsga2"], evaluations=30)
+    carried_out(study, tmp_path)
+    assert "pymoo" not in read_manifest(tmp_path)["versions"]
+    both = with_pymoo(["nsga2", "pymoo:GA"], evaluations=30)
+    carried_out(both, tmp_path)
+    manifest = read_manifest(tmp_path)
+    assert manifest["titles"] == {"pymoo_GA": "GA (pymoo)"}
+    manifest["versions"]["pymoo"] = "0.1"
+    write_manifest(tmp_path, manifest)
+    with pytest.raises(InputError, match=r"version of pymoo was '0\.1'"):
+        carried_out(both, tmp_path)
