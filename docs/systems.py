@@ -18,18 +18,19 @@ PROMISE = "treadDepth >= 2", "brakeTorque >= 0.8"
 
 
 def limits_of(study: sv.Study) -> dict[str, str]:
-    """The limit of each part alone, how far all may wear together, and the safety degree of the new car."""
+    """The limit of each part alone and of all together, and the safety degree of the new car."""
     new = sv.simulate(study)
     degree = new.metrics["safety_degree"]
     if degree < 0:
         return {"new": f"collides at {-degree:.1f} m/s"}
     row = {"new": f"keeps {degree:.2f} m"}
     answer = sv.tolerance(study, unsafe="collision", fits=0)
-    for one in answer.to_frame().itertuples():
-        end = one.safe_from if one.safe_from > one.lower else one.safe_to
-        is_limited = one.lower < one.safe_from or one.safe_to < one.upper
-        row[f"{one.characteristic} [{one.unit}]"] = f"{end:.4g}" if is_limited else "any"
-    return row | {"all together": f"{answer.joint.factor:.0%} of the way"}
+    for one in answer.table("limits").itertuples():
+        domain = study.vehicle.characteristics[one.characteristic]
+        ends = [(one.alone_low, domain.lower, one.together_low), (one.alone_high, domain.upper, one.together_high)]
+        limits = [f"{alone:.4g} (together {together:.4g})" for alone, last, together in ends if alone != last]
+        row[f"{one.characteristic} [{one.unit}]"] = " to ".join(limits) or "any"
+    return row
 
 
 def repair_of(study: sv.Study) -> tuple[str, str, str]:

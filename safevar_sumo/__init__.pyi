@@ -16,7 +16,6 @@ from .questions.risk import risk as risk
 from .questions.rules import rules as rules
 from .questions.subject import Results as Results, load as load
 from .questions.tolerance import tolerance as tolerance
-from .questions.tolerance.answer import Tolerance as Tolerance
 from .records import Outcome as Outcome
 from .reference.agreement import validate as validate
 from .reference.rows import import_published as import_published

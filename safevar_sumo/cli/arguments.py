@@ -9,7 +9,6 @@ import operator
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from functools import wraps
 from itertools import product
 from pathlib import Path
@@ -23,7 +22,6 @@ from safevar_sumo.cli.program import print_note, print_warning
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.changes import NUMBER_PATTERN
-from safevar_sumo.questions.options import Option, Options
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
@@ -156,50 +154,6 @@ def as_it_is_now() -> bool:
     return bool(click.get_current_context().meta.get(AS_IT_IS_NOW_KEY))
 
 
-def add_flags(question: type[Options]) -> Decorator:
-    """Decorator that adds the flags of a question's options; the command makes them by `question(**keywords)`."""
-
-    def add(command: CommandFunction) -> CommandFunction:
-        for field in reversed(fields(question)):
-            command = _add_flag(
-                question.flags()[field.name], field.name, field.default, question.definitions()[field.name]
-            )(command)
-        return command
-
-    return add
-
-
-def _add_flag(flag: str, name: str, default: Any, option: Option) -> Decorator:
-    if option.kind is bool:
-        return click.option(flag, name, is_flag=True, default=default, help=option.help)
-    if option.form != "one":
-        return click.option(
-            flag,
-            name,
-            multiple=option.form == "repeated",
-            metavar=option.metavar,
-            help=option.help,
-            callback=lambda _context, _option, value: (
-                split_names(value) if option.form == "commas" and value else value
-            ),
-        )
-    click_type: click.ParamType[Any] = click.STRING
-    if option.kind is int:
-        click_type = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
-    elif option.kind is float:
-        low_is_open, high_is_open = option.is_open
-        click_type = click.FloatRange(option.low, option.high, low_is_open, high_is_open)
-    return click.option(
-        flag,
-        name,
-        type=click_type,
-        default=default,
-        show_default=default is not None,
-        metavar=option.metavar,
-        help=option.help,
-    )
-
-
 def split_names(text: str) -> tuple[str, ...]:
     """Split names at commas."""
     return tuple(name.strip() for name in text.split(","))
@@ -235,8 +189,6 @@ def _load_subject(source: str, point: str | None = None, *, results_only: bool =
 
 GATE_EXIT_CODE = 3
 """Exit code of a command if a condition of --fail-if holds, or a limit is not kept."""
-FAILURES_KEY = "safevar_sumo.failures"
-"""Key, in a command's context, of the sentences that say why it ends with this exit code."""
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
     "<=": operator.le,
@@ -296,11 +248,6 @@ def _values(answer: Any, names: Sequence[str], key: str) -> list[Any]:
     return values
 
 
-def fail(sentence: str) -> None:
-    """End the command with exit code 3 after its answer, and with this sentence."""
-    click.get_current_context().meta.setdefault(FAILURES_KEY, []).append(sentence)
-
-
 def gated(command: CommandFunction) -> CommandFunction:
     """A command with the option --fail-if; the command returns its JSON, and has printed its answer."""
 
@@ -308,8 +255,7 @@ def gated(command: CommandFunction) -> CommandFunction:
     def run(*arguments: Any, conditions: tuple[str, ...], **options: Any) -> None:
         parsed = [Condition.parse(text) for text in conditions]
         answer = command(*arguments, **options)
-        sentences = click.get_current_context().meta.get(FAILURES_KEY, [])
-        sentences += [sentence for condition in parsed for sentence in condition.fulfilments(answer)]
+        sentences = [sentence for condition in parsed for sentence in condition.fulfilments(answer)]
         for sentence in sentences:
             click.echo(f"failed: {sentence}", err=True)
         if sentences:

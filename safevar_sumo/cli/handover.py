@@ -26,7 +26,6 @@ from safevar_sumo.cli.arguments import (
 )
 from safevar_sumo.cli.program import commands, print_json, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.tolerance import ToleranceOptions
 from safevar_sumo.sumo.matrix import system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, open_progress, print_text
@@ -41,7 +40,10 @@ from safevar_sumo.terminal import WholeTable, open_progress, print_text
 @click.option("--paper", is_flag=True, help="With the research questions of the paper, as tables and figures.")
 @point_option
 @click.option(
-    "--margin", type=click.FloatRange(0, 100), metavar="M", help=ToleranceOptions.definitions()["margin"].help
+    "--margin",
+    type=click.FloatRange(0, 100),
+    metavar="M",
+    help="Distance to keep from a collision [m].  [default: the model's error that the study states, else 0.3]",
 )
 @as_it_is_now_option
 @jobs_option

@@ -30,7 +30,7 @@ COMMANDS_BY_GROUP = {
         "study": "cli.study:study",
         "simulate": "cli.simulate:simulate_command",
         "explain": "questions.explain:explain",
-        "tolerance": "cli.questions:tolerance",
+        "tolerance": "questions.tolerance:tolerance",
         "risk": "questions.risk:risk",
         "report": "cli.handover:report",
         "status": "cli.study:status",

@@ -4,8 +4,8 @@ equally well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,6 +18,10 @@ from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
+if TYPE_CHECKING:
+    from safevar_sumo.questions.evaluator import Evaluator
+
+Found = TypeVar("Found")
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
@@ -122,6 +126,15 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
     if point:
         systems = [system_at_point(system, point, source="point") for system in systems]
     return [evaluate(system, settings) for system in systems]
+
+
+def across(evaluator: Evaluator, fits: int, measure: Callable[[Evaluator], Found]) -> list[Found]:
+    """What `measure` finds with the study's own parameters, then with each other of the first `fits` parameter sets;
+    these are not verified in SUMO, because scene and equations are those of the study.
+    """
+    study = evaluator.study
+    others = studies_of_sets(study)[1:fits] if study.spread else []
+    return [measure(evaluator), *(measure(evaluator.for_study(other, verified=0)) for other in others)]
 
 
 def studies_of_sets(study: Study) -> list[Study]:

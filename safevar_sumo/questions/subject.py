@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.output import whole_file
-from safevar_sumo.questions.options import Options
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST, differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
-from safevar_sumo.terminal import Progress, open_progress
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.questions.case import Case
 
-Answer = TypeVar("Answer")
 MAX_CHANGES_NAMED = 3
 """Maximum number of changes that an error names."""
 
@@ -243,35 +238,3 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
             "the inputs of that time; or `as_it_is_now=True` to simulate with the present inputs and a warning",
         )
     return [f"{difference}; simulated as it is now" for difference in changes]
-
-
-def answer_question(
-    compute: Callable[..., Answer],
-    subject: Study | Case,
-    options: Options,
-    pool: Pool | None = None,
-    jobs: int | None = None,
-    progress: bool | Progress = True,
-) -> Answer:
-    """Compute the answer to a question about a subject, with an evaluator of its study."""
-    from safevar_sumo.questions.evaluator import open_evaluator
-
-    with (
-        open_progress(progress) as show_progress,
-        open_evaluator(study_in(subject), pool, jobs, show_progress) as evaluator,
-    ):
-        return compute(subject, options, evaluator)
-
-
-def answer_call(compute: Callable[..., Answer], options: type[Options], arguments: JsonObject) -> Answer:
-    """Answer a call of a question's function; `arguments` are its arguments by name, the subject first."""
-    from safevar_sumo.metrics import Unsafe
-
-    source, as_it_is_now = next(iter(arguments.values())), arguments["as_it_is_now"]
-    subject = study_or_case(source, as_it_is_now=as_it_is_now)
-    subject = reduce_to_point(subject, arguments.get("point"))
-    values = {name: arguments[name] for name in options.definitions()}
-    if values.get("unsafe") is not None:
-        values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
-    common = {name: arguments[name] for name in ("pool", "jobs", "progress")}
-    return answer_question(compute, subject, options(**values), **common)

@@ -15,6 +15,8 @@ from safevar_sumo.terminal import WholeTable, printable_text
 
 LOW, HIGH = "_low", "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
+LONG_TEXT = 60
+"""Longer texts of a column stand below a table on the terminal [characters]."""
 LATEX_PREAMBLE = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
 )
@@ -142,35 +144,47 @@ class _ReaderColumn(NamedTuple):
     texts: list[str]
     is_number: bool
 
+    @property
+    def is_long(self) -> bool:
+        """Whether its texts are too long for a narrow table."""
+        return max(map(len, self.texts), default=0) > LONG_TEXT
+
 
 def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
-    """The columns of a table for readers: an interval stands in brackets behind its value, unless that is exact."""
+    """The columns of a table for readers: an interval stands behind its value unless that is exact, or alone."""
     columns, words = columns_of(frame), frame.attrs.get("words", {})
     for name in map(str, frame):
-        base = name.removesuffix(LOW).removesuffix(HIGH)
-        if base != name and base in frame:
+        base = re.sub(f"({LOW}|{HIGH})$", "", name)
+        column, ends = columns.get(name, Column("", "")), [f"{base}{LOW}", f"{base}{HIGH}"]
+        if not column.is_shown or (base != name and (base in frame or name == ends[1])):
             continue
-        if len(frame) and frame[name].isna().all():  # undefined in every row
-            continue
-        column = columns.get(name, Column("", ""))
-        if not column.is_shown:
+        if len(frame) and frame[[name] if base == name else ends].isna().all(axis=None):  # undefined in every row
             continue
         texts = [text_of(value, column.number_format) for value in frame[name]]
         texts = [words.get(text, text) for text in texts]
-        if f"{name}{LOW}" in frame:
-            rows = zip(texts, frame[f"{name}{LOW}"], frame[f"{name}{HIGH}"], strict=True)
-            texts = [
-                text if text == "-" or low == high else f"{text} ({text_of([low, high], column.number_format)})"
-                for text, low, high in rows
-            ]
+        if ends[0] in frame:
+            pairs = frame[ends].itertuples(index=False)
+            intervals = ["" if low == high else _interval_text(low, high, column.number_format) for low, high in pairs]
+            own = zip(texts, intervals, strict=True)
+            texts = [f"{text} ({interval})" if interval and text != "-" else text for text, interval in own]
+            texts = texts if base == name else intervals
         unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
         is_number = pd.api.types.is_numeric_dtype(frame[name])
-        yield _ReaderColumn(f"{name.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
+        yield _ReaderColumn(f"{base.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
 
 
-def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable]:
-    """The table; columns that do not fit stand in further tables, in which the first columns of text are repeated."""
-    columns = list(reader_columns(frame))
+def _interval_text(low: Any, high: Any, number_format: str) -> str:
+    """An interval, of which an end may be missing, for readers."""
+    texts = text_of(low, number_format), text_of(high, number_format)
+    forms = {(True, True): "-", (True, False): "up to {1}", (False, True): "from {0}"}
+    return forms.get((texts[0] == "-", texts[1] == "-"), "{0} to {1}").format(*texts)
+
+
+def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | str]:
+    """The table; columns that do not fit stand in further tables, in which the first columns of text are repeated, and
+    long texts in lines of their own.
+    """
+    columns = [column for column in reader_columns(frame) if not column.is_long]
     labels = list(takewhile(lambda column: not column.is_number, columns))
     blocks = [[*labels]]
     for column in columns[len(labels) :]:
@@ -184,6 +198,9 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable]:
         for cells in zip(*(column.texts for column in block), strict=True):
             table.add_row(*cells)
         yield table
+    for column in reader_columns(frame):
+        if column.is_long:
+            yield from (f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True))
 
 
 def _least_width(column: _ReaderColumn) -> int:
@@ -213,7 +230,8 @@ def latex_table(label: str, frame: pd.DataFrame) -> str:
     """A booktabs table that fits into the line."""
     readable = pd.DataFrame({column.head: column.texts for column in reader_columns(frame)})
     style = readable.style.hide().format(_escaped_for_latex).format_index(_escaped_for_latex, axis=1)
-    alignment = "".join("r" if column.is_number else "l" for column in reader_columns(frame))
+    kinds = ("r" if column.is_number else "p{6cm}" if column.is_long else "l" for column in reader_columns(frame))
+    alignment = "".join(kinds)
     caption = _escaped_for_latex(frame.attrs.get("title", ""))
     table = style.to_latex(hrules=True, column_format=alignment, caption=caption, label=f"tab:{label}", position="htbp")
     return table.replace(r"\begin{tabular}", FIT_BEGIN + r"\begin{tabular}").replace(

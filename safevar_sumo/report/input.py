@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +13,7 @@ import numpy as np
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.ask import find_question
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.options import Options
-from safevar_sumo.questions.subject import answer_question, at_point, changes_since
-from safevar_sumo.questions.tolerance import ToleranceOptions
-from safevar_sumo.questions.tolerance.compute import find_tolerances
+from safevar_sumo.questions.subject import at_point, changes_since
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay.animation import player_data
@@ -31,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-QUESTIONS: Mapping[str, Callable[..., Any]] = {"tolerance": find_tolerances}
-"""The functions that answer the questions of a page, by their commands."""
 SAMPLES: Mapping[str, JsonObject] = {"risk": {"samples": 4000}, "rules": {"samples": 4000}}
 """The number of vehicles sampled for these sections."""
 EXPLAIN_SIMULATIONS = 30_000
@@ -64,11 +59,6 @@ class ReportInput:
         return is_rated(self.case.study) and not self.point
 
     @cached_property
-    def options(self) -> Mapping[str, Options]:
-        """Each question's options on the page: smaller samples than the commands take."""
-        return {"tolerance": ToleranceOptions(margin=self.margin)}
-
-    @cached_property
     def values(self) -> Mapping[str, JsonObject]:
         """The values of options that are not the commands' defaults; a rated study's variant is the solution with the
         fewest changes that loses a point.
@@ -81,21 +71,17 @@ class ReportInput:
             "opinion": {},
             "rating": {"solution": solution},
             "repair": {"margin": self.margin},
+            "tolerance": {"margin": self.margin},
         }
 
     def ask(self, question: str, jobs: int | None, progress: Progress, *others: Case) -> Any:
         """The answer to a question of the page, `others` beside its study."""
-        if question in self.values:
-            subjects, values = [self.case, *others], self.values[question]
-            return find_question(question).answer(subjects, values, jobs=jobs, progress=progress)
-        options = self.options[question]
-        return answer_question(QUESTIONS[question], self.case, options, jobs=jobs, progress=progress)
+        subjects, values = [self.case, *others], self.values[question]
+        return find_question(question).answer(subjects, values, jobs=jobs, progress=progress)
 
     def command(self, question: str) -> str:
         """The command that prints this answer."""
-        if question in self.values:
-            return find_question(question).command_line([str(self.directory)], self.point, self.values[question])
-        return self.options[question].command_line(str(self.directory), self.point)
+        return find_question(question).command_line([str(self.directory)], self.point, self.values[question])
 
     @cached_property
     def solutions(self) -> dict[str, JsonObject]:

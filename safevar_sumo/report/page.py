@@ -8,6 +8,7 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -23,7 +24,6 @@ from safevar_sumo.questions.explain.failures import DISTINCT_CAUSE
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.subject import Results
-from safevar_sumo.questions.tolerance.answer import Tolerance
 from safevar_sumo.questions.words import question_command
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
@@ -64,18 +64,15 @@ def render_tables(cases: Sequence[Case]) -> Markup:
         return Markup("<p>{}</p>").format(f"{error.source}: {error.problem}.")
 
 
+def _limits(tolerance: Answer) -> Markup:
+    """The decision on the limits, and their table."""
+    return Markup(replace(tolerance, tables={"limits": tolerance.tables["limits"]}).render("html"))
+
+
 def figure_data(figure: Figure, frame: pd.DataFrame) -> JsonObject:
     """An answer's figure, with its values as a table."""
     shown = frame[[name for name in frame if name not in HIDDEN_COLUMNS]].set_index("characteristic")
     return {**_picture("", figure), "table": table_data(shown, "Values of the figure")}
-
-
-def limits_data(tolerance: Tolerance) -> JsonObject:
-    """The limits sheet as a table, without columns that say nothing on the page."""
-    sheet = tolerance.sheet.to_frame().set_index("characteristic")
-    hidden = ["part"] if tolerance.limits else ["part", "specified", "kept"]
-    notes = [f"Unsafe: {tolerance.unsafe.description}."]
-    return table_data(sheet.drop(columns=hidden), "Limits to obey all together, rounded to the safe side", notes)
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
@@ -288,9 +285,7 @@ def _study_data(
     explained: Answer | None = answers.get("explain")
     failures = explained.tables["solutions"].to_dict("records") if explained else []
     choices: list[Any] = [row for row in failures if row["reason"] != DISTINCT_CAUSE]
-    tolerance = answers.get("tolerance")
     rendered = {name: answer for name, answer in answers.items() if isinstance(answer, Answer)}
-    about_domain = {name: answer for name, answer in answers.items() if name not in rendered}
     replays = replay_solutions(data, explained, progress) if "causes" in sections else []
     different = [solution["handle"] for solution in replays if solution["differences"]]
     why = why_different(is_imported=not data.case.has_runs)
@@ -307,12 +302,10 @@ def _study_data(
         "title": data.case.study.title,
         "anchor": data.anchor(),
         "replays": replays,
-        "limits": limits_data(tolerance) if tolerance else None,
         "failures": [describe_failure(data, failure) for failure in choices],
         "picture": _picture("failure", data.draw_failure(choices[0]["solution"]))
         if choices and "verdict" in sections
         else None,
-        "sheet": _picture("limits", tolerance.sheet.figure()) if tolerance else None,
         "different": different,
         "why_different": why,
         "agreement": describe_agreement(data.case.study),
@@ -324,16 +317,8 @@ def _study_data(
         )
         if explained and explained.numbers["analysed"]
         else None,
-        "answers": {
-            name: [part for part in answer.sentences() if isinstance(part, str)]
-            for name, answer in about_domain.items()
-        },
         "rendered": {name: Markup(answer.render("html")) for name, answer in rendered.items()},
-        "figures": {
-            name: figure_data(answer.figure(), answer.to_frame())
-            for name, answer in about_domain.items()
-            if not answer.to_frame().empty
-        },
+        "limits": _limits(rendered["tolerance"]) if "tolerance" in rendered else None,
         **{name: make() for name, make in makers.items() if name in sections},
     }
 

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from safevar_sumo.cli.study import _verdict
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.explain.failures import compare_at_cells
-from safevar_sumo.questions.tolerance import ToleranceOptions
-from safevar_sumo.questions.tolerance.compute import find_tolerances
+from safevar_sumo.questions.tolerance import tolerance
+from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, run, searched
@@ -55,22 +56,21 @@ def test_what_is_shipped_passes_the_check() -> None:
 
 @pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
-    result = find_tolerances(
-        STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), Evaluator(STUDY, InlinePool(2))
-    )
-    (scan,) = result.alone
-    assert scan.points is not None
-    points = scan.points
-    assert points[1.0] == max(points.values()) > points[0.5]
-    first = scan.first_loss()
-    assert first is not None
+    evaluator = Evaluator(STUDY, InlinePool(2))
+    answer = tolerance.compute(STUDY, evaluator, characteristics=("brakeTorque",), unsafe="points=4.0")
+    column = list(evaluator.characteristics.names).index("brakeTorque")
+    (alone,) = scan(evaluator, [column], Unsafe(points=4.0))
+    points = alone.profile.set_index("value")["rating_points"]
+    assert points[1.0] == points.max() > points[0.5]
+    first = alone.first_loss()
     assert points[first] < points[1.0]
-    assert all(kept == points[1.0] for value, kept in points.items() if value > first)
-    record = result.to_dict()["alone"][0]
-    assert record["any_lost"] == first
-    assert record["points"][-1] == [1.0, points[1.0]]
-    assert "brakeTorque: points are lost from" in str([*result.sentences()])
-    assert result.figure().get_axes()
+    assert (points[points.index > first] == points[1.0]).all()
+    (lost,) = answer.tables["points"].to_dict("records")
+    assert (lost["any_lost"], lost["least_points"]) == (first, points.min())
+    assert lost["first_point_lost"] <= first
+    (row,) = answer.tables["limits"].to_dict("records")
+    assert (row["sentence"], row["together_low"]) == (None, None)
+    assert answer.figure().get_axes()
 
 
 @pytest.mark.slow

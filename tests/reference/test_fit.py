@@ -15,8 +15,7 @@ from calibration import fit
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import compute_model_spreads, prediction_band, value_of, with_values
-from safevar_sumo.questions.tolerance import scans
-from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan_with_sets
+from safevar_sumo.questions.tolerance import scans, tolerance
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -176,15 +175,19 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)
-    friction = list(load_study("sun").vehicle.characteristics).index("tireFric")
     gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
     study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
 
-    def ends(one: Study, fits: int) -> OneAtATimeScan:
-        return scan_with_sets(Evaluator(one, InlinePool()), [friction], Unsafe(below=1.5), fits)[0]
+    def low_end(one: Study) -> float:
+        friction = list(one.vehicle.characteristics).index("tireFric")
+        (alone,) = scans.scan(Evaluator(one, InlinePool()), [friction], Unsafe(below=1.5))
+        return alone.safe[0] if alone.safe else np.nan
 
-    of_each = [ends(with_values(study, {gap: value}), 0).safe for value in gaps]
-    low, high = zip(*(interval for interval in of_each if interval), strict=True)
-    assert len({*low}) > 1, "the fits differ"
-    ranges = (min(low), max(low)), (min(high), max(high))
-    assert ends(study, 8).across_fits == (len(low), ranges, len(of_each) - len(low))
+    of_each = np.array([low_end(with_values(study, {gap: value})) for value in gaps])
+    assert len({*of_each}) > 1, "the fits differ"
+    asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
+    (row,) = tolerance(study, **asked).tables["fits"].to_dict("records")
+    assert (row["characteristic"], row["end"], row["alone"]) == ("tireFric", "low", of_each[0])
+    assert (row["alone_low"], row["alone_high"]) == (np.nanmin(of_each), np.nanmax(of_each))
+    assert row["fits"] == np.isfinite(of_each).sum()
+    assert "fits" not in tolerance(study, fits=0, **asked).tables

@@ -83,17 +83,18 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     explained = json_of("explain", "out", *below, "--top", "2", "--limit", "500")
     tolerance = json_of("tolerance", "bound.toml", *below, "--characteristics", "tireFric,mass,maxBrakeTorque")
     boundaries = [cause["boundary"] for cause in explained["tables"]["causes"]["rows"]]
+    intervals = tolerance["tables"]["intervals"]["rows"]
     alone = [
-        {scan["characteristic"]: value}
-        for scan in tolerance["alone"]
-        for ends in [scan["safe"], *scan["unsafe"]]
-        for value in ends
+        {row["characteristic"]: row[end]}
+        for row in intervals
+        for end in ("low", "high")
+        if row["state"] in ("safe", "unsafe")
     ]
     assert boundaries
     assert len(alone) >= 6
     reported = [*settings_in(explained), *alone]
     assert [values for values in reported if not is_feasible(values)] == []
-    assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
+    assert any(row["characteristic"] == "mass" for row in intervals if row["state"] == "infeasible")
     for question in (
         "tolerance bound.toml --fits 0 --characteristics mass",
         "rules bound.toml --samples 200",

@@ -304,11 +304,11 @@ def find_joint_limits(
     start, corner = search.longest.copy(), np.zeros(len(search.original))
     for column, scan in zip(columns, scans, strict=True):
         original = search.original[column]
-        (low, high), (low_margin, high_margin) = scan.safe or (original, original), scan.margins
+        low, high = scan.safe or (original, original)
         safe_alone = np.minimum(start[:, column], (original - low, high - original))
         start[:, column] = np.where(search.is_free[:, column], safe_alone, start[:, column])
-        is_low_end = low_margin is not None and (high_margin is None or low_margin < high_margin)
-        corner[column] = -1.0 if is_low_end else 1.0
+        low_degree, high_degree = np.nan_to_num([scan.degree(end) for end in (low, high)], nan=np.inf)
+        corner[column] = -1.0 if low_degree < high_degree else 1.0
     search.corners.append(corner)
     for attempt in range(1, MAX_ATTEMPTS + 1):
         kept = not len(search.attack(search.fixed))

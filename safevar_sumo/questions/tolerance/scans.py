@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ import pandas as pd
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator, Interval
-from safevar_sumo.records import FloatArray, JsonObject, finite_or_none
+from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import Characteristic
 
@@ -29,26 +28,7 @@ POINT_ROUNDING = 1e-9
 """A loss of at most so many rating points is a rounding error."""
 
 
-class EndsAcrossFits(NamedTuple):
-    """How the ends of a safe interval move with the parameter sets of a study's table [spread].
-
-    Attributes
-    ----------
-    sets
-        Number of sets in which the interval exists, the study's own among them.
-    range
-        The least and the greatest lower end, and the least and the greatest upper end.
-    unsafe_as_new
-        Number of further sets with which the original itself is unsafe, so that there is no interval.
-    """
-
-    sets: int
-    range: tuple[Interval, Interval]
-    unsafe_as_new: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class OneAtATimeScan:
+class OneAtATimeScan(NamedTuple):
     """The scan of one characteristic.
 
     Attributes
@@ -57,77 +37,44 @@ class OneAtATimeScan:
         Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe", "not_simulated" or
         "infeasible"), and in a rated study `rating_points`, in the order of the values, which are closer together where
         the state changes.
-    across_fits
-        How the ends of the safe interval move over the study's parameter sets; None without any.
     """
 
     characteristic: Characteristic
     profile: pd.DataFrame
-    across_fits: EndsAcrossFits | None = None
 
-    def intervals(self, state: str) -> list[Interval]:
-        """All intervals of a state, each from its first to its last value."""
-        states = self.profile["state"]
-        interval_numbers = (states != states.shift()).cumsum()  # the number rises where the state changes
-        intervals = self.profile["value"][states == state].groupby(interval_numbers)
-        return list(zip(intervals.min().tolist(), intervals.max().tolist(), strict=True))
+    @property
+    def intervals(self) -> pd.DataFrame:
+        """The runs of neighbouring values of one state: `state`, the first value `low` and the last one `high`."""
+        states, values = self.profile["state"], self.profile["value"]
+        is_first, is_last = states != states.shift(), states != states.shift(-1)
+        ends = {"low": values[is_first].to_numpy(), "high": values[is_last].to_numpy()}
+        return pd.DataFrame({"state": states[is_first].to_numpy(), **ends})
+
+    def of_state(self, state: str) -> list[Interval]:
+        """The intervals of a state."""
+        frame = self.intervals
+        return list(frame.loc[frame["state"] == state, ["low", "high"]].itertuples(index=False, name=None))
 
     @property
     def safe(self) -> Interval | None:
         """The safe interval around the original; None if the original itself is unsafe."""
         original = self.characteristic.original
-        return next((ends for ends in self.intervals("safe") if ends[0] <= original <= ends[1]), None)
+        return next((ends for ends in self.of_state("safe") if ends[0] <= original <= ends[1]), None)
 
-    @property
-    def unsafe(self) -> list[Interval]:
-        """All unsafe intervals."""
-        return self.intervals("unsafe")
+    def nearest_unsafe(self, value: float) -> float | None:
+        """The unsafe value that is nearest to `value`, the lower one of two; None if nothing is unsafe."""
+        values = [float(np.clip(value, low, high)) for low, high in self.of_state("unsafe")]
+        return min(values, key=lambda unsafe: (abs(unsafe - value), unsafe), default=None)
 
-    @property
-    def margins(self) -> list[float | None]:
-        """Safety degrees at the ends of the safe interval [m]."""
-        degrees = self.profile.set_index("value")[SAFETY_DEGREE]
-        return [None, None] if self.safe is None else [finite_or_none(degrees[end]) for end in self.safe]
+    def degree(self, value: float) -> float:
+        """The safety degree at a value of the profile [m, or -m/s]."""
+        return float(self.profile.set_index("value")[SAFETY_DEGREE][value])
 
-    @property
-    def points(self) -> dict[float, float] | None:
-        """The vehicle's rating points at each value, in ascending order; None if the study is not rated."""
-        if RATING_POINTS.name not in self.profile:
-            return None
-        return dict(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
-
-    def first_loss(self, loss: float = 0.0) -> float | None:
-        """The value nearest to the original that loses more than `loss` rating points; None if no value does."""
-        points, original = self.points or {}, self.characteristic.original
-        allowed = points.get(original, math.nan) - loss - POINT_ROUNDING
-        values = [value for value in points if points[value] < allowed]
-        return min(values, key=lambda value: abs(value - original), default=None)
-
-    def to_dict(self) -> JsonObject:
-        """An entry for a characteristic in `alone` of `tolerance --json`; in a rated study with points, and where they
-        are first lost.
-        """
-        rating_entries = (
-            {}
-            if self.points is None
-            else {
-                "points": [list(pair) for pair in self.points.items()],
-                "any_lost": self.first_loss(),
-                "first_point_lost": self.first_loss(WHOLE_POINT_LOSS),
-            }
-        )
-        infeasible = self.intervals("infeasible")
-        return {
-            **rating_entries,
-            "characteristic": self.characteristic.name,
-            "unit": self.characteristic.unit,
-            "original": self.characteristic.original,
-            "safe": self.safe,
-            "unsafe": self.unsafe,
-            "not_simulated": self.intervals("not_simulated"),
-            **({"infeasible": infeasible} if infeasible else {}),
-            **({} if self.across_fits is None else {"across_fits": self.across_fits._asdict()}),
-        }
+    def first_loss(self, loss: float = 0.0) -> float:
+        """The value nearest to the original that loses more than `loss` rating points; NaN if no value does."""
+        points, original = self.profile.set_index("value")[RATING_POINTS.name], self.characteristic.original
+        values = points.index[points < points[original] - loss - POINT_ROUNDING]
+        return min(values, key=lambda value: abs(value - original), default=math.nan)
 
 
 def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
@@ -145,29 +92,7 @@ def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[O
             pd.concat(coarse_and_fine, ignore_index=True).sort_values("value", ignore_index=True)
             for coarse_and_fine in zip(profiles, finer_profiles, strict=True)
         ]
-    return [
-        OneAtATimeScan(characteristic=item, profile=profile) for item, profile in zip(scanned, profiles, strict=True)
-    ]
-
-
-def scan_with_sets(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, fits: int) -> list[OneAtATimeScan]:
-    """Scan with the study's own parameters, and state how far the ends of the safe intervals move with its other
-    parameter sets.
-    """
-    evaluators = evaluator.for_sets(fits) or [evaluator]
-    scans = []
-    for of_characteristic in zip(*(scan(with_set, columns, unsafe) for with_set in evaluators), strict=True):
-        own_scan, intervals = of_characteristic[0], [each.safe for each in of_characteristic if each.safe is not None]
-        if len(evaluators) > 1 and intervals:
-            lows, highs = zip(*intervals, strict=True)
-            across_fits = EndsAcrossFits(
-                sets=len(intervals),
-                range=((min(lows), max(lows)), (min(highs), max(highs))),
-                unsafe_as_new=len(evaluators) - len(intervals),
-            )
-            own_scan = replace(own_scan, across_fits=across_fits)
-        scans.append(own_scan)
-    return scans
+    return list(map(OneAtATimeScan, scanned, profiles))
 
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:
