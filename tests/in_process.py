@@ -1,10 +1,13 @@
-"""Campaigns and commands in this process: a pool that computes at once, commands as users type them."""
+"""Campaigns and commands in this process: a pool that computes at once, commands as users type them; and the blocks of
+the manual's pages.
+"""
 
 from __future__ import annotations
 
 import io
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -21,6 +24,28 @@ from safevar_sumo.cli.program import main
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
+
+ROOT = Path(__file__).parents[1]
+
+
+class Block(NamedTuple):
+    """A fenced block of a page: its language, the file that it is the content of (or ""), and its text."""
+
+    language: str
+    title: str
+    text: str
+
+
+def blocks(page: str) -> list[Block]:
+    """The fenced blocks of a page of the manual."""
+    pattern = r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$'
+    found = re.findall(pattern, (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE)
+    return [Block(*one) for one in found]
+
+
+def files_of(*pages: str) -> dict[str, str]:
+    """The files that pages of the manual show, by their names."""
+    return {block.title: block.text for page in pages for block in blocks(page) if block.title}
 
 
 class InlinePool(Pool):

@@ -21,25 +21,10 @@ from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS
 from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
+from tests.in_process import ROOT, blocks
 
-ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md")))]
 PROGRAM = "python -m safevar_sumo "
-
-
-class Block(NamedTuple):
-    """A fenced block: its language, the file that it is the content of (or ""), and its text."""
-
-    language: str
-    title: str
-    text: str
-
-
-def blocks(page: str) -> list[Block]:
-    result = re.findall(
-        r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE
-    )
-    return [Block(*one) for one in result]
 
 
 @pytest.mark.slow

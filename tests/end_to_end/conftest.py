@@ -1,44 +1,135 @@
-"""Fixtures of a small study and its results; no command outlives its test, however the test ends."""
+"""A small study of three algorithms, in this process or in other processes that tests start, watch and kill; no command
+outlives its test, however the test ends.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from safevar_sumo.study import load_study
-from tests.end_to_end import processes
-from tests.in_process import searched
+from tests.in_process import run, searched
+
+STUDY = """
+extends = "smoke"
+name = "small"
+[search]
+algorithms = ["nsga2", "rs", "safe_fuzzer"]
+evaluations = 150
+"""
+TIMEOUT = 60.0  # s
+Process = subprocess.Popen[str]
+running: list[Process] = []
+"""Processes that a test has started."""
+
+
+def started(*arguments: str, **options: object) -> Process:
+    """Start a command in its own process group and with Ctrl-C as a shell does, whatever this process ignores."""
+    running.append(
+        subprocess.Popen(
+            [sys.executable, "-m", "safevar_sumo", *arguments],
+            stdout=subprocess.PIPE,  # type: ignore[call-overload]
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=None if os.name == "nt" else lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            **options,
+        )
+    )
+    return running[-1]
+
+
+def until(condition: Callable[[], bool], process: Process | None = None) -> None:
+    """Wait for a condition, or for the end of the process that should fulfil it."""
+    deadline = time.monotonic() + TIMEOUT
+    while not condition() and (process is None or process.poll() is None):
+        assert time.monotonic() < deadline, "the condition was not fulfilled in time"
+        time.sleep(0.01)
+
+
+def written(out: Path) -> int:
+    """Number of bytes in the journals of the runs."""
+    return sum(path.stat().st_size for path in out.glob("runs/*-*.jsonl"))
+
+
+def workers_of(process: Process) -> list[psutil.Process]:
+    """The worker processes of a command."""
+    try:
+        return [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def left_of_group(process: Process) -> list[str]:
+    """Command lines of the processes in a command's process group that still run."""
+    command_lines: list[str] = []
+    for member in psutil.process_iter() if os.name == "posix" else ():
+        try:
+            if os.getpgid(member.pid) == process.pid and member.status() != psutil.STATUS_ZOMBIE:
+                command_lines.append(" ".join(member.cmdline()))
+        except (psutil.Error, ProcessLookupError):
+            continue
+    return command_lines
+
+
+def ended(process: Process, expect: int) -> str:
+    """Wait for a command's end; returns its text on stderr."""
+    output, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == expect, f"{process.returncode}\n{output}\n{errors}"
+    assert "Traceback" not in output + errors, errors
+    until(lambda: not left_of_group(process))
+    return errors
+
+
+def killed(process: Process) -> None:
+    """Kill a process with SIGKILL."""
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=TIMEOUT)
+    until(lambda: not left_of_group(process))
+
+
+def study(*arguments: str, expect: int = 0) -> str:
+    """Search the small study in this process, without a summary; returns the text on stderr."""
+    return run("study", "small.toml", "--quiet", *arguments, expect=expect).stderr
+
+
+def solutions(out: str | Path) -> bytes:
+    return (Path(out) / "solutions.csv").read_bytes()
 
 
 @pytest.fixture(autouse=True)
 def _nothing_left_running() -> Iterator[None]:
     yield
-    for process in processes.running:
+    for process in running:
         if process.poll() is None:
             if os.name == "posix":
                 os.killpg(process.pid, signal.SIGKILL)
             else:
                 process.kill()
             process.communicate()
-    processes.running.clear()
+    running.clear()
 
 
 @pytest.fixture
 def small(in_tmp: Path) -> None:
     """Write the file of the small study to an empty working directory."""
-    Path("small.toml").write_text(processes.STUDY)
+    Path("small.toml").write_text(STUDY)
 
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of the small study; no test may change them."""
     folder = tmp_path_factory.mktemp("whole")
-    (folder / "small.toml").write_text(processes.STUDY)
+    (folder / "small.toml").write_text(STUDY)
     return searched(load_study(str(folder / "small.toml")), folder / "out")
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.results import load_runs
-from tests.end_to_end.processes import solutions, study, written
+from tests.end_to_end.conftest import solutions, study, written
 from tests.in_process import refused, run
 
 pytestmark = pytest.mark.usefixtures("small")

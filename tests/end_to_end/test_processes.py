@@ -19,7 +19,7 @@ import pytest
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load_runs
-from tests.end_to_end.processes import ended, killed, solutions, started, until, workers_of, written
+from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
 from tests.in_process import run
 
 Process = subprocess.Popen[str]

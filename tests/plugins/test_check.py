@@ -12,9 +12,8 @@ import pytest
 
 from safevar_sumo.plugins.check import check
 from safevar_sumo.study import load_study, study_names
-from tests.in_process import json_of, run
+from tests.in_process import files_of, json_of, run
 
-SIX = Path(__file__).parent / "six"
 SCALAR = """import random
 import time
 import numpy as np
@@ -47,8 +46,9 @@ class Mine:
         near = (np.abs(seen.lateral) < 2.5) & (seen.gap < seen.speed**2 / (1.2 * memory) + 2)
         return Command(np.where(~near & (seen.speed < 5), 0.5, 0.0), np.where(near, 1.0, 0.0)), memory
 """
+FILES = files_of("docs/tutorials/own_vehicle.md", "docs/tutorials/own_metric.md")
 VEHICLE, SCENARIO, METRIC, OBJECTIVE, ALGORITHM = (
-    (SIX / f"{file}.py").read_text().replace(name, "Mine")
+    FILES[f"{file}.py"].replace(name, "Mine")
     for file, name in (
         ("my_vehicle", "Cart"),
         ("my_scenario", "Wall"),
@@ -156,8 +156,8 @@ DEFECTS = {
         "algorithm",
         "repetition",
         ALGORITHM,
-        "result, original,",
-        "rng = np.random.default_rng()\n        result, original,",
+        "known, original,",
+        "rng = np.random.default_rng()\n        known, original,",
         RUN,
     ),
     "algorithm learns": planted(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import json_of, run, searched
+from tests.in_process import files_of, json_of, run, searched
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
 
@@ -86,20 +85,41 @@ def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(
         search_all(folder, tmp_path / "out")
 
 
+SIX = """
+extends = "cart.toml"
+name = "six"
+[vehicle.characteristics.mass]
+weight = 0.5
+[ads]
+model = "my_ads:Careful"
+parameters = { margin = 4.0 }
+[metrics]
+also = ["my_metrics:JERK"]
+[search]
+algorithms = ["nsga2", "my_search:Halving"]
+objectives = ["safety_degree", "jerk", "my_objective:MEAN"]
+[search.Halving]
+factor = 0.7
+"""
+"""Six members from outside: those of the tutorials."""
+
+
 @pytest.fixture
 def six(in_tmp: Path) -> None:
-    shutil.copytree(Path(__file__).parent / "six", "six")
+    for name, text in files_of(*(f"docs/tutorials/own_{page}.md" for page in ("ads", "vehicle", "metric"))).items():
+        Path(name).write_text(text)
+    Path("six.toml").write_text(SIX)
 
 
 def test_members_of_user_code_are_simulated_and_scored(six: None) -> None:
-    output = json_of("simulate", "six/mine.toml", "--set", "grip=5")
+    output = json_of("simulate", "six.toml", "--set", "grip=5")
     assert output["jerk"] > 0
     assert output["mean_change"] == pytest.approx(3 / 8 / 3)
 
 
 @pytest.mark.slow
 def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
-    run("study", "six/mine.toml", "--out", "out", "--runs", "1", "--evaluations", "20", "--quiet")
+    run("study", "six.toml", "--out", "out", "--runs", "1", "--evaluations", "20", "--quiet")
     solutions = load_runs("out").solutions
     assert set(solutions["algorithm"]) == {"nsga2", "Halving"}
     assert np.isfinite(solutions[["jerk", "mean_change"]].to_numpy()).all()

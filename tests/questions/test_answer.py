@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate, wi
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool, refused, run
+from tests.in_process import InlinePool, files_of, refused, run
 
 COLUMNS = {
     "part": Column("", "part of the vehicle"),
@@ -115,8 +114,7 @@ def test_help_and_call_have_the_same_sentence_and_options(name: str) -> None:
 
 def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has at most 60 lines, and gets a command with the shared options and every format."""
-    manual = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
-    (code,) = re.findall(r'```python title="my_questions.py"\n(.*?)```', manual, re.DOTALL)
+    code = files_of("CONTRIBUTING.md")["my_questions.py"]
     assert code.count("\n") <= 60
     (tmp_path / "my_questions.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -10,8 +10,7 @@ import pytest
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Rater
 from safevar_sumo.records import CellResults
-from tests.rating.calculator import Calculator
-from tests.rating.spreadsheets import fill_drawn_cells, fill_template
+from tests.rating.calculator import Calculator, fill_drawn_cells, fill_template
 
 pytestmark = pytest.mark.slow
 PROTOCOL = protocol_of(EURO_NCAP_2026)

@@ -1,7 +1,7 @@
 """Derive `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator, in an environment that has the
 calculator.
 
-`python tests/rating/derive.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026
+`python calibration/euro_ncap.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026
 'pandas<3'`.
 """
 
@@ -21,7 +21,7 @@ MASK = {matrix_processing.TestRange.STANDARD: "S", matrix_processing.TestRange.E
 
 HEADER = """\
 # Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers.
-# Derived by tests/rating/derive.py from euroncap-rating-2026 {0} (PyPI, Apache-2.0):
+# Derived by calibration/euro_ncap.py from euroncap-rating-2026 {0} (PyPI, Apache-2.0):
 # its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. \
 Do not edit.
 # range_letters: one for each column, S standard, E extended, - no cell; has_function_choice: the manufacturer chooses
