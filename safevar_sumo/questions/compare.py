@@ -12,6 +12,7 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 import pandas as pd
 
@@ -80,28 +81,26 @@ def compare(
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
-    evaluators = evaluator, evaluator.for_study(study_in(other))
-    studies = [one.study for one in evaluators]
-    _require_same_characteristics(*studies)
+    study = evaluator.study
+    evaluators = evaluator, evaluator.for_study(_in_order_of(study, study_in(other)))
     stated = [one.parse_criterion(unsafe) for one in evaluators if unsafe is not None]
     names = list(evaluator.characteristics.names)
-    orders = [[names.index(name) for name in one.characteristics.names] for one in evaluators]
-    frame, outside = _common_settings((subject, other), evaluators, orders, samples)
-    a, b = runs = [
-        one.evaluate(frame[names].to_numpy(float)[:, order], f"settings in {side.upper()}")
-        for one, order, side in zip(evaluators, orders, SIDES, strict=True)
+    frame, outside = _common_settings((subject, other), evaluators, samples)
+    runs = [
+        one.evaluate(frame[names].to_numpy(float), f"settings in {side.upper()}")
+        for one, side in zip(evaluators, SIDES, strict=True)
     ]
-    originals, both_rated = [one.evaluate_original() for one in evaluators], all(map(is_rated, studies))
+    originals, both_rated = (
+        [one.evaluate_original() for one in evaluators],
+        all(is_rated(one.study) for one in evaluators),
+    )
     criterion = stated[0] if stated else _default_criterion(both_rated, runs, originals)
-    is_valid = a.valid & b.valid
-    frame, a, b = frame[is_valid].reset_index(drop=True), a.take(is_valid), b.take(is_valid)
+    is_valid = runs[0].valid & runs[1].valid
+    frame, (a, b) = frame[is_valid].reset_index(drop=True), [run.take(is_valid) for run in runs]
     settings = pd.concat([frame, table_of_pairs(frame["solution"], a, b, criterion).drop(columns="solution")], axis=1)
-    distinct = settings.drop_duplicates(names)
     metric = RATING_POINTS.name if both_rated else SAFETY_DEGREE
     p, a12, pairs = _test(frame.assign(a=a.column(metric), b=b.column(metric)))
-    scans = [scan(one, range(len(names)), criterion) for one in evaluators]
-    braking = _needless_braking(*studies)
-    reason_b = evaluators[1].no_verdict
+    distinct, reason_b = settings.drop_duplicates(names), evaluators[1].no_verdict
     numbers: JsonObject = {
         **({"driven": False} if reason_b else {}),
         "unsafe": str(criterion),
@@ -111,35 +110,44 @@ def compare(
         "a12": a12,
         "outside": outside,
         "not_simulated": int(np.count_nonzero(~is_valid)),
+        **_needless_braking(*(one.study for one in evaluators)),
+        **_ends_of_originals(evaluators, originals, with_points=both_rated),
     }
-    numbers |= dict(zip(("a_needless_braking", "b_needless_braking", "benign_scenes"), braking, strict=True))
-    for side, study, original in zip(SIDES, studies, originals, strict=True):
-        numbers |= {f"{side}_outcome": str(original.outcome[0]), f"{side}_degree": float(original.f_safe[0])}
-        if contact := contact_degree(assemble(study)):
-            numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
-        if both_rated:
-            numbers[f"{side}_points"] = float(original.column(RATING_POINTS.name)[0])
-    title_a, title_b = titles = ("A", "B") if studies[0].name == studies[1].name else tuple(one.name for one in studies)
-    quantity = "rating" if both_rated else "safety degree"
-    test = _test_in_words(quantity, title_b, p, a12, pairs)
-    verdict = f"{count_in_words(numbers, title_a, title_b, criterion)} {test}"
+    titles = tuple(one.study.name for one in evaluators)
+    titles = titles if len(set(titles)) == 2 else ("A", "B")
+    test = _test_in_words("rating" if both_rated else "safety degree", titles[1], p, a12, pairs)
+    verdict = f"{count_in_words(numbers, titles[0], titles[1], criterion)} {test}"
     if reason_b not in ("", evaluator.no_verdict):
         verdict = f"{reason_b} {verdict}"
+    limits = [*_limits(*(scan(one, range(len(names)), criterion) for one in evaluators))]
+    tables = {
+        "limits": tabulate("Limits of each alone, all others as in the original", LIMIT_COLUMNS, limits),
+        "settings": _settings_table(evaluator, settings),
+    }
+    draw = partial(draw_pairs, titles=titles)
+    return Answer(question="compare", study=study, verdict=verdict, numbers=numbers, tables=tables, draw=draw)
+
+
+def _ends_of_originals(
+    evaluators: Sequence[Evaluator], originals: Sequence[Evaluations], *, with_points: bool
+) -> JsonObject:
+    """How both original vehicles end, with the gap where degrees are from centre to centre."""
+    numbers: JsonObject = {}
+    for side, one, original in zip(SIDES, evaluators, originals, strict=True):
+        numbers |= {f"{side}_outcome": str(original.outcome[0]), f"{side}_degree": float(original.f_safe[0])}
+        if contact := contact_degree(assemble(one.study)):
+            numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
+        if with_points:
+            numbers[f"{side}_points"] = float(original.column(RATING_POINTS.name)[0])
+    return numbers
+
+
+def _settings_table(evaluator: Evaluator, settings: pd.DataFrame) -> pd.DataFrame:
+    """The table of settings, those first that are unsafe in one system only."""
     columns = {"source": Column("", "a or b, whose solution it is, or sample"), **SETTING_COLUMNS}
     columns |= {item.name: Column(item.unit, item.words, is_shown=False) for item in evaluator.characteristics}
     order = settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
-    tables = {
-        "limits": tabulate("Limits of each alone, all others as in the original", LIMIT_COLUMNS, _limits(*scans)),
-        "settings": tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]]),
-    }
-    return Answer(
-        question="compare",
-        study=evaluator.study,
-        verdict=verdict,
-        numbers=numbers,
-        tables=tables,
-        draw=partial(draw_pairs, titles=titles),
-    )
+    return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
 
 
 def table_of_pairs(
@@ -199,29 +207,33 @@ def _test_in_words(quantity: str, b: str, p: float, a12: float, pairs: str) -> s
 
 
 def _limits(in_a: Sequence[OneAtATimeScan], in_b: Sequence[OneAtATimeScan]) -> Iterator[list[Any]]:
-    """A row of `LIMIT_COLUMNS` for each characteristic, in A's order; no interval where the original is unsafe."""
-    of_b = {one.characteristic.name: one for one in in_b}
-    for a in in_a:
-        item = a.characteristic
-        values = [(one.characteristic.original, *(one.safe or (np.nan, np.nan))) for one in (a, of_b[item.name])]
+    """A row of `LIMIT_COLUMNS` for each characteristic; no interval where the original is unsafe."""
+    for both in zip(in_a, in_b, strict=True):
+        item = both[0].characteristic
+        values = [(one.characteristic.original, *(one.safe or (np.nan, np.nan))) for one in both]
         yield [item.name, item.unit, *chain(*values)]
 
 
-def _needless_braking(a: Study, b: Study) -> tuple[int, int, int]:
+def _needless_braking(a: Study, b: Study) -> dict[str, int]:
     """In how many of A's benign scenes the original vehicles of A and B brake, and the number of these scenes."""
     systems = [assemble(study, study.source) for study in (a, b)]
     scenes = benign_scenes(a, systems[0])
     brakes_in_a, brakes_in_b = (needless_braking(system, scenes) for system in systems)
-    return sum(brakes_in_a), sum(brakes_in_b), len(brakes_in_a)
+    counts = {"a_needless_braking": sum(brakes_in_a), "b_needless_braking": sum(brakes_in_b)}
+    return {**counts, "benign_scenes": len(brakes_in_a)}
 
 
-def _require_same_characteristics(a: Study, b: Study) -> None:
-    units_a, units_b = ([(name, row.unit) for name, row in study.vehicle.characteristics.items()] for study in (a, b))
-    if set(units_a) == set(units_b):
-        return
+def _in_order_of(a: Study, b: Study) -> Study:
+    """Study B with its characteristics in A's order; refuses other characteristics and other units."""
+    rows_a, rows_b = a.vehicle.characteristics, b.vehicle.characteristics
+    units_a, units_b = ({(name, row.unit) for name, row in rows.items()} for rows in (rows_a, rows_b))
+    if units_a == units_b:
+        return msgspec.structs.replace(
+            b, vehicle=msgspec.structs.replace(b.vehicle, characteristics={name: rows_b[name] for name in rows_a})
+        )
     a_alone, b_alone = (
-        ", ".join(f"{name} [{unit}]" for name, unit in units if (name, unit) not in other_units) or "none"
-        for units, other_units in ((units_a, units_b), (units_b, units_a))
+        ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
+        for units in (units_a - units_b, units_b - units_a)
     )
     raise InputError(
         b.source,
@@ -231,21 +243,18 @@ def _require_same_characteristics(a: Study, b: Study) -> None:
 
 
 def _common_settings(
-    subjects: Sequence[Study | Case], evaluators: Sequence[Evaluator], orders: list[list[int]], samples: int
+    subjects: Sequence[Study | Case], evaluators: Sequence[Evaluator], samples: int
 ) -> tuple[pd.DataFrame, int]:
     """The settings for both systems, with `source`, `solution` and, if there are runs, `algorithm` and `run`; and the
-    number of solutions outside the common domain. `orders` are A's characteristics in each system's order.
+    number of solutions outside the common domain.
     """
     names = list(evaluators[0].characteristics.names)
-    domains = [
-        [ends[np.argsort(order)] for ends in (one.characteristics.lower, one.characteristics.upper)]
-        for one, order in zip(evaluators, orders, strict=True)
-    ]
-    lower, upper = np.max([low for low, _ in domains], axis=0), np.min([high for _, high in domains], axis=0)
+    lower = np.max([one.characteristics.lower for one in evaluators], axis=0)
+    upper = np.min([one.characteristics.upper for one in evaluators], axis=0)
     if (lower > upper).any():
         problem = f"{names[int(np.argmax(lower > upper))]}: the domains of the two studies do not overlap"
         raise InputError(evaluators[1].study.source, problem, "studies with a common domain of each characteristic")
-    sample = _common_sample(evaluators, orders, lower, upper, samples)
+    sample = _common_sample(evaluators, lower, upper, samples)
     frames = [pd.DataFrame(sample, columns=names).assign(source=SAMPLE, solution="")]
     for side, case in zip("ba", reversed(subjects), strict=True):
         if isinstance(case, Case):
@@ -257,17 +266,15 @@ def _common_settings(
     return frame[is_inside].reset_index(drop=True), int(np.count_nonzero(~is_inside))
 
 
-def _common_sample(
-    evaluators: Sequence[Evaluator], orders: list[list[int]], lower: FloatArray, upper: FloatArray, number: int
-) -> FloatArray:
+def _common_sample(evaluators: Sequence[Evaluator], lower: FloatArray, upper: FloatArray, number: int) -> FloatArray:
     """`number` settings that cover the common domain evenly and satisfy the constraints of both studies; fewer if
     hardly any settings do.
     """
     factor = 1
     while True:
         settings = lower + sobol_points(number * factor, len(lower), 0) * (upper - lower)
-        for evaluator, order in zip(evaluators, orders, strict=True):
-            settings = settings[evaluator.region.feasible(settings[:, order])]
+        for evaluator in evaluators:
+            settings = settings[evaluator.region.feasible(settings)]
         if len(settings) >= number or factor >= MAX_FACTOR:
             return settings[:number]
         factor *= 2
