@@ -40,11 +40,6 @@ benchmark: .venv/installed-test
 	.venv/asam/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
 	touch $@
 
-# An engine for parquet, outside the environment: beside it, pandas has other types of texts everywhere.
-.venv/installed-arrow: setup.cfg .venv/installed
-	$(RUN) -m pip install --quiet --disable-pip-version-check --no-deps --target .venv/arrow "pyarrow == 23.0.*"
-	touch $@
-
 .venv/installed-%: .venv/installed
 	$(INSTALL) ".[$*]"
 	touch $@

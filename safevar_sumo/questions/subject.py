@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
-from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST, differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
@@ -69,23 +68,6 @@ class Results:
     def finished(self) -> tuple[tuple[str, int], ...]:
         """Algorithm and number of every finished run."""
         return self.case.finished_runs
-
-    def to_parquet(self, path: str | Path, *, evaluations: bool = False) -> None:
-        """Write the solutions, or all evaluations, to a parquet file.
-
-        Raises
-        ------
-        InputError
-            If no engine for parquet is installed, or the file cannot be written.
-        """
-        frame = self.evaluations if evaluations else self.solutions
-        try:
-            with whole_file(Path(path), "to_parquet") as file:
-                frame.to_parquet(file, index=False)
-        except ImportError:
-            raise InputError(
-                "to_parquet", "pyarrow is not installed", "in the checkout: pip install '.[parquet]'"
-            ) from None
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(repr(self))}</p>\n{self.solutions.to_html(max_rows=10, index=False)}"

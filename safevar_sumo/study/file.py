@@ -52,21 +52,7 @@ class _RawStudy(NamedTuple):
 
 
 def load_study(study: StudyLike, **changes: Any) -> Study:
-    """Read a study strictly.
-
-    Parameters
-    ----------
-    study
-        The study's name, the path of its file, its tables as in a file, or a study to change.
-    changes
-        Keys that override keys of the study, table by table, as in a file that extends the study:
-        `weather="fog"`, `search={"runs": 2}`.
-
-    Raises
-    ------
-    InputError
-        If the study cannot be used; the error names file, key, value and expected values.
-    """
+    """Read a study strictly, as `safevar_sumo.load_study` does, but for the parameters of its shipped models."""
     raw = _raw_study(study)
     return _checked_study(_with_overrides(raw, plain_values(changes), raw.source) if changes else raw)
 

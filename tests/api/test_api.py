@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from importlib.metadata import version
@@ -18,9 +17,6 @@ from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-
-ARROW = Path(sys.prefix, "arrow")
-"""Where `make .venv/installed-arrow` puts an engine for parquet."""
 
 
 @pytest.fixture(scope="module")
@@ -147,34 +143,6 @@ def test_compare_needs_a_study_and_changes_alone() -> None:
 def test_unusable_settings_are_reported_before_any_simulation(settings: object, expected: str) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
-
-
-def test_without_an_engine_parquet_is_refused(
-    results: sv.Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for engine in ("pyarrow", "fastparquet"):
-        monkeypatch.setitem(sys.modules, engine, None)
-    with pytest.raises(sv.InputError, match="pyarrow is not installed"):
-        results.to_parquet(tmp_path / "solutions.parquet")
-    assert not list(tmp_path.iterdir())
-
-
-def test_parquet_holds_solutions_and_evaluations(results: sv.Results, tmp_path: Path) -> None:
-    """In a process of its own: beside Arrow, pandas has other types of texts everywhere."""
-    if not ARROW.is_dir() and os.environ.get("SAFEVAR_ARROW") != "required":
-        pytest.skip("make .venv/installed-arrow installs an engine for parquet")
-    code = (
-        "import sys, pandas as pd, safevar_sumo as sv\n"
-        "results, file = sv.load(sys.argv[1]), sys.argv[2]\n"
-        "for evaluations, frame in ((False, results.solutions), (True, results.evaluations)):\n"
-        "    results.to_parquet(file, evaluations=evaluations)\n"
-        "    pd.testing.assert_frame_equal(pd.read_parquet(file), frame.reset_index(drop=True), check_dtype=False)\n"
-    )
-    subprocess.run(
-        [sys.executable, "-c", code, results.directory, tmp_path / "table.parquet"],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(ARROW), os.getcwd()))},
-        check=True,
-    )
 
 
 def test_load_reads_the_results_of_run(results: sv.Results) -> None:
