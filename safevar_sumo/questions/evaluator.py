@@ -25,7 +25,6 @@ from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
@@ -223,14 +222,6 @@ class Evaluator:
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
         return Evaluator(study, self._pool, self.progress, self._verified if verified is None else verified)
-
-    def for_sets(self, fits: int) -> list[Evaluator]:
-        """An evaluator for each of the first `fits` parameter sets, the study's own first; none without [spread].
-
-        No setting is verified in SUMO, because scene and equations are those of the study.
-        """
-        studies = studies_of_sets(self.study)[:fits] if fits and self.study.spread else []
-        return [self.for_study(study, verified=0) for study in studies]
 
 
 @contextmanager

@@ -43,15 +43,15 @@ DRIVERS: dict[str, tuple[str, JsonObject]] = {
     f"{ANY_LEADER}_later": ("competent_driver", ANY | LATER),
 }
 """Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
-TITLES = {
-    LETTER: "a competent driver",
-    ANY_LEADER: "one who reacts to any braking of a leader, not only above 5 m/s^2",
-    FULL: "full braking at the first possible moment",
-}
-NOBODY, NO_VERDICT = "nobody: physically unavoidable", "no verdict"
+TITLES = {LETTER: "competent driver", ANY_LEADER: "competent driver, any braking of a leader", FULL: "full braking"}
+NOBODY, NO_VERDICT = "nobody", "no verdict"
 """In the place of a driver who avoids a collision."""
 COLUMNS = {
-    "driver": Column("", f"reference driver in the same vehicle: {'; '.join(TITLES.values())}"),
+    "driver": Column(
+        "",
+        "reference driver in the same vehicle: a competent driver; one who reacts to any braking of a leader, not only "
+        "above 5 m/s^2; full braking at the first possible moment",
+    ),
     "avoided": Column("", "collisions that he avoids"),
     "later": Column("", f"collisions that he avoids if he needs {DELAY:g} s longer"),
     "no_verdict": Column("", "collisions at points where he collides in the original vehicle, too: no verdict"),
@@ -104,10 +104,8 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
 
 def avoided_by(verdicts: Mapping[Any, Any]) -> str:
     """The weakest driver who avoids a collision, in words; `verdicts` is a row of `judge_collisions`."""
-    by = next((title for driver, title in TITLES.items() if verdicts[driver] == 1), "")
-    if not by:
-        return NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
-    return by + (f" (no verdict of {TITLES[LETTER]})" if np.isnan(verdicts[LETTER]) else "")
+    otherwise = NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
+    return next((title for driver, title in TITLES.items() if verdicts[driver] == 1), otherwise)
 
 
 def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:

@@ -17,8 +17,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import explain
-from safevar_sumo.questions.explain.across_fits import count_holding, ranges_across_fits
+from safevar_sumo.questions.explain import across_fits, explain
+from safevar_sumo.questions.explain.across_fits import are_causes, ranges_across_fits
 from safevar_sumo.questions.explain.causes import (
     RESOLUTION,
     BoundaryState,
@@ -204,7 +204,7 @@ def test_needed_and_changed_over_failures() -> None:
     assert distinct[["cause", "failures"]].to_numpy().tolist() == [[("a up", "b down"), 2], [("c up",), 1]]
 
 
-def test_conclusions_across_fitted_models() -> None:
+def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> None:
     """Own: a up and b down together are unsafe. Second: a up alone. Third: nothing. Fourth: as the own, only wider."""
     wider = made_up_evaluator(3, lambda one: (one[:, 0] > 7) & (one[:, 1] < 5))
     models = [*(made_up_evaluator(3, region) for region in (box, lambda one: one[:, 0] > 8, nowhere)), wider]
@@ -212,16 +212,18 @@ def test_conclusions_across_fitted_models() -> None:
     evaluations = models[0].evaluate(settings, "settings")
     rows = COLLISION.of(evaluations)
     causes = [cause for of_one in find_minimal_causes(models[0], settings[rows], COLLISION) for cause in of_one]
-    assert count_holding(models, causes, COLLISION) == [2] * len(causes)
+    holding = [are_causes(model, causes, COLLISION).tolist() for model in models]
+    assert holding == [[holds] * len(causes) for holds in (True, False, False, True)]
+    monkeypatch.setattr(across_fits, "across", lambda evaluator, fits, measure: list(map(measure, models[:fits])))
     nobody = pd.Series(dtype=float)
     needed = pd.Series({"a": 1.0, "b": 1.0, "c": 0.0})
-    assert ranges_across_fits(models, evaluations, COLLISION, needed, nobody) == {
+    assert ranges_across_fits(models[0], 4, evaluations, COLLISION, needed, nobody) == {
         ("unsafe", ""): (0.0, 0.5),
         ("needed", "a"): (1.0, 1.0),
         ("needed", "b"): (0.0, 1.0),
         ("needed", "c"): (0.0, 0.0),
     }
-    safe = ranges_across_fits(models, evaluations.take([3]), COLLISION, needed.head(0), nobody)
+    safe = ranges_across_fits(models[0], 4, evaluations.take([3]), COLLISION, needed.head(0), nobody)
     assert safe == {("unsafe", ""): (0.0, 0.0)}, "safe with each"
 
 

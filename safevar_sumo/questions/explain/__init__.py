@@ -15,7 +15,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_fits import Ranges, count_holding, ranges_across_fits
+from safevar_sumo.questions.explain.across_fits import Ranges, are_causes, ranges_across_fits
 from safevar_sumo.questions.explain.causes import (
     Cause,
     count_distinct_causes,
@@ -35,6 +35,7 @@ from safevar_sumo.questions.explain.failures import (
     time_step,
 )
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
+from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -48,7 +49,7 @@ from safevar_sumo.questions.preventability import (
 )
 from safevar_sumo.questions.tables import Column, tabulate, with_interval
 from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of, share_in_words
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.records import BoolArray, JsonObject, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
@@ -74,7 +75,7 @@ CAUSE_COLUMNS = {
     "safety_degree": Column("m", "safety degree with these changes only; -m/s on a collision", is_shown=False),
     "robust_share": Column("-", "share of the neighbours of these changes that are unsafe, too", ".2f"),
     "fits_holding": Column("", "number of fitted vehicle models in which these changes are a cause, too"),
-    "avoided_by": Column("", "weakest reference driver who avoids the failure", is_shown=False),
+    "avoided_by": Column("", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False),
 }
 SOLUTION_COLUMNS = {
     "solution": Column("", "handle"),
@@ -86,7 +87,7 @@ SOLUTION_COLUMNS = {
     "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
     "ends": Column("", "how the original vehicle and this one end, where this one is worst", is_shown=False),
     "points": Column("", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False),
-    "avoided_by": Column("", "weakest reference driver who avoids it, in the same vehicle"),
+    "avoided_by": Column("", "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable"),
 }
 CHARACTERISTIC_COLUMNS = {
     "characteristic": Column("", "characteristic of the vehicle"),
@@ -146,13 +147,16 @@ def explain(
     needed = count_needed(evaluator.characteristics, changed, [causes[row] for row in sample], len(rows))
     # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
     verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
-    models, ranges = evaluator.for_sets(fits if len(runs) else 0), Ranges()
-    if models:
+    of_chosen = [causes[row] for row in reasons]
+    holding, ranges = list[BoolArray](), Ranges()
+    if fits and study.spread and len(runs):
+        chosen = [cause for group in of_chosen for cause in group]
+        holding = across(evaluator, fits, lambda each: are_causes(each, chosen, population.unsafe))
         shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-        ranges = ranges_across_fits(models, runs, population.unsafe, *shares)
+        ranges = ranges_across_fits(evaluator, fits, runs, population.unsafe, *shares)
     solutions = _solutions_frame(population, evaluator, reasons)
     tables = {
-        "causes": _causes_table(population, evaluator, models, solutions, [causes[row] for row in reasons]),
+        "causes": _causes_table(population, evaluator, holding, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **_statistics(evaluator, needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
         "distinct_causes": _distinct_table(evaluator, [causes[row] for row in sample]),
@@ -162,11 +166,11 @@ def explain(
         "analysed": len(sample),
         "explained": len(solutions),
         **(dict.fromkeys(COLLISION_NUMBERS) if is_rated(study) else _collision_numbers(verdicts, collisions)),
-        "fits": len(models),
+        "fits": len(holding),
         "unsafe_in_fits": ranges.get(("unsafe", "")),
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
-    sentences = [_verdict(evaluator, population, kind, len(models), tables["causes"]), _avoided_in_words(verdicts)]
+    sentences = [_verdict(evaluator, population, kind, len(holding), tables["causes"]), _avoided_in_words(verdicts)]
     verdict = " ".join([*filter(None, sentences), *constraints_in_words(study)])
     return Answer(question="explain", study=study, verdict=verdict, numbers=numbers, tables=tables, draw=draw_needed)
 
@@ -226,7 +230,7 @@ def _solutions_frame(population: Population, evaluator: Evaluator, reasons: Reas
 def _causes_table(
     population: Population,
     evaluator: Evaluator,
-    models: Sequence[Evaluator],
+    holding: Sequence[BoolArray],
     solutions: pd.DataFrame,
     causes_of: Sequence[Sequence[Cause]],
 ) -> pd.DataFrame:
@@ -237,12 +241,12 @@ def _causes_table(
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, time_step(study), unsafe).mean(axis=1)
-    shrunk, holding = find_limits(evaluator, causes, unsafe), count_holding(models, causes, unsafe)
+    shrunk, fits_holding = find_limits(evaluator, causes, unsafe), np.sum(holding, axis=0)
     numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), list[tuple[Any, ...]]()
     for index in np.lexsort([-robust, numbers]).tolist():
         cause, failure = causes[index], solutions.iloc[numbers[index]]
         own = (len(cause.changes), cause.outcome, cause.safety_degree, robust[index])
-        holds = holding[index] if models else None
+        holds = int(fits_holding[index]) if holding else None
         rows.append((failure["solution"], cause.changes, *shrunk[index], *own, holds, failure["avoided_by"]))
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
     return tabulate("Minimal causes, all else as in the original", CAUSE_COLUMNS, frame)
@@ -305,7 +309,8 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
 def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     """What a competent driver, and full braking, would have avoided."""
     shares = avoided_shares(verdicts)
-    phrases = [f"{TITLES[name]} avoids {share_in_words(shares[name])}" for name in (LETTER, FULL) if name in shares]
+    titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
+    phrases = [f"{title} avoids {share_in_words(shares[name])}" for name, title in titles.items() if name in shares]
     number = number_of(len(verdicts), "collision")
     return f"In the same vehicle, of {number} {join_phrases(phrases)}." if phrases else ""
 

@@ -13,6 +13,7 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator, Interval
 from safevar_sumo.questions.explain.causes import Cause, count_needed, find_minimal_causes, settings_of
+from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.preventability import avoided_shares, judge_sample
 from safevar_sumo.records import BoolArray, Evaluations
 
@@ -34,40 +35,37 @@ another set makes on a sample.
 """
 
 
-def count_holding(evaluators: Sequence[Evaluator], causes: Sequence[Cause], unsafe: Unsafe) -> list[int]:
-    """Number of sets with which each cause holds: its changes alone are unsafe, and safe if any one of them is left
-    out.
+def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> BoolArray:
+    """Whether each of M causes is one with an evaluator's parameters: its changes alone are unsafe, and safe if any one
+    of them is left out.
     """
-    counts = np.zeros(len(causes), dtype=int)
-    if not causes or not evaluators:
-        return counts.tolist()
-    characteristics, groups = evaluators[0].characteristics, []
+    if not causes:
+        return np.zeros(0, dtype=bool)
+    characteristics, groups = evaluator.characteristics, []
     for setting in settings_of(characteristics, causes):
         is_changed = setting != characteristics.original
         is_left_out = np.diag(is_changed)[is_changed]
         groups.append(np.vstack([setting, np.where(is_left_out, characteristics.original, setting)]))
     starts = np.cumsum([0, *map(len, groups[:-1])])
-    for evaluator in evaluators:
-        is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
-        # A cause holds if its first setting, with all changes, is the only unsafe one of its group.
-        counts += is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1)
-    return counts.tolist()
+    is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
+    # The first setting of a group, with all changes, is the only unsafe one.
+    return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
 
 
 def ranges_across_fits(
-    evaluators: Sequence[Evaluator],
+    evaluator: Evaluator,
+    fits: int,
     evaluations: Evaluations,
     unsafe: Unsafe,
     needed: pd.Series[float],
     avoided: pd.Series[float],
 ) -> Ranges:
-    """The ranges of the shares over the sets of `evaluators`, of which the first has the study's own parameters.
+    """The ranges of the shares over the study's own parameters and the first `fits` sets.
 
-    With these, the shares of failures that need a characteristic are `needed`, and of collisions that a driver avoids
-    `avoided`.
+    With its own parameters, the shares of failures that need a characteristic are `needed`, and of collisions that a
+    driver avoids `avoided`.
     """
-    evaluators = evaluators[:MAX_SHARE_SETS]
-    order = np.random.default_rng(evaluators[0].study.search.seed).permutation(len(evaluations))
+    order = np.random.default_rng(evaluator.study.search.seed).permutation(len(evaluations))
     vehicles = evaluations.settings[order[:MAX_VEHICLES]]
     failures = evaluations.take(unsafe.of(evaluations))
     failures = failures.take(np.argsort(failures.f_num_diff, kind="stable")[:MAX_FAILURES])
@@ -79,13 +77,12 @@ def ranges_across_fits(
         changed = evaluator.characteristics.changed(failures.settings[rows])
         frame = count_needed(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
         runs = evaluator.evaluate(vehicles, STAGE)
-        avoided_here = (
-            avoided if avoided.empty else avoided_shares(judge_sample(evaluator, runs.take(runs.collided))[0])
-        )
+        collisions = runs.take(runs.collided & (len(avoided) > 0))
+        avoided_here = avoided_shares(judge_sample(evaluator, collisions)[0])
         return _shares_by_kind(unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here)
 
     shares = _shares_by_kind(unsafe.of(evaluations), needed, avoided)
-    samples = pd.concat(list(map(sample_shares, evaluators)), axis=1).reindex(shares.index)
+    samples = pd.concat(across(evaluator, min(fits, MAX_SHARE_SETS), sample_shares), axis=1).reindex(shares.index)
     # Column 0 has the study's own parameters. There is no share where a sample has no failure, or no collision.
     differences = samples.sub(samples[0].fillna(shares), axis=0)
     lows, highs = (
