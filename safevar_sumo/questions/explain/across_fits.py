@@ -77,8 +77,8 @@ def ranges_across_fits(
         changed = evaluator.characteristics.changed(failures.settings[rows])
         frame = count_needed(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
         runs = evaluator.evaluate(vehicles, STAGE)
-        collisions = runs.take(runs.collided & (len(avoided) > 0))
-        avoided_here = avoided_shares(judge_sample(evaluator, collisions)[0])
+        is_judged = not avoided.empty
+        avoided_here = avoided_shares(judge_sample(evaluator, runs.take(runs.collided))[0]) if is_judged else avoided
         return _shares_by_kind(unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here)
 
     shares = _shares_by_kind(unsafe.of(evaluations), needed, avoided)
