@@ -40,8 +40,14 @@ def whole_file(path: Path, source: str = "") -> Iterator[Path]:
         raise
 
 
-def check_writable(path: Path, source: str) -> None:
-    """Refuse an output file that cannot be written, before the work begins; raises InputError."""
+def check_writable(path: Path, source: str, endings: Sequence[str] = (), but: str = "") -> None:
+    """Refuse an output file that cannot be written, before the work begins, whose name has another ending, or that
+    exists and is named `but`; raises InputError.
+    """
+    if endings and path.suffix.lower() not in endings:
+        raise InputError(source, str(path), f"a file that ends in {', '.join(endings)}")
+    if path.name == but and path.exists():
+        raise InputError(source, f"{path} holds results", "another file")
     try:
         with path.open("a") if path.exists() else tempfile.TemporaryFile(dir=path.resolve().parent):
             pass

@@ -55,20 +55,21 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self._title_line:
             yield self._title_line  # rich breaks a title where its table ends
-        wide_options, sizes = options.update(width=UNLIMITED_WIDTH), list[tuple[int, int]]()
+        sizes, count = list[tuple[int, int]](), len(self.columns)
         for column in self.columns:
-            cells = [Measurement.get(console, wide_options, cell) for cell in (column.header, *column.cells)]
-            sizes.append((max(cell.minimum for cell in cells), max(cell.maximum for cell in cells)))
-        least_width = sum(longest_word + 1 for longest_word, _ in sizes) + 1  # with a line around each column
-        words_fit = least_width <= options.max_width
-        if words_fit and least_width + 2 * len(sizes) > options.max_width:
-            self.padding = 0
-        for column, (longest_word, full_width) in zip(self.columns, sizes, strict=True):
-            column.overflow, column.no_wrap = "fold", words_fit and longest_word == full_width
-        excess = Measurement.get(console, wide_options, self).maximum - options.max_width
-        if excess > 0:
-            longest_word, full_width = sizes[0]
-            self.columns[0].width = max(longest_word, full_width - excess)
+            cells = (column.header, *column.cells)
+            measures = [Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell) for cell in cells]
+            sizes.append((max(one.minimum for one in measures), max(one.maximum for one in measures)))
+            column.overflow = "fold"
+        words, whole = (sum(size) for size in zip(*sizes, strict=True)) if sizes else (0, 0)
+        space = options.max_width - count - 1  # beside the lines
+        if whole + 2 * count > space:
+            if words + 2 * count > space:
+                self.padding = 0
+            spare = space - words - (0 if words + 2 * count > space else 2 * count)
+            for column, (longest_word, full_width) in zip(self.columns, sizes, strict=True):
+                if spare >= 0:
+                    column.width = longest_word + (full_width - longest_word) * spare // max(whole - words, 1)
         yield from super().__rich_console__(console, options)
 
 

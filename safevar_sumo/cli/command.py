@@ -19,7 +19,6 @@ from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import FORMATS, Answer
 from safevar_sumo.questions.ask import Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
-from safevar_sumo.results import SOLUTIONS
 from safevar_sumo.study import study_names
 
 GATE_EXIT_CODE = 3
@@ -37,7 +36,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     """The command that calls a function.
 
     An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a condition of --fail-if
-    holds. A text is printed, too.
+    holds, and 1 if its number `passed` is false. A text is printed, too.
     """
     signature = inspect.signature(function)
     positional = [one for one in signature.parameters.values() if one.kind is not one.KEYWORD_ONLY]
@@ -57,8 +56,11 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         form: str, as_json: bool, table: str | None, plot: Path | None, fail_if: tuple[str, ...], **values: Any
     ) -> None:
         conditions = [_parse(text) for text in fail_if]
-        _check_picture(plot)
-        answer: Answer = call(**values)
+        if plot is not None:
+            check_writable(plot, "plot", PICTURE_ENDINGS)
+        answer: Answer | None = call(**values)
+        if answer is None:
+            return
         _print(answer, "json" if as_json else form, table)
         if plot is not None:
             from safevar_sumo.questions.figures import save
@@ -69,11 +71,13 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             click.echo(f"failed: {sentence}", err=True)
         if failures:
             click.get_current_context().exit(GATE_EXIT_CODE)
+        if answer.numbers.get("passed") is False:
+            click.get_current_context().exit(1)
 
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
-    gives_answer = signature.return_annotation in ("Answer", Answer)
+    gives_answer = "Answer" in str(signature.return_annotation)
     return click.Command(
         name,
         params=[*map(_argument, positional), *map(_flag, options), *(_output_options() if gives_answer else [])],
@@ -131,17 +135,6 @@ def _output_options() -> list[click.Option]:
             help="End with exit code 3 if a number, or a table's column in any row, is so; may be repeated.",
         ),
     ]
-
-
-def _check_picture(path: Path | None) -> None:
-    """Refuse, before anything is simulated, a picture with an unknown ending or that cannot be written."""
-    if path is None:
-        return
-    if path.name == SOLUTIONS and path.exists():
-        raise InputError("plot", f"{path} holds results", "another file")
-    if path.suffix.lower() not in PICTURE_ENDINGS:
-        raise InputError("plot", str(path), f"a file that ends in {', '.join(PICTURE_ENDINGS)}")
-    check_writable(path, "plot")
 
 
 def _print(answer: Answer, form: str, table: str | None) -> None:

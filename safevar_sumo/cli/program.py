@@ -27,13 +27,12 @@ if TYPE_CHECKING:
 
 COMMANDS_BY_GROUP = {
     "From a driving system to a decision": {
-        "study": "cli.study:study",
-        "simulate": "cli.simulate:simulate_command",
+        "study": "api.study:study",
+        "simulate": "replay.simulate:simulate",
         "explain": "questions.explain:explain",
         "tolerance": "questions.tolerance:tolerance",
         "risk": "questions.risk:risk",
         "report": "cli.handover:report",
-        "status": "cli.study:status",
     },
     "Further questions": {
         "rules": "questions.rules:rules",
@@ -45,11 +44,11 @@ COMMANDS_BY_GROUP = {
     "Hand over": {
         "evidence": "cli.handover:evidence",
         "verify": "cli.handover:verify",
-        "export": "cli.handover:export",
+        "export": "replay.export:export",
     },
-    "Your own code": {"check": "cli.catalogue:check_command", "list": "cli.catalogue:list_command"},
+    "Your own code": {"check": "questions.catalogue:check", "list": "questions.catalogue:list_models"},
     "Published data": {
-        "import": "cli.reference:import_command",
+        "import": "reference.rows:import_published",
         "validate": "reference.agreement:validate",
         "tables": "questions.research_questions.answer:tables",
     },

@@ -52,7 +52,7 @@ class Answer:
     question
         The command that asks it.
     study
-        The study that was examined.
+        The study that was examined; `list` is about none.
     verdict
         One or two sentences: what, how far, how sure.
     numbers
@@ -89,7 +89,7 @@ class Answer:
             }
             for name, frame in self.tables.items()
         }
-        head = {"question": self.question, "study": self.study.name, "verdict": self.verdict}
+        head = {"question": self.question, "study": getattr(self.study, "name", None), "verdict": self.verdict}
         return {**head, "numbers": plain(self.numbers), "tables": tables}
 
     def table(self, name: str | None = None) -> pd.DataFrame:
@@ -165,7 +165,7 @@ class Answer:
         return self.render("html")
 
     def __repr__(self) -> str:
-        return f"<Answer {self.question} {self.study.name}: {self.verdict}>"
+        return f"<Answer {self.question}: {self.verdict}>"
 
     def figure(self) -> Figure:
         """The answer as a figure."""
@@ -201,7 +201,7 @@ def _draw_intervals(answer: Answer) -> Figure:
     if not names or frame.empty:
         raise InputError("plot", "the answer has nothing to draw", "the answer as a table")
     size = (max(2.6 * len(names), 5.2), 1.1 + 0.35 * len(frame))
-    figure, axes = new_figure(f"{answer.study.name}: {frame.attrs['title']}", 1, len(names), size, sharey=True)
+    figure, axes = new_figure(frame.attrs["title"], 1, len(names), size, sharey=True)
     places = range(len(frame), 0, -1)
     for axis, name in zip(axes[0], names, strict=True):
         value, low, high = (frame[f"{name}{end}"].to_numpy(float) for end in ("", LOW, HIGH))

@@ -253,7 +253,7 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     if get_origin(hint) is Annotated:
         hint, extra = get_args(hint)
         limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
-    is_repeated = get_origin(hint) is tuple
+    is_repeated = any(get_origin(one) is tuple for one in (hint, *get_args(hint)))
     kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
     kind = str if is_repeated or not kinds else kinds[0]
     choices = get_args(hint) if get_origin(hint) is Literal else ()

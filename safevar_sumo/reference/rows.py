@@ -7,9 +7,9 @@ in most files, `Dece`. There is no run column.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -150,25 +150,28 @@ def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> E
 
 def import_published(
     study: StudyLike,
-    out: str | Path,
     *,
+    out: str | Path,
     nsga2: str | Path | None = None,
     rs: str | Path | None = None,
     safe_fuzzer: str | Path | None = None,
-    original: Mapping[str, float] | None = None,
+    original: Annotated[Mapping[str, float] | tuple[str, ...], "METRIC=NUMBER"] = (),
 ) -> Results:
     """Import published CSV solutions of a study as a results directory, in place of an earlier import.
 
     Parameters
     ----------
-    study
-        A study, or anything that `load_study` accepts.
     out
         Directory of the results.
-    nsga2, rs, safe_fuzzer
-        Files with the solutions of NSGA-II, random search and SafeFuzzer.
+    nsga2
+        File with the solutions of NSGA-II.
+    rs
+        File with the solutions of random search.
+    safe_fuzzer
+        File with the solutions of SafeFuzzer.
     original
-        The original vehicle's metrics, such as {"safety_degree": 2.7}; by default those published for the study.
+        A metric of the original vehicle, such as sd=2.7, tet, tit or ave_dece; may be repeated. By default those
+        published for the study.
 
     Raises
     ------
@@ -180,7 +183,7 @@ def import_published(
     files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
-    metrics = {name: {**loaded_study.published, **(original or {})}.get(name) for name in METRICS}
+    metrics = {name: {**loaded_study.published, **_read_metrics(original)}.get(name) for name in METRICS}
     if metrics[SAFETY_DEGREE] is None:
         problem = "the study has no published values of the original vehicle"
         raise InputError(study, problem, "them as `original`, at least the safety degree")
@@ -192,3 +195,24 @@ def import_published(
     names = {algorithm: path.name for algorithm, path in files.items()}
     write_imported(directory, loaded_study, solutions, metrics, names)
     return load(directory)
+
+
+def _read_metrics(original: Mapping[str, float] | Sequence[str]) -> dict[str, float]:
+    """Metrics by name, of which the form METRIC=NUMBER also knows the titles; raises InputError if a number is none, or
+    outside its range.
+    """
+    texts = [f"{name}={value}" for name, value in original.items()] if isinstance(original, Mapping) else original
+    names = {word: metric.name for metric in METRICS.values() for word in (metric.name, metric.title.lower())}
+    metrics = {}
+    for text in texts:
+        word, _, number = text.partition("=")
+        try:
+            name = names[word.strip()]
+            lowest, highest = RANGES[name]
+            if not lowest <= float(number) <= highest:
+                raise ValueError
+        except (KeyError, ValueError):
+            legal = "sd=NUMBER, tet=NUMBER, tit=NUMBER or ave_dece=NUMBER, in its range"
+            raise InputError("original", repr(text), legal) from None
+        metrics[name] = float(number)
+    return metrics

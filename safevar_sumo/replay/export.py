@@ -7,17 +7,20 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
-from safevar_sumo.replay.comparison import Comparison
+from safevar_sumo.replay.comparison import Comparison, compare_setting
+from safevar_sumo.replay.simulate import load_target
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.network import Network, built_network, run_program
+from safevar_sumo.sumo.system import assemble
 
 ROAD, SCENARIO, SCRIPT, VEHICLE = "road.xodr", "scenario.xosc", "run_in_carla.py", "vehicle.json"
 BLUEPRINT = "vehicle.lincoln.mkz*2017"
@@ -181,7 +184,45 @@ def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float
     }
 
 
-def export(comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, Mapping[str, float]]) -> None:
+def export(
+    directory: str,
+    *,
+    solution: Annotated[str, "ALG:RUN:N"],
+    to: Literal["carla", "openscenario"],
+    out: Path,
+    point: str | None = None,
+    as_it_is_now: bool = False,
+) -> str:
+    """Write a solution's simulation for CARLA (a script and the vehicle's values), or as OpenSCENARIO and OpenDRIVE.
+
+    Parameters
+    ----------
+    solution
+        The solution to export; N counts from 0.
+    to
+        What reads it.
+    out
+        A new directory.
+    point
+        Only this point of the study's matrix.
+    as_it_is_now
+        If results were computed with other files or versions, simulate with the present ones and say so.
+    """
+    if out.exists() or out.is_symlink():
+        raise InputError("out", f"{out} exists", "a new directory")
+    target = load_target(directory, solution, [], as_it_is_now)
+    study = target.study if point is None else study_at(target.study, point, source="point")
+    system = assemble(study, directory)
+    setting = target.setting(system)
+    values = dict(zip(system.characteristics.names, setting.tolist(), strict=True))
+    physics = carla_physics(values, directory) if to == "carla" else {}
+    write_files(compare_setting(study, system, setting), to, out, solution, physics)
+    return f"{to}: {out}"
+
+
+def write_files(
+    comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, Mapping[str, float]]
+) -> None:
     """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or "openscenario"."""
     files = {ROAD: open_drive(comparison.network)}
     if to == "carla":

@@ -59,6 +59,9 @@ def test_every_module_study_and_network_is_in_the_wheel(site: Path) -> None:
 
 def test_commands_work_from_an_empty_directory(site: Path, tmp_path: Path) -> None:
     assert str(site) in run(site, tmp_path, "-c", "import safevar_sumo; print(safevar_sumo.__file__)")
-    assert json.loads(run(site, tmp_path, "-m", "safevar_sumo", "simulate", "lgsvl", "--json"))["outcome"] == "stopped"
+    assert (
+        json.loads(run(site, tmp_path, "-m", "safevar_sumo", "simulate", "lgsvl", "--json"))["numbers"]["outcome"]
+        == "stopped"
+    )
     run(site, tmp_path, "-m", "safevar_sumo", "study", "smoke", "--runs", "1", "--evaluations", "20")
     assert (tmp_path / "results/smoke/solutions.csv").is_file()

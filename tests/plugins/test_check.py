@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from safevar_sumo.plugins.check import check
+from safevar_sumo.plugins.check import check, study_to_check
 from safevar_sumo.study import load_study, study_names
 from tests.in_process import files_of, json_of, run
 
@@ -188,7 +188,7 @@ def test_a_planted_defect_is_found_with_the_input_that_shows_it(name: str, in_tm
     defect = DEFECTS[name]
     (in_tmp / "mine.py").write_text(defect.module)
     (in_tmp / "mine.toml").write_text(STUDY_OF[defect.kind])
-    (finding,) = check("mine.toml")
+    (finding,) = check(study_to_check("mine.toml"))
     assert finding.check == defect.check, finding
     assert defect.got in str(finding)
     file, _, line = finding.where.rpartition(":")
@@ -211,7 +211,9 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
         f"    def drive(self, seen):\n        {drive}\n"
     )
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
-    assert [(finding.check, reason in finding.finding) for finding in check(subject)] == [("reaction", True)]
+    assert [(finding.check, reason in finding.finding) for finding in check(study_to_check(subject))] == [
+        ("reaction", True)
+    ]
 
 
 RIGHT = {
@@ -233,7 +235,7 @@ RIGHT = {
 def test_what_is_right_passes(name: str, in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(RIGHT[name])
     (in_tmp / "mine.toml").write_text(STUDY_OF[name.partition(" ")[0]])
-    assert not [finding for finding in check("mine.toml") if finding.check != "reaction"]
+    assert not [finding for finding in check(study_to_check("mine.toml")) if finding.check != "reaction"]
 
 
 SHIPPED = {
@@ -248,17 +250,19 @@ SHIPPED = {
     "study", [pytest.param(name, marks=[] if name == "smoke" else pytest.mark.slow) for name in SHIPPED.values()]
 )
 def test_what_is_shipped_passes(study: str) -> None:
-    assert not check(study)
+    assert not check(load_study(study))
 
 
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(DEFECTS["out of range"].module)
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
     answer = json.loads(run("check", "mine.toml", "--json", expect=1).stdout)
-    assert (answer["subject"], answer["passed"]) == ("mine.toml", False)
-    assert list(answer["findings"][0]) == ["check", "finding", "where", "input", "expected"]
-    text = run("check", "mine:Mine", expect=1).stdout.replace("\n", "")
-    assert "contract: ads.model = 'mine:Mine' returned brake = 100.0 from drive" in text
-    assert "mine.py:11)" in text
+    assert answer["numbers"]["passed"] is False
+    (finding,) = answer["tables"]["findings"]["rows"]
+    assert {"finding", "where", "input", "expected"} <= set(finding)
+    text = run("check", "mine:Mine", "--format", "csv", expect=1).stdout
+    assert "ads.model = 'mine:Mine' returned brake = 100.0 from drive" in text
+    assert "mine.py:11" in text
     (in_tmp / "mine.py").write_text(RIGHT["ads"])
-    assert json_of("check", "mine.toml")["findings"] == []
+    passed = json_of("check", "mine.toml")
+    assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (True, [])

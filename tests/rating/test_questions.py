@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.cli.study import _verdict
+from safevar_sumo.api.study import _verdict
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins.check import check
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
@@ -51,7 +51,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_what_is_shipped_passes_the_check() -> None:
-    assert not check("euro_ncap_rating")
+    assert not check(load_study("euro_ncap_rating"))
 
 
 @pytest.mark.slow
@@ -88,7 +88,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_po
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure["points"])
     assert [sorted(changes) for changes in answer.tables["causes"]["changes"]] == [["brakeTorque"]]
     assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [None] * 3
-    (verdict,) = _verdict(case, original)
+    _, verdict = _verdict(case, assemble(case.study), original)
     kept = evaluations.column("rating_points")[case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]]
     assert f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
 

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -28,7 +29,7 @@ from safevar_sumo.results import (
 from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
 from safevar_sumo.study import Study, load_study, tables_of
 from tests.campaign.formulas import with_search
-from tests.in_process import json_of, refused, run
+from tests.in_process import json_of, refused
 from tests.made_up import made_up_evaluations
 
 NAMES = ("a", "b")
@@ -244,9 +245,9 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     manifest["versions"]["safevar_sumo"] = release
     (copied / "manifest.json").write_text(json.dumps(manifest))
     before = contents(copied)
-    for command in ("tables", "status"):
+    for command in (("tables", str(copied)), ("study", "smoke", "--status", "--out", str(copied))):
         message = (f"in format {number}", f"the release that wrote them, safevar_sumo {release}")
-        refused(command, str(copied), message=message)
+        refused(*command, message=message)
     assert contents(copied) == before
 
 
@@ -256,12 +257,18 @@ def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
+def status_of(place: Path) -> dict[str, dict[str, Any]]:
+    """The rows of the status of the study in a directory, by algorithm."""
+    status = json_of("study", "smoke", "--status", "--out", str(place))
+    return {row["algorithm"]: row for row in status["tables"]["algorithms"]["rows"]}
+
+
 def test_the_status_of_a_study_agrees_with_its_journals(slippery: Path, case: Case) -> None:
     before = contents(slippery)
-    status = json_of("status", str(slippery))
+    status = status_of(slippery)
     assert contents(slippery) == before
-    assert list(status["algorithms"]) == ["nsga2", "rs"]
-    for algorithm, row in status["algorithms"].items():
+    assert list(status) == ["nsga2", "rs"]
+    for algorithm, row in status.items():
         group = case.evaluations.query(f"algorithm == '{algorithm}'")
         assert (row["finished"], row["runs"], row["simulated"]) == (1, 1, len(group))
         assert row["collisions"] == (group["outcome"] == "collision").sum()
@@ -273,10 +280,9 @@ def test_a_study_under_way(copied: Path) -> None:
     rs.unlink()
     (copied / "solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
-    begun, waiting = json_of("status", str(copied))["algorithms"].values()
+    begun, waiting = status_of(copied).values()
     assert (begun["finished"], waiting["finished"], waiting["simulated"], waiting["best"]) == (0, 0, 0, None)
     assert 0 < begun["simulated"] < 56
     nsga2.write_bytes(nsga2.read_bytes().partition(b"\n")[0] + b"\n")
-    assert json_of("status", str(copied))["algorithms"]["nsga2"]["simulated"] == 0
+    assert status_of(copied)["nsga2"]["simulated"] == 0
     assert load_cases([copied])[0].evaluations.empty
-    assert "collisions" in run("status", str(copied)).stdout

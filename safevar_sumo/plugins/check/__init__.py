@@ -61,13 +61,8 @@ class Finding(NamedTuple):
         return f"{self.check}: {self.finding}{f', with {self.input}' if self.input else ''}{place}"
 
 
-def check(name: str) -> list[Finding]:
-    """Check the user code of a study, or an ADS.
-
-    Parameters
-    ----------
-    name
-        The name or path of a study; or an ADS by name, which drives in `STUDY_OF_AN_ADS`.
+def study_to_check(name: str) -> Study:
+    """The study by name or path; or `STUDY_OF_AN_ADS` with an ADS by name.
 
     Raises
     ------
@@ -75,7 +70,11 @@ def check(name: str) -> list[Finding]:
         If the study or the ADS cannot be loaded.
     """
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
-    study = load_study(STUDY_OF_AN_ADS, ads={"model": name}) if is_ads else load_study(name)
+    return load_study(STUDY_OF_AN_ADS, ads={"model": name}) if is_ads else load_study(name)
+
+
+def check(study: Study) -> list[Finding]:
+    """Check the user code of a study."""
     findings = list(find_defects(study))
     if not findings and (reason := why_no_verdict(assemble(study))):
         where = _definition(study, "ads.model", study.ads.model)

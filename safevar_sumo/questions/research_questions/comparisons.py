@@ -33,10 +33,8 @@ from safevar_sumo.questions.research_questions.statistics import (
     correct_by_holm,
     signed_rank_test,
 )
-from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import JsonObject
 
-MORE_UNSAFE = "below 0.5: the runs are more unsafe than the original vehicle"
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
 
@@ -198,27 +196,3 @@ def titles_of(cases: Iterable[Case]) -> dict[str, str]:
     metrics = {metric.name: metric.title for case in cases for metric in case.scoring.metrics}
     algorithms = {name: case.title_of(name) for case in cases for name in case.algorithms}
     return algorithms | INDICATOR_TITLES | metrics
-
-
-def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk."""
-    lines, titles = [], titles_of([case])
-    try:
-        tests = compare_over_runs(case).replace(titles)
-        for question, subject, heading, meaning in (
-            ("RQ1", "algorithm", "{} against the original vehicle", MORE_UNSAFE),
-            ("RQ2", "baseline", "{first} against {}", "above 0.5: {first} is better"),
-        ):
-            first = case.title_of(opponents_of(case)[0]) if question == "RQ2" else ""  # raises if RQ2 has no answer
-            heading, meaning = heading.replace("{first}", first), meaning.replace("{first}", first)
-            lines.append(f"{question} over runs: A12 {meaning}; * p < {ALPHA:g} after Holm's correction")
-            for name, group in tests[tests.index == question].groupby(subject, sort=False):
-                marks = np.where(group["p_holm"] < ALPHA, "*", "")
-                effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
-                line = f"  A12 of {heading.format(name)}: {', '.join(effects)}"
-                if untestable := ", ".join(group.loc[~group["enough_runs"] & group["effect_size"].notna(), "metric"]):
-                    line += f"; too few runs for a test ({FEWEST_RUNS[question]} are needed): {untestable}"
-                lines.append(line)
-    except UnanswerableError as error:
-        lines.append(f"{'RQ2' if lines else 'RQ1 and RQ2'} over runs: {error.problem}.")
-    return lines

@@ -1,0 +1,123 @@
+"""What can be named in a study, and whether the user's own code keeps the promises that results rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgspec
+import pandas as pd
+
+from safevar_sumo.ads import ADS
+from safevar_sumo.errors import unknown_name
+from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.words import number_of
+from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
+from safevar_sumo.search import DESCRIPTIONS
+from safevar_sumo.study import load_study, study_names
+from safevar_sumo.vehicles import CHANGES, CharacteristicSet
+
+NAME = {"name": Column("", "name in a study")}
+DESCRIBED = NAME | {"description": Column("", "what it is")}
+STUDIES = NAME | {key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")}
+VEHICLES = {
+    "vehicle": Column("", "vehicle"),
+    "name": Column("", "characteristic"),
+    "unit": Column("", "its unit"),
+    "original": Column("as unit", "value of the original vehicle", "g"),
+    "lower": Column("as unit", "lower end of its domain", "g"),
+    "upper": Column("as unit", "upper end of its domain", "g"),
+    "threshold": Column("as unit", "smallest change that the filter keeps", "g"),
+    "meaning": Column("", "what it is", is_shown=False),
+    "counterpart": Column("", "what it is in other models", is_shown=False),
+}
+WEATHER = NAME | {
+    "road_friction": Column("", "factor on the tyres' friction"),
+    "visibility": Column("", "factor on the distance at which sensors detect an obstacle"),
+    "recognition_delay": Column("s", "additional time to recognise somebody"),
+    "light": Column("", "day or night"),
+    "wet": Column("", "whether the road is wet"),
+    "effect": Column("", "none: an ADS drives as in clear weather, unless its parameters differ"),
+}
+OBJECTIVES: Mapping[str, object] = {
+    **{name: f"The search drives {metric.name} to unsafe values." for name, metric in METRIC_OF_OBJECTIVE.items()},
+    **{change.name: f"{change.title.capitalize()} [{change.unit}]." for change in CHANGES.values()},
+    RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
+}
+FINDINGS = {
+    "finding": Column("", "what is wrong"),
+    "where": Column("", "place in the user's code"),
+    "input": Column("", "input that shows it"),
+    "expected": Column("", "what is expected"),
+    "check": Column("", "name of the check"),
+    "advice": Column("", "what to do"),
+}
+
+
+def list_models(kind: str | None = None) -> Answer:
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with KIND only these."""
+    tables = {
+        "studies": tabulate("Studies", STUDIES, _studies()),
+        "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
+        "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
+        "scenarios": tabulate("Scenarios", DESCRIBED, _described(SCENARIOS)),
+        "weathers": tabulate("Weathers", WEATHER, _weathers()),
+        "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
+        "metrics": tabulate(
+            "Metrics", DESCRIBED, ((name, one.description) for name, one in {**METRICS, **OPTIONAL_METRICS}.items())
+        ),
+        "objectives": tabulate("Objectives; every metric can be one, too", DESCRIBED, OBJECTIVES.items()),
+    }
+    if kind is not None:
+        if kind not in tables:
+            raise unknown_name("kind", f"there is no {kind!r} to list", kind, tables)
+        tables = {kind: tables[kind]}
+    verdict = f"A study can name {', '.join(f'{len(frame)} {name}' for name, frame in tables.items())}."
+    no_study: Any = None
+    return Answer(question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables)
+
+
+def _studies() -> Iterator[tuple[str, ...]]:
+    for study in map(load_study, study_names()):
+        weather = study.weather if isinstance(study.weather, str) else study.weather.name
+        yield study.name, study.title, study.vehicle.model, study.ads.model, study.scenario.model, weather
+
+
+def _characteristics() -> Iterator[tuple[Any, ...]]:
+    studies = {study.vehicle.model: study for study in reversed([*map(load_study, study_names())])}
+    for vehicle, study in sorted(studies.items()):
+        for row in CharacteristicSet.of(study):
+            yield vehicle, *(getattr(row, name) for name in list(VEHICLES)[1:])
+
+
+def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The first paragraph of each model's docstring."""
+    return ((name, " ".join((model.__doc__ or "").partition("\n\n")[0].split())) for name, model in models.items())
+
+
+def _weathers() -> pd.DataFrame:
+    effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
+    return pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
+
+
+def check(subject: str) -> Answer:
+    """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep the promises that
+    results rest on.
+
+    SUBJECT is the name or path of a study, all of whose code is checked, or a driving system, by its name or
+    package.module:Name, which then drives in the study smoke. The exit code is 0 if SUBJECT passes, 1 with findings, 2
+    if it cannot be loaded.
+    """
+    from safevar_sumo.plugins.check import CHECKS, check as find, study_to_check  # loads SUMO
+
+    study = study_to_check(subject)
+    findings = find(study)
+    rows = [(one.finding, one.where, one.input, one.expected, one.check, CHECKS[one.check]) for one in findings]
+    return Answer(
+        question="check",
+        study=study,
+        verdict=f"{subject}: {number_of(len(findings), 'finding') if findings else 'passed'}.",
+        numbers={"passed": not findings},
+        tables={"findings": tabulate("Findings", FINDINGS, rows)},
+    )

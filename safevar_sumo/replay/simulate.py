@@ -1,0 +1,366 @@
+"""The command `simulate`: one setting of a study beside the original vehicle, or a sweep over many."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.api.evaluation import evaluate_settings
+from safevar_sumo.api.simulation import Simulation, simulate_with_original
+from safevar_sumo.errors import InputError, warn
+from safevar_sumo.output import check_writable, whole_file
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.ask import Range, find_question
+from safevar_sumo.questions.changes import read_changes
+from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
+from safevar_sumo.questions.subject import study_in, study_or_case
+from safevar_sumo.questions.words import number_of, points_in_words
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, record, row_of_handle
+from safevar_sumo.scenarios import degree_note, pre_crash_sentence
+from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.matrix import (
+    PointResult,
+    contact_degree,
+    point_record,
+    simulate_all_points,
+    study_at,
+    vehicle_remarks,
+)
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from safevar_sumo.replay.comparison import Comparison
+
+REMARKS = {"remark": Column("", "what to know about this simulation")}
+CHARACTERISTICS = {
+    "characteristic": Column("", "characteristic"),
+    "unit": Column("", "unit of its values"),
+    "original": Column("", "value of the original vehicle", "g"),
+    "simulated": Column("", "simulated value", "g"),
+    "changed": Column("", "whether the simulated value differs from the original's"),
+    "meaning": Column("", "what it is", is_shown=False),
+}
+RESULTS = {
+    "result": Column("", "outcome, metric or objective"),
+    "unit": Column("", "its unit"),
+    "original": Column("", "of the original vehicle"),
+    "simulated": Column("", "of the simulated vehicle"),
+}
+POINTS = {
+    "point": Column("", "point of the study's matrix"),
+    "outcome": Column("", "how the simulation ends"),
+    "impact_speed": Column("m/s", "speed of the vehicle at the collision", ".2f"),
+    "relative_impact_speed": Column("m/s", "relative speed of the impact", ".2f", is_shown=False),
+    SAFETY_DEGREE: Column("m", "safety degree; minus the collision's speed in m/s", ".2f"),
+    "gap": Column("m", "least distance between bodies", ".2f", is_shown=False),
+    "test_speed_error": Column("km/h", "deviation from the test speed before the driving system acts", "+.1f"),
+    "warning_ttc": Column("s", "time to collision at the first warning", is_shown=False),
+    "side": Column("", "side of the vehicle that touches", is_shown=False),
+    "place": Column("%", "position of the contact along that side", is_shown=False),
+}
+SPREAD = {
+    "vehicle": Column("", "the simulated vehicle or the original"),
+    "sets": Column("", "parameter sets that fit published data equally well"),
+    "lower": Column("m", "lower end of the 90 % band of the safety degree", ".2f"),
+    "upper": Column("m", "its upper end", ".2f"),
+    "collisions": Column("", "parameter sets with which it collides"),
+}
+
+
+class Target(NamedTuple):
+    """What is simulated: a study, and its name in errors; of a solution also its handle and its row of the results."""
+
+    study: Study
+    source: str
+    handle: SolutionId | None = None
+    row: JsonObject | None = None
+
+    def setting(self, system: System) -> FloatArray:
+        """The solution's setting, or the original."""
+        if self.row is None:
+            return system.characteristics.original
+        return np.array([self.row[name] for name in system.characteristics.names], dtype=float)
+
+
+def simulate(
+    source: str,
+    *,
+    solution: Annotated[str | None, "ALG:RUN:N"] = None,
+    most_severe: bool = False,
+    fewest: bool = False,
+    smallest: bool = False,
+    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
+    no_filter: bool = False,
+    beyond: bool = False,
+    trace: Path | None = None,
+    animate: Path | None = None,
+    gui: bool = False,
+    slower: Annotated[float, Range(0.01, 1000)] = 1.0,
+    spread: bool = False,
+    point: str | None = None,
+    as_it_is_now: bool = False,
+) -> Answer:
+    """Simulate a study once, or a solution of results with the study as recorded there, beside the original vehicle.
+
+    Parameters
+    ----------
+    solution
+        Replay solution N of a run in a results directory; N counts from 0.
+    most_severe
+        Replay the most severe solution.
+    fewest
+        Replay the unsafe solution with the fewest changes.
+    smallest
+        Replay the unsafe solution with the smallest changes.
+    set
+        A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it for others.
+    no_filter
+        Keep changes that are smaller than the filter's thresholds.
+    beyond
+        Also accept values beyond the domains, and settings that violate a constraint.
+    trace
+        Write the simulation step by step to this csv file.
+    animate
+        Animate both simulations, seen from above, in this gif or html file.
+    gui
+        Show both simulations in sumo-gui, each on its own road.
+    slower
+        How many times slower than real time sumo-gui plays.
+    spread
+        Add the vehicle model's own uncertainty: other parameters that fit published data as well.
+    point
+        Only this point of the study's matrix.
+    as_it_is_now
+        If results were computed with other files or versions, simulate with the present ones and say so.
+    """
+    choices = {"most_severe": most_severe, "fewest": fewest, "smallest": smallest}
+    chosen = [name for name, given in choices.items() if given]
+    target = load_target(source, solution, chosen, as_it_is_now)
+    if point is not None:
+        target = target._replace(study=study_at(target.study, point, source="point"))
+    system = assemble(target.study, source)
+    values = read_changes(set, system.characteristics, "set", beyond=beyond)
+    requested = _combine(values, target.setting(system), system)
+    if not beyond and set:
+        system.check_feasible(requested, "set", filtered=not no_filter, switch="--beyond")
+    for path, name, endings in ((trace, "trace", (".csv",)), (animate, "animate", (".gif", ".html"))):
+        if path is not None:
+            check_writable(path, name, endings, but=SOLUTIONS)
+    if any(len(options) > 1 for options in values.values()):
+        if trace or animate or gui or spread:
+            expected = "one value for each characteristic with --trace, --animate, --gui or --spread"
+            raise InputError("set", f"{' '.join(set)} is a sweep", expected)
+        return _sweep(target.study, system, requested, list(values), not no_filter)
+    simulation = simulate_with_original(target.study, system, requested[0], filtered=not no_filter)
+    if target.row and not set and point is None:  # results belong to the whole matrix
+        _warn_of_differences(target, target.row, simulation)
+    if trace is not None:
+        with whole_file(trace, "trace") as file:
+            simulation.trace.to_csv(file, index=False, lineterminator="\n")
+    compare = cache(partial(_compare, target.study, system, simulation.evaluation.settings[0]))
+    if animate is not None:
+        from safevar_sumo.replay import animation
+
+        animation.animate(compare(), animate)
+    if gui:
+        from safevar_sumo.replay.gui import show_in_gui
+
+        show_in_gui(compare(), slower=slower)
+    answer = _answer(target, system, simulation, with_spread=spread)
+    return replace(answer, draw=lambda _: _draw(compare()))
+
+
+def _compare(study: Study, system: System, setting: FloatArray) -> Comparison:
+    from safevar_sumo.replay.comparison import compare_setting
+
+    return compare_setting(study, system, setting)
+
+
+def _draw(comparison: Comparison) -> Figure:
+    from safevar_sumo.replay.figure import draw_comparison
+
+    return draw_comparison(comparison)
+
+
+def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
+    """A setting beside the original: its values, outcome, metrics and objectives, and the points of a matrix."""
+    study, setting = target.study, simulation.evaluation.settings[0]
+    remarks = [*_remarks(system), *_resets(simulation)]
+    tables = {"characteristics": _characteristics(simulation), "results": _results(simulation)}
+    verdict = [simulation.no_verdict, *_verdict(simulation)]
+    if system.rater is not None:
+        command = _rating_command(target, system, simulation)
+        verdict.append(f"{len(system.matrix)} cells and variations: run `{command}`.")
+    elif system.matrix:
+        points = [_point_row(result) for result in simulate_all_points(system, setting[np.newaxis])]
+        tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
+        failing = [row["point"] for row in points if row["impact_speed"] is not None]
+        verdict.append(points_in_words(failing, len(points)))
+    if with_spread:
+        remarks += remarks_on_sets(study)
+        bands = compute_model_spreads(study, np.stack([setting, system.characteristics.original]))
+        rows = [(name, *band) for name, band in zip(("simulated", "original"), bands, strict=True)]
+        tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
+    tables["remarks"] = _remark_table(remarks)
+    handle = {} if target.handle is None else {"solution": str(target.handle)}
+    return Answer(
+        question="simulate",
+        study=study,
+        verdict=" ".join(filter(None, verdict)),
+        numbers={"driven": not simulation.no_verdict, **handle, **_numbers(simulation)},
+        tables=tables,
+    )
+
+
+def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_now: bool) -> Target:
+    """The study by name or path, or that of a results directory, with the solution that is named or chosen.
+
+    Raises
+    ------
+    InputError
+        If there is no such study, directory or solution, or two options choose one.
+    """
+    wanted = [*chosen, *([] if solution is None else [f"solution {solution}"])]
+    if len(wanted) > 1:
+        raise InputError("solution", f"{' and '.join(wanted)} both choose a solution", "one of them")
+    subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=bool(wanted))
+    if not isinstance(subject, Study) and subject.shortfall:
+        warn(subject.shortfall)
+    if isinstance(subject, Study) or not wanted:
+        return Target(study_in(subject), source)
+    subject.require_solutions()
+    handle = (
+        choose_handle(subject.solutions, subject.unsafe, chosen[0], source)
+        if chosen
+        else SolutionId.parse(str(solution))
+    )
+    row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
+    return Target(subject.study, source, handle, {str(name): value for name, value in row.items()})
+
+
+def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -> FloatArray:
+    """M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in turn."""
+    combinations = list(product(*values.values()))
+    settings = np.tile(base, (len(combinations), 1))
+    settings[:, [system.characteristics.names.index(name) for name in values]] = combinations
+    return settings
+
+
+def _warn_of_differences(target: Target, row: JsonObject, simulation: Simulation) -> None:
+    from safevar_sumo.replay.comparison import list_differences, why_different
+
+    why = why_different(is_imported="run" not in row)
+    for difference in list_differences(simulation.evaluation, row):
+        warn(f"{target.handle} of {target.source}: {difference}; {why}")
+
+
+def _sweep(study: Study, system: System, requested: FloatArray, names: list[str], filtered: bool) -> Answer:
+    """A row for each setting of a sweep."""
+    characteristics = system.characteristics
+    settings = characteristics.filter(requested) if filtered else requested
+    evaluations = evaluate_settings(study, np.concatenate([characteristics.original[np.newaxis], settings]))
+    contact, no_verdict = contact_degree(system), why_no_verdict(system)
+    frame = pd.DataFrame(settings, columns=list(characteristics.names))[names]
+    columns = {item.name: Column(item.unit, "value", "g") for item in characteristics if item.name in names}
+    columns["outcome"] = Column("", "how the simulation ends")
+    metrics = {metric.name: metric for metric in system.measuring.scoring.metrics}
+    for name in evaluations.metrics:
+        columns[name] = Column(metrics[name].unit, metrics[name].title, ".3f") if name in metrics else Column("", name)
+    columns["gap"] = Column("m", "least distance between bodies", ".3f", is_shown=bool(contact))
+    values = {"outcome": evaluations.outcome, **evaluations.metrics, "gap": evaluations.gaps(contact)}
+    frame = frame.assign(**{name: column[1:] for name, column in values.items()})
+    collisions, resets = int(evaluations.collided[1:].sum()), np.count_nonzero((settings != requested).any(axis=1))
+    remarks = [*_remarks(system), degree_note(contact)]
+    if resets:
+        remarks.append(f"In {resets} of {len(frame)} settings the filter reset small changes; --no-filter keeps them.")
+    original = f"The original vehicle: {evaluations.outcome[0]}, safety degree {evaluations.f_safe[0]:.2f}."
+    return Answer(
+        question="simulate",
+        study=study,
+        verdict=f"{no_verdict} {collisions} of {number_of(len(frame), 'setting')} collide. {original}".strip(),
+        numbers={"driven": not no_verdict, "settings": len(frame), "collisions": collisions},
+        tables={"sweep": tabulate(study.title, columns, frame), "remarks": _remark_table(remarks)},
+    )
+
+
+def _remark_table(remarks: list[str]) -> pd.DataFrame:
+    return tabulate("Remarks", REMARKS, [(remark,) for remark in dict.fromkeys(remarks)])
+
+
+def _numbers(simulation: Simulation) -> JsonObject:
+    return {**record(simulation.evaluation, row=0), "gap": simulation.gap}
+
+
+def _characteristics(simulation: Simulation) -> pd.DataFrame:
+    def row(item: Characteristic) -> tuple[Any, ...]:
+        value = simulation.setting[item.name]
+        return item.name, item.unit, item.original, value, value != item.original, item.words
+
+    rows = map(row, CharacteristicSet.of(simulation.study))
+    return tabulate(simulation.study.title, CHARACTERISTICS, rows)
+
+
+def _results(simulation: Simulation) -> pd.DataFrame:
+    original, simulated = _numbers(simulation.original), _numbers(simulation)
+    names = {"outcome": "", **simulation.units}
+    return tabulate("Results", RESULTS, [(name, unit, original[name], simulated[name]) for name, unit in names.items()])
+
+
+def _point_row(result: PointResult) -> JsonObject:
+    row = point_record(result)
+    return {**row, **row.get("contact", {})}
+
+
+def _verdict(simulation: Simulation) -> list[str]:
+    """How the original vehicle and, if it differs, the simulated one end."""
+    original = f"The original vehicle {simulation.original.verdict}."
+    if simulation.setting == simulation.original.setting:
+        return [original]
+    return [original, f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}."]
+
+
+def _safety_comparison(simulation: Simulation) -> str:
+    degree, original = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
+    if np.isnan(degree) or np.isnan(original):
+        return "whether that is less safe cannot be decided"
+    if degree == original:
+        return "as safe as the original"
+    gaps = "" if simulation.gap == degree else f", gap {simulation.gap:.2f} against {simulation.original.gap:.2f} m"
+    change = "less safe" if degree < original else "safer"
+    return f"{change} than the original, SD {degree:.2f} against {original:.2f}{gaps if degree > 0 else ''}"
+
+
+def _remarks(system: System) -> list[str]:
+    remarks = [remark for point in system.points for remark in point.scenario.remarks()]
+    types = pre_crash_sentence(system.points)
+    return [*remarks, *system.remarks, *vehicle_remarks(system), *([types] if types else [])]
+
+
+def _resets(simulation: Simulation) -> list[str]:
+    return [
+        f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
+        f"{simulation.setting[name]:g}; --no-filter keeps it."
+        for name, value in simulation.reset_values.items()
+    ]
+
+
+def _rating_command(target: Target, system: System, simulation: Simulation) -> str:
+    """The command that rates the simulated vehicle: a solution, and the values that differ from it or from the
+    original.
+    """
+    base = target.setting(system).tolist()
+    pairs = zip(system.characteristics.names, base, strict=True)
+    changes = [f"{name}={simulation.setting[name]!r}" for name, value in pairs if simulation.setting[name] != value]
+    solution = None if target.handle is None else str(target.handle)
+    return find_question("rating").command_line([target.source], None, {"set": tuple(changes), "solution": solution})
