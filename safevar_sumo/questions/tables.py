@@ -184,7 +184,13 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     """The table; columns that do not fit stand in further tables, in which the first columns of text are repeated, and
     long texts in lines of their own.
     """
-    columns = [column for column in reader_columns(frame) if not column.is_long]
+    columns, long = list[_ReaderColumn](), list[_ReaderColumn]()
+    for column in reader_columns(frame):
+        (long if column.is_long else columns).append(column)
+    if long and len(columns) < 2:  # lines say it all
+        yield frame.attrs.get("title", "")
+        yield from (": ".join(texts) for texts in zip(*(column.texts for column in (*columns, *long)), strict=True))
+        return
     labels = list(takewhile(lambda column: not column.is_number, columns))
     blocks = [[*labels]]
     for column in columns[len(labels) :]:
@@ -198,9 +204,8 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         for cells in zip(*(column.texts for column in block), strict=True):
             table.add_row(*cells)
         yield table
-    for column in reader_columns(frame):
-        if column.is_long:
-            yield from (f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True))
+    for column in long:
+        yield from (f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True))
 
 
 def _least_width(column: _ReaderColumn) -> int:

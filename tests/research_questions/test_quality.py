@@ -275,5 +275,5 @@ def test_readers_see_a_long_table_crosswise_and_every_table_within_80_columns() 
     text = answer_questions(CASES["two"]).only("rq3.2").render("text")
     assert re.search(r"setting +┃ *characteristic +┃ *1 ┃ *2 ┃ *3 ┃ *any ", text)
     assert re.search(r"made-up +│ *mass +│", text)
-    for line in answer_questions(CASES["two"]).render("text").splitlines()[1:]:
-        assert len(line) <= 80
+    lines = answer_questions(CASES["two"]).render("text").splitlines()
+    assert max(len(line) for line in lines if line[0] in "┏┃┡│└") == 80
