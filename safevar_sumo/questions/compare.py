@@ -24,7 +24,7 @@ from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
 from safevar_sumo.questions.repair.price import benign_scenes, needless_braking
-from safevar_sumo.questions.research_questions.statistics import ALPHA, FEWEST_RUNS, compare_samples, signed_rank_test
+from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples, fewest_runs, signed_rank_test
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.words import number_of
@@ -301,7 +301,7 @@ def _test(frame: pd.DataFrame) -> tuple[float, float, str]:
     pairs, unit = frame[frame["source"] == SAMPLE][[*SIDES]], "setting"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
-        if len(means) >= FEWEST_RUNS["RQ1"]:
+        if len(means) >= fewest_runs("RQ1"):
             pairs, unit = means, "run"
     p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
     return p, a12, number_of(len(pairs), unit)

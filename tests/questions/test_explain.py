@@ -15,7 +15,7 @@ from hypothesis import given, strategies as st
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import across_fits, explain
 from safevar_sumo.questions.explain.across_fits import are_causes, ranges_across_fits
@@ -23,6 +23,7 @@ from safevar_sumo.questions.explain.causes import (
     RESOLUTION,
     BoundaryState,
     Limits,
+    causes_of_runs,
     count_distinct_causes,
     count_needed,
     find_limits,
@@ -144,6 +145,25 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     assert found == smallest
     for columns_of_cause in found:
         assert not any(subset < columns_of_cause for subset in unsafe)
+
+
+def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once() -> None:
+    """`a` above 9 or `b` below 2 collides; the failures with the fewest changes come first, equal ones count once."""
+    evaluator = made_up_evaluator(3, lambda settings: (settings[:, 0] > 9) | (settings[:, 1] < 2))
+    names = list(evaluator.characteristics.names)
+    settings = [(9.5, 5.0, 5.0), (9.5, 5.0, 5.0), (9.9, 1.0, 5.0), (9.6, 5.0, 9.0), (8.0, 4.0, 9.0)]
+    rows = [
+        {**dict(zip(names, setting, strict=True)), "algorithm": name, "run": run, "f_diff": 0.0}
+        | {"f_num_diff": sum(value != 5.0 for value in setting), "f_safe": 1.0, "safety_degree": 1.0}
+        | {"outcome": "collision" if setting[0] > 9 or setting[1] < 2 else "stopped"}
+        for name, run, numbers in (("rs", 0, range(5)), ("nsga2", 1, (4,)))
+        for setting in (settings[i] for i in numbers)
+    ]
+    finished = [("rs", 0), ("nsga2", 1), ("nsga2", 0)]
+    case = build_case(evaluator.study, {"safety_degree": 2.0}, pd.DataFrame(rows), pd.DataFrame(rows), finished, True)
+    counts = [causes_of_runs(case, evaluator, limit).iloc[:, 1:].to_numpy().tolist() for limit in (1, 9)]
+    assert counts[0] == [["rs", 0, 3, 1, 1], ["nsga2", 1, 0, 0, 0], ["nsga2", 0, 0, 0, 0]]
+    assert counts[1][0] == ["rs", 0, 3, 3, 2], "a up, b down"
 
 
 def limits(evaluator: Evaluator, *setting: float) -> Limits:

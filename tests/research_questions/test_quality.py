@@ -32,8 +32,12 @@ from safevar_sumo.questions.research_questions.statistics import (
     EXACT_TEST,
     compare_samples,
     correct_by_holm,
+    effect_interval,
+    log_rank_test,
     magnitude_of,
+    median_interval,
     signed_rank_test,
+    survival_median,
 )
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.test_questions import made_up, made_up_study, row, three_algorithms
@@ -147,6 +151,74 @@ def test_holms_correction_of_a_worked_example() -> None:
     assert corrected == pytest.approx([0.03, math.nan, 0.06, 0.06, 0.02], nan_ok=True)
 
 
+@pytest.mark.parametrize("count", [0, 3, 10])
+def test_the_interval_against_one_value_is_wilsons_of_a_share(count: int) -> None:
+    expected = scipy.stats.binomtest(count, 10).proportion_ci(0.95, "wilson")
+    assert effect_interval(count / 10, 10, None, 0.05) == pytest.approx(tuple(expected), abs=1e-9)
+
+
+@pytest.mark.parametrize(("shift", "draw"), [(1.0, "normal"), (2.0, "normal"), (0.5, "exponential")])
+def test_the_interval_of_an_effect_covers_it(shift: float, draw: str) -> None:
+    """X is shifted by `shift`, so that P(X > Y) is Phi(shift / sqrt 2) of normal values, 1 - exp(-shift) / 2 of
+    exponential ones.
+    """
+    rng, repeats = np.random.default_rng(1), 1000
+    effect = scipy.stats.norm.cdf(shift / math.sqrt(2)) if draw == "normal" else 1 - math.exp(-shift) / 2
+    covered = 0
+    for _ in range(repeats):
+        x, y = getattr(rng, draw)(size=10) + shift, getattr(rng, draw)(size=15)
+        low, high = effect_interval((x[:, np.newaxis] > y).mean(), 10, 15, 0.05)
+        covered += low <= effect <= high
+    assert 0.93 < covered / repeats < 0.98
+
+
+def test_the_interval_of_samples_apart_has_a_width() -> None:
+    low, high = effect_interval(1.0, 10, 10, 0.05)
+    q1, q2 = low / (2 - low), 2 * low**2 / (1 + low)  # Hanley and McNeil's (1982), for exponential values
+    variance = (low * (1 - low) + 9 * (q1 - low**2) + 9 * (q2 - low**2)) / 100
+    assert (1 - low) / math.sqrt(variance) == pytest.approx(scipy.stats.norm.ppf(0.975))
+    assert high == 1
+    assert effect_interval(0.0, 10, 10, 0.05) == pytest.approx((0, 1 - low))
+
+
+@pytest.mark.parametrize(("size", "alpha", "rank"), [(10, 0.05, 2), (30, 0.05, 10), (8, 0.01, 1), (12, 0.01, 2)])
+def test_the_interval_of_a_median_lies_between_the_order_statistics_of_the_sign_test(
+    size: int, alpha: float, rank: int
+) -> None:
+    """The ranks of tables of the sign test; the next ones would leave too much outside."""
+    low, high = median_interval(np.random.default_rng(1).permutation(size) + 1, alpha)
+    assert (low, high) == (rank, size + 1 - rank)
+    outside = [2 * sum(math.comb(size, i) for i in range(number)) / 2**size for number in (rank, rank + 1)]
+    assert outside[0] <= alpha < outside[1]
+
+
+def test_too_few_values_have_no_interval_of_the_median() -> None:
+    assert np.isnan(median_interval(range(7), 0.01)).all()
+    assert np.isnan(median_interval([], 0.01)).all()
+
+
+PLACEBO = [1, 1, 2, 2, 3, 4, 4, 5, 5, 8, 8, 8, 8, 11, 11, 12, 12, 15, 17, 22, 23]
+TREATED = [6, 6, 6, 7, 10, 13, 16, 22, 23, *(6, 9, 10, 11, 17, 19, 20, 25, 32, 32, 34, 35)]
+"""Weeks of remission of leukaemia (Freireich et al. 1963), the censored ones of the treated last."""
+RELAPSED = [True] * 9 + [False] * 12
+
+
+def test_survival_of_the_textbook_example() -> None:
+    """Medians 8 (95 % interval 4 to 11) and 23 (13 to none) weeks, a log-rank chi-squared of 16.79."""
+    all_relapsed = [True] * len(PLACEBO)
+    assert survival_median(PLACEBO, all_relapsed, 0.05) == (8, (4, 11))
+    median, (low, high) = survival_median(TREATED, RELAPSED, 0.05)
+    assert (median, low) == (23, 13)
+    assert math.isnan(high)
+    p_value = log_rank_test((PLACEBO, all_relapsed), (TREATED, RELAPSED))
+    assert scipy.stats.chi2.isf(p_value, 1) == pytest.approx(16.79, abs=0.005)
+
+
+def test_without_an_event_there_is_no_median_and_no_test() -> None:
+    none = ([100, 100], [False, False])
+    assert np.isnan([survival_median(*none)[0], log_rank_test(none, none)]).all()
+
+
 def rich_case(**changes: Any) -> Case:
     """Two algorithms, two runs, changes of one to three characteristics, collisions; every run has evaluations."""
     values = [(1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)]
@@ -219,9 +291,15 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
         ),
         (
             "rq1-runs",
-            "setting algorithm metric p_value p_holm effect_size magnitude runs method mean original enough_runs",
+            "setting algorithm metric p_value p_holm effect_size effect_size_low effect_size_high magnitude runs "
+            "method mean original enough_runs",
         ),
-        ("rq2-runs", "setting baseline metric p_value p_holm effect_size magnitude n1 n2 method algorithm enough_runs"),
+        (
+            "rq2-runs",
+            "setting baseline metric p_value p_holm effect_size effect_size_low effect_size_high magnitude n1 n2 "
+            "method algorithm enough_runs",
+        ),
+        ("medians", "setting algorithm metric runs median median_low median_high"),
         ("evaluations", "setting algorithm run requested simulated budget"),
         ("rq3.1", "setting run j count"),
         ("rq3.2", "setting characteristic j percent rank"),

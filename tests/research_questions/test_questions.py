@@ -28,7 +28,15 @@ from safevar_sumo.questions.research_questions.changes import (
     rq33,
     rq33_safety,
 )
-from safevar_sumo.questions.research_questions.comparisons import rq1, rq1_runs, rq2, rq2_runs
+from safevar_sumo.questions.research_questions.comparisons import (
+    Choices,
+    first_collisions,
+    median_runs,
+    rq1,
+    rq1_runs,
+    rq2,
+    rq2_runs,
+)
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
@@ -164,7 +172,7 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
     case = three_algorithms()
     means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
     for asked, first, others in (("", "nsga2", ["rs", "safe_fuzzer"]), ("safe_fuzzer", "safe_fuzzer", ["nsga2", "rs"])):
-        frame = rq2_runs(case, asked)
+        frame = rq2_runs(case, Choices(asked))
         assert (set(frame["algorithm"]), list(frame["baseline"].unique())) == ({first}, others)
         expected = compare_samples(means[first], means["rs"])
         chosen = only(frame, metric="safety_degree", baseline="rs")
@@ -176,7 +184,7 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
     assert set(zip(table["algorithm"], table["baseline"], strict=True)) == {("rs", "mine")}
     assert only(table, metric="safety_degree")["effect_size"] == 1
     assert re.search(r"RS +│My search", answer.render("text"))
-    asked = answer_questions([without], "nsga2").only("rq2")
+    asked = answer_questions([without], Choices("nsga2")).only("rq2")
     assert asked.tables["rq2"].empty
     assert "no finished run of nsga2" in " ".join(asked.tables["remarks"]["remark"])
 
@@ -233,6 +241,55 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     original = only(rq1_runs(case), algorithm="nsga2", metric="safety_degree")
     assert original["p_value"] == 2 * 2 / 2**8, "all signed ranks but the smallest are negative"
     assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)
+
+
+def test_runs_without_a_collision_have_needed_more_evaluations_than_they_requested() -> None:
+    """Two of three runs of one algorithm collide, in their third and tenth evaluation, and none of the other."""
+    seen = [
+        {**row(name, run, sd=-1.0 if name == "nsga2" and i == (2, 9, None)[run] else 1.0), "evaluation": i}
+        for name in ("nsga2", "rs")
+        for run in range(3)
+        for i in range(100)
+    ]
+    case = made_up(*(row(name, run) for name in ("nsga2", "rs") for run in range(3)), evaluations=seen)
+    ours, theirs = first_collisions(case, Choices(alpha=0.05)).to_dict("records")
+    assert (ours["runs"], ours["collided"], ours["median"]) == (3, 2, 10)
+    assert (theirs["runs"], theirs["collided"], math.isnan(theirs["median"])) == (3, 0, True)
+    assert math.isnan(ours["p_value"])
+    # At the collisions 3 of 6 and 2 of 5 runs at risk are of the algorithm.
+    chi_squared = (2 - (3 / 6 + 2 / 5)) ** 2 / (3 * 3 / 6**2 + 2 * 3 / 5**2)
+    assert theirs["p_value"] == theirs["p_holm"] == pytest.approx(scipy.stats.chi2.sf(chi_squared, 1))
+
+
+def test_a_reader_chooses_the_level_of_significance() -> None:
+    case = three_algorithms()
+    strict, loose = (rq2_runs(case, Choices(alpha=alpha)) for alpha in (1e-9, 0.3))
+    assert not strict["significant"].any()
+    assert not strict["enough_runs"].any(), "12 runs cannot reach such a level"
+    assert loose["significant"].any()
+    widths = [frame["effect_size_high"] - frame["effect_size_low"] for frame in (strict, loose)]
+    assert (widths[0] > widths[1]).all()
+    medians = median_runs(case, Choices(alpha=0.05))
+    means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()["rs"].sort_values()
+    median = only(medians, algorithm="rs", metric="safety_degree")
+    assert (median["median"], median["median_low"], median["median_high"]) == (
+        means.median(),
+        *means.iloc[[2, 9]],  # the third and the tenth of twelve
+    )
+
+
+def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
+    case = three_algorithms()
+    counts = [
+        (case.name, name, run, 9, 5, 7 if name == "nsga2" else run % 3) for name in case.algorithms for run in range(8)
+    ]
+    frame = pd.DataFrame(counts, columns=["setting", "algorithm", "run", "failures", "examined", "causes"])
+    choices = Choices(causes={case.name: frame})
+    found = only(rq2_runs(case, choices), metric="causes", baseline="rs")
+    assert (found["effect_size"], found["n1"], found["significant"]) == (1, 8, True)
+    assert "causes" not in [*rq2_runs(case)["metric"]]
+    assert answer_questions([case], choices).tables["causes"]["causes"].tolist() == [row[-1] for row in counts]
+    assert "causes" not in answer_questions([case]).tables
 
 
 HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)

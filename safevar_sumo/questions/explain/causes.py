@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
@@ -145,6 +146,32 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
+
+
+def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame:
+    """How many distinct minimal causes each finished run found, in at most `limit` of its unsafe solutions: those with
+    the fewest, then the smallest changes.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns setting, algorithm, run, failures (different unsafe solutions), examined, causes.
+    """
+    names, keys = list(evaluator.characteristics.names), ["algorithm", "run"]
+    failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
+    failures = failures.sort_values([F_NUM_DIFF.name, F_DIFF.name], kind="stable")
+    examined = failures.groupby(keys).head(limit)
+    causes = find_minimal_causes(evaluator, examined[names].to_numpy(dtype=float), case.unsafe)
+    by_run: dict[tuple[str, int], set[tuple[str, ...]]] = {run: set() for run in case.finished_runs}
+    kinds = [{directions(evaluator.characteristics, one.changes) for one in group} for group in causes]
+    for run, group in zip(examined[keys].itertuples(index=False, name=None), kinds, strict=True):
+        by_run[run].update(group)
+    counts = [frame.groupby(keys).size().to_dict() for frame in (failures, examined)]
+    rows = [
+        (case.name, *run, *(count.get(run, 0) for count in counts), len(kinds_of_run))
+        for run, kinds_of_run in by_run.items()
+    ]
+    return pd.DataFrame(rows, columns=["setting", *keys, "failures", "examined", "causes"])
 
 
 LINE_SETTINGS = 32

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import pandas as pd
 
 from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.ask import Jobs, Range, Share
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, load_cases, solutions_for_metric
 from safevar_sumo.questions.research_questions import changes
-from safevar_sumo.questions.research_questions.comparisons import titles_of
+from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choices, titles_of
 from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
-from safevar_sumo.questions.research_questions.statistics import FEWEST_RUNS
-from safevar_sumo.questions.research_questions.tables import RQ2_TABLES, TABLES, WEATHER
+from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
+from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, TABLES, WEATHER
+from safevar_sumo.study import label_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,18 +28,32 @@ if TYPE_CHECKING:
 REMARKS = {"table": Column("", "table"), "remark": Column("", "what is missing or left out there, and why")}
 
 
-def tables(*results: Results | str | Path, algorithm: str = "", figures: Path | None = None) -> Answer:
+def tables(
+    *results: Results | str | Path,
+    algorithm: str = "",
+    alpha: Share = ALPHA,
+    causes: Annotated[int, Range(0, 100_000)] = 0,
+    figures: Path | None = None,
+    jobs: Jobs = None,
+) -> Answer:
     """Answer the research questions of the paper from results, one for each case, as tables and figures.
 
     Parameters
     ----------
     algorithm
         The algorithm that RQ2 compares with all others; by default NSGA-II or, without it, the study's first.
+    alpha
+        A p-value below it is significant, and intervals have the confidence 1 - alpha.
+    causes
+        Simulate the minimal causes of up to this many unsafe solutions of each run, and compare their numbers.
     figures
         Draw every figure into this directory, as png and pdf.
+    jobs
+        Number of worker processes that simulate causes, by default one for each core.
     """
     cases = _cases_of(results)
-    answer = answer_questions(cases, algorithm)
+    counted = {case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs}
+    answer = answer_questions(cases, Choices(label_of(algorithm), alpha, counted))
     if figures is not None:
         save_figures(cases, figures)
     return answer
@@ -59,7 +75,16 @@ def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
     return load_cases([source if isinstance(source, str | Path) else source.directory for source in results])
 
 
-def answer_questions(cases: Sequence[Case], algorithm: str = "") -> Answer:
+def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
+    """The minimal causes of a case's runs, which are simulated."""
+    from safevar_sumo.questions.evaluator import open_evaluator
+    from safevar_sumo.questions.explain.causes import causes_of_runs
+
+    with open_evaluator(case.study, jobs=jobs) as evaluator:
+        return causes_of_runs(case, evaluator, limit)
+
+
+def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT) -> Answer:
     """Every table of the cases; a table that no case answers has no row, and a remark says why.
 
     Raises
@@ -71,16 +96,18 @@ def answer_questions(cases: Sequence[Case], algorithm: str = "") -> Answer:
     frames: dict[str, pd.DataFrame] = {}
     remarks, errors = list[tuple[str, str]](), list[UnanswerableError]()
     for name, (title, compute, columns, wide) in TABLES.items():
+        if name == CAUSES and not choices.causes:
+            continue
         parts = list[pd.DataFrame]()
         for group in [cases] if name == WEATHER else [[case] for case in cases]:
             try:
-                part = compute(*group, *([algorithm] if name in RQ2_TABLES else []))
+                part = compute(*group, *([choices] if name in CHOSEN else []))
             except UnanswerableError as error:
                 errors.append(error)
                 remarks.append((name, f"{error.source}: {error.problem}."))
             else:
                 parts.append(part)
-                remarks += [(name, note) for case in group for note in _remarks(name, case, part)]
+                remarks += [(name, note) for case in group for note in _remarks(name, case, part, choices.alpha)]
         shown = {
             key: column._replace(is_shown=len(cases) > 1) if key == "setting" else column
             for key, column in columns.items()
@@ -96,7 +123,7 @@ def answer_questions(cases: Sequence[Case], algorithm: str = "") -> Answer:
         question="tables",
         study=cases[0].study,
         verdict=" ".join(map(_verdict, cases)),
-        numbers={"cases": len(cases), "solutions": sum(len(case.solutions) for case in cases)},
+        numbers={"cases": len(cases), "solutions": sum(len(case.solutions) for case in cases), "alpha": choices.alpha},
         tables=frames,
         draw=lambda answer: draw_change_counts(cases),
     )
@@ -126,14 +153,14 @@ def describe_evaluations(case: Case) -> str:
     return f"settings that a run simulates, mean: {'; '.join(texts)}."
 
 
-def _remarks(table: str, case: Case, frame: pd.DataFrame) -> Iterator[str]:
+def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
     """What a case's frame leaves out."""
     prefix, rq = f"{case.name}: ", table.split("-")[0].upper()
     if table in ("rq1", "rq2"):
         few = frame.loc[~frame["enough_runs"], "algorithm" if table == "rq1" else "baseline"].unique()
         if names := ", ".join(map(case.title_of, few)):
             yield (
-                f"{prefix}too few runs of {names} for a test ({FEWEST_RUNS[rq]} are needed): "
+                f"{prefix}too few runs of {names} for a test ({fewest_runs(rq, alpha)} are needed): "
                 "no p-value of pooled solutions is significant."
             )
         for metric in case.scoring.metrics:
@@ -153,7 +180,7 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame) -> Iterator[str]:
     if table in ("rq1-runs", "rq2-runs"):
         tests = frame.dropna(subset="effect_size")
         if few_count := len(tests) - tests["enough_runs"].sum():
-            how_many = "all" if few_count == len(tests) else f"{few_count} of the"
-            yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({FEWEST_RUNS[rq]} are needed)."
+            how_many, needed = "all" if few_count == len(tests) else f"{few_count} of the", fewest_runs(rq, alpha)
+            yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({needed} are needed)."
     if table == "combinations" and frame.empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."

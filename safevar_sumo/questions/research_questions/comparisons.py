@@ -14,12 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from itertools import product
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import MetricFacts
-from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, solutions_for_metric
 from safevar_sumo.questions.research_questions.fronts import (
     INDICATOR_TITLES,
     MORE_IS_BETTER,
@@ -28,27 +30,46 @@ from safevar_sumo.questions.research_questions.fronts import (
 )
 from safevar_sumo.questions.research_questions.statistics import (
     ALPHA,
-    FEWEST_RUNS,
     compare_samples,
     correct_by_holm,
+    effect_interval,
+    fewest_runs,
+    log_rank_test,
+    median_interval,
     signed_rank_test,
+    survival_median,
 )
 from safevar_sumo.records import JsonObject
 
+CAUSES = "causes"
+INTERVAL_OF_MEDIAN = ["median", "median_low", "median_high"]
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
 
 
-def rq1(case: Case) -> pd.DataFrame:
+class Choices(NamedTuple):
+    """What a reader chooses: the algorithm that is compared with all others, the level of significance, and, by a
+    case's name, the minimal causes of its runs, if they were counted: columns setting, algorithm, run, causes.
+    """
+
+    algorithm: str = ""
+    alpha: float = ALPHA
+    causes: Mapping[str, pd.DataFrame] = MappingProxyType({})
+
+
+DEFAULT = Choices()
+
+
+def rq1(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated once for each solution, metric by metric.
 
     `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are more unsafe; `mean` is
     the mean over the algorithm's solutions, `original` the original vehicle's value.
     """
-    return _with_significance(pd.DataFrame(_test_original(case)))
+    return _with_significance(pd.DataFrame(_test_original(case, choices)), choices)
 
 
-def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
+def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """One algorithm, as `opponents_of` chooses it, against every other: its runs' indicators, then its pooled
     solutions' metrics.
 
@@ -57,52 +78,108 @@ def rq2(case: Case, algorithm: str = "") -> pd.DataFrame:
     mean numbers of settings that a run simulated. Indicators and evaluations of imported solutions, which belong to no
     run, are undefined.
     """
-    frame = pd.DataFrame(_test_opponents(case, algorithm))
+    frame = pd.DataFrame(_test_opponents(case, choices))
     simulated = pd.Series(dtype=float)
     if case.has_runs and len(case.evaluations):
         simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
     sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
     evaluations = {name: frame[side].map(simulated).astype(float) for name, side in sides.items()}
-    return _with_significance(frame.assign(**evaluations))
+    return _with_significance(frame.assign(**evaluations), choices)
 
 
-def rq1_runs(case: Case) -> pd.DataFrame:
+def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
     `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal ones
     (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is
     `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
     """
-    tests = compare_over_runs(case)
+    tests = compare_over_runs(case, choices)
     return tests[tests.index == "RQ1"]
 
 
-def rq2_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
-    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, and metrics' means
-    over solutions.
+def rq2_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, metrics' means
+    over solutions and, if they were counted, distinct minimal causes.
 
     `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
     """
-    tests = compare_over_runs(case, algorithm)
-    opponents_of(case, algorithm)  # raises if RQ2 has no answer
+    tests = compare_over_runs(case, choices)
+    opponents_of(case, choices.algorithm)  # raises if RQ2 has no answer
     return tests[tests.index == "RQ2"]
 
 
-def compare_over_runs(case: Case, algorithm: str = "") -> pd.DataFrame:
+def compare_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2."""
-    rows = {"RQ1": _test_original(case, over_runs=True)}
+    rows = {"RQ1": _test_original(case, choices, over_runs=True)}
     if len(case.algorithms) > 1:
-        rows["RQ2"] = _test_opponents(case, algorithm, over_runs=True)
+        rows["RQ2"] = _test_opponents(case, choices, over_runs=True)
     tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
-    return _with_significance(tests.assign(p_holm=correct_by_holm(tests["p_value"])))
+    return _with_significance(tests.assign(p_holm=correct_by_holm(tests["p_value"])), choices)
 
 
-def _with_significance(tests: pd.DataFrame) -> pd.DataFrame:
+def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
     """Tests with the column `significant`: where p-values are corrected, the corrected one counts; where solutions of
-    runs are pooled, there have to be enough runs for a test.
+    runs are pooled, there have to be enough runs for a test. Over runs, effects have intervals.
     """
-    is_significant = tests["p_holm"] < ALPHA if "p_holm" in tests else (tests["p_value"] < ALPHA) & tests["enough_runs"]
-    return tests.assign(significant=is_significant)
+    if "p_holm" not in tests:
+        return tests.assign(significant=(tests["p_value"] < choices.alpha) & tests["enough_runs"])
+    sizes = tests["n2"].where(tests.index == "RQ2")
+    ends = [
+        effect_interval(effect, m, None if np.isnan(n) else n, choices.alpha)
+        for effect, m, n in zip(tests["effect_size"], tests["n1"], sizes, strict=True)
+    ]
+    low, high = zip(*ends, strict=True)
+    return tests.assign(significant=tests["p_holm"] < choices.alpha, effect_size_low=low, effect_size_high=high)
+
+
+def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+    """The median over the runs of each algorithm, of every indicator and metric; columns setting, algorithm, metric,
+    runs, median, median_low, median_high.
+    """
+    case.require_solutions()
+    samples = _samples(case, choices, over_runs=True)
+    rows = [
+        (case.name, algorithm, metric, len(values), values.median(), *median_interval(values, choices.alpha))
+        for (algorithm, metric), values in samples.items()
+    ]
+    return pd.DataFrame(rows, columns=["setting", "algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN])
+
+
+def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+    """How many evaluations a run needs to find a collision; a run without any has needed more than it requested.
+
+    Columns setting, algorithm, runs, collided (runs with a collision), median with its interval, and against the
+    algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the other algorithms.
+    """
+    ends = count_evaluations(case).set_index(["algorithm", "run"])["requested"]
+    collisions = case.evaluations[are_collisions(case.evaluations)]
+    first = collisions.groupby(["algorithm", "run"])["evaluation"].min().reindex(ends.index) + 1
+    runs = pd.DataFrame({"time": first.fillna(ends), "found": first.notna()}).groupby(level="algorithm", sort=False)
+    samples = {str(name): (rows["time"].to_numpy(), rows["found"].to_numpy()) for name, rows in runs}
+    reference = choices.algorithm or (NSGA2 if NSGA2 in samples else next(iter(samples)))
+    rows = []
+    for algorithm, (times, found) in samples.items():
+        median, interval = survival_median(times, found, choices.alpha)
+        is_other = algorithm != reference and reference in samples
+        p_value = log_rank_test((times, found), samples[reference]) if is_other else math.nan
+        rows.append((case.name, algorithm, len(times), int(found.sum()), median, *interval, p_value))
+    names = ["setting", "algorithm", "runs", "collided", *INTERVAL_OF_MEDIAN, "p_value"]
+    frame = pd.DataFrame(rows, columns=names)
+    return frame.assign(p_holm=correct_by_holm(frame["p_value"]))
+
+
+def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
+    """Distinct minimal causes that the runs found, as they were counted.
+
+    Raises
+    ------
+    UnanswerableError
+        If they were not counted.
+    """
+    if case.name not in choices.causes:
+        raise UnanswerableError(case.name, "minimal causes are simulated only if they are asked for", "causes")
+    return choices.causes[case.name]
 
 
 def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
@@ -124,10 +201,10 @@ def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
     return first, others
 
 
-def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
+def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
     """A row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
-    rows = []
+    rows, fewest = [], fewest_runs("RQ1", choices.alpha)
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values, original = _values(case, algorithm, metric, over_runs), case.original[metric.name]
         if over_runs:
@@ -138,21 +215,25 @@ def _test_original(case: Case, *, over_runs: bool = False) -> list[JsonObject]:
             test = test.reversed()
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": runs}
-        row |= {"mean": values.mean(), "original": original, "enough_runs": runs >= FEWEST_RUNS["RQ1"]}
+        row |= {"mean": values.mean(), "original": original, "enough_runs": runs >= fewest}
         rows.append({**row, **test._asdict()})
     return rows
 
 
-def _test_opponents(case: Case, algorithm: str, *, over_runs: bool = False) -> list[JsonObject]:
+def _test_opponents(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
     """A row for each baseline and metric."""
-    (first, others), samples, rows = opponents_of(case, algorithm), _samples(case, over_runs), []
-    for baseline, (metric, more_is_better) in product(others, _directions(case).items()):
+    (first, others), samples = opponents_of(case, choices.algorithm), _samples(case, choices, over_runs)
+    directions = {
+        name: more for name, more in _directions(case).items() if name != CAUSES or (first, CAUSES) in samples
+    }
+    rows, fewest = [], fewest_runs("RQ2", choices.alpha)
+    for baseline, (metric, more_is_better) in product(others, directions.items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
         if not more_is_better:  # so that above 0.5 the first algorithm is better
             test = test.reversed()
         runs = min((test.n1, test.n2) if over_runs else (_finished_runs(case, name) for name in (first, baseline)))
         row = {"setting": case.name, "algorithm": first, "baseline": baseline, "metric": metric}
-        rows.append({**row, **test._asdict(), "runs": runs, "enough_runs": runs >= FEWEST_RUNS["RQ2"]})
+        rows.append({**row, **test._asdict(), "runs": runs, "enough_runs": runs >= fewest})
     return rows
 
 
@@ -165,11 +246,13 @@ def _directions(case: Case) -> dict[str, bool]:
     """For each indicator and metric: whether larger values speak for an algorithm (a better front, or more unsafe
     solutions).
     """
-    return MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+    return MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics} | {CAUSES: True}
 
 
-def _samples(case: Case, over_runs: bool) -> Samples:
-    """The values of every metric and, unless the solutions belong to no run, of every indicator."""
+def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
+    """The values of every metric and, unless the solutions belong to no run, of every indicator; over runs, of the
+    minimal causes.
+    """
     samples = {
         (algorithm, metric.name): _values(case, algorithm, metric, over_runs)
         for algorithm, metric in product(case.algorithms, case.scoring.metrics)
@@ -177,6 +260,9 @@ def _samples(case: Case, over_runs: bool) -> Samples:
     if case.has_runs and len(case.solutions):
         for algorithm, rows in compute_indicators(case).groupby(level="algorithm"):
             samples |= {(str(algorithm), name): rows.droplevel("algorithm")[name] for name in MORE_IS_BETTER}
+    if over_runs and case.name in choices.causes:
+        counts = choices.causes[case.name].groupby("algorithm")
+        samples |= {(str(algorithm), CAUSES): rows.set_index("run")[CAUSES] for algorithm, rows in counts}
     return samples
 
 

@@ -1,13 +1,14 @@
-"""Statistical tests of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed ranks, effect
-sizes, and Holm's correction for many tests.
+"""Statistics of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed ranks, the log-rank
+test, effect sizes, medians, their intervals, and Holm's correction for many tests.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
 from itertools import count
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,15 +18,7 @@ from numpy.typing import ArrayLike
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
-"""A p-value below this level is significant."""
-FEWEST_RUNS = {
-    "RQ1": next(n for n in count(1) if 2 / 2**n < ALPHA),
-    "RQ2": next(n for n in count(1) if 2 / math.comb(2 * n, n) < ALPHA),
-}
-"""Smallest number of runs with which a test can be significant before any correction, by question.
-
-The smallest two-sided p-value of n runs is 2 / 2^n by RQ1's signed-rank test, and 2 / C(2n, n) by RQ2's U test.
-"""
+"""By default, a p-value below this level is significant, and intervals have the confidence 1 - ALPHA."""
 EXACT_SAMPLE_SIZE = 8
 """Without ties, the p-value of U is exact if one sample has at most this many values; otherwise it is a normal
 approximation."""
@@ -35,9 +28,18 @@ EXACT_TEST = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC_TEST = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
+Interval = tuple[float, float]
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
 NOTABLE_MAGNITUDES = ("medium", "large")
+
+
+def fewest_runs(question: str, alpha: float = ALPHA) -> int:
+    """Smallest number of runs with which a test of RQ1 or RQ2 can be significant before any correction.
+
+    The smallest two-sided p-value of n runs is 2 / 2^n by RQ1's signed-rank test, and 2 / C(2n, n) by RQ2's U test.
+    """
+    return next(n for n in count(1) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < alpha)
 
 
 class TwoSampleTest(NamedTuple):
@@ -106,3 +108,63 @@ def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
     ascending = values.dropna().sort_values()
     corrected = (ascending * np.arange(len(ascending), 0, -1)).clip(upper=1.0).cummax()
     return np.asarray(corrected.reindex(values.index), dtype=float)
+
+
+def effect_interval(effect: float, m: int, n: int | None, alpha: float = ALPHA) -> Interval:
+    """The interval of an effect size of m against n values, or without n against one, at the confidence 1 - alpha.
+
+    It holds the values that differ from the effect by at most as many standard errors, as these values have them, as
+    the normal distribution allows: Newcombe's (2006, method 5) and, against one value, Wilson's of a share. Unlike the
+    bootstrap's it has a width where all values of one sample are greater. NaN for an undefined effect.
+    """
+    limit = float(scipy.stats.norm.isf(alpha / 2)) ** 2
+
+    def excess(value: float) -> float:
+        variance: float = value * (1 - value) / m
+        if n is not None:
+            variance *= (1 + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))) / n
+        return (effect - value) ** 2 - limit * variance
+
+    if math.isnan(effect):
+        return math.nan, math.nan
+    # From beside the effect, where the excess is below 0, whatever the effect.
+    starts = {end: effect + 1e-9 * (end - effect) for end in (0.0, 1.0)}
+    low, high = (end if effect == end else scipy.optimize.brentq(excess, start, end) for end, start in starts.items())
+    return low, high
+
+
+def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
+    """The interval of a median, at a confidence of at least 1 - alpha, between two order statistics; NaN if there are
+    too few values.
+    """
+    ordered = np.sort(np.asarray(values, dtype=float))
+    rank = int(scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5))  # the first whose probability is not too small
+    return (ordered[rank - 1], ordered[-rank]) if rank else (math.nan, math.nan)
+
+
+def survival_median(times: ArrayLike, has_ended: ArrayLike, alpha: float = ALPHA) -> tuple[float, Interval]:
+    """The median time to an event, of which some are censored, by Kaplan and Meier, and its interval by Brookmeyer and
+    Crowley (log-log); NaN where half of the runs do not reach it.
+    """
+    curve = scipy.stats.ecdf(_censored(times, has_ended)).sf
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of undefined ends of the interval
+        ends = curve.confidence_interval(1 - alpha, method="log-log")
+
+    def time_below_half(one: Any) -> float:
+        return next(iter(one.quantiles[one.probabilities <= 0.5]), math.nan)
+
+    return time_below_half(curve), (time_below_half(ends.low), time_below_half(ends.high))
+
+
+def log_rank_test(first: tuple[ArrayLike, ArrayLike], second: tuple[ArrayLike, ArrayLike]) -> float:
+    """The p-value of the log-rank test of two samples, each of times and of whether they have ended; NaN without an
+    event.
+    """
+    if not (np.any(first[1]) or np.any(second[1])):
+        return math.nan
+    return float(scipy.stats.logrank(_censored(*first), _censored(*second)).pvalue)
+
+
+def _censored(times: ArrayLike, has_ended: ArrayLike) -> scipy.stats.CensoredData:
+    return scipy.stats.CensoredData.right_censored(np.asarray(times, dtype=float), ~np.asarray(has_ended, dtype=bool))

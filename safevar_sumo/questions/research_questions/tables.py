@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.questions.answer import Column, Wide
+from safevar_sumo.questions.answer import Column, Wide, with_interval
 from safevar_sumo.questions.research_questions import changes, comparisons
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
-from safevar_sumo.questions.research_questions.statistics import ALPHA
 
-WEATHER, RQ2_TABLES = "weather", ("rq2", "rq2-runs")
+WEATHER, CAUSES = "weather", "causes"
+CHOSEN = ("rq1-runs", "rq2-runs", "medians", "first-collision", CAUSES, "rq1", "rq2")
+"""The tables that depend on a reader's choices."""
 Hidden = partial(Column, is_shown=False)
 """A column that JSON and CSV alone have."""
 Percent, Number = partial(Column, "%", number_format=".1f"), partial(Column, "", number_format=".2f")
@@ -25,12 +26,12 @@ METRIC = {"metric": Column("", "safety metric or quality of a run's front")}
 CHARACTERISTIC = {"characteristic": Column("", "characteristic")}
 CHANGES = {"j": Column("", "number of characteristics changed; any: of all critical solutions")}
 P_VALUE = {"p_value": Column("", "p-value of the test, two-sided", ".2g")}
+UNCORRECTED = {"p_value": Hidden("", "p-value of the test, two-sided, before the correction")}
 P_HOLM = {"p_holm": Column("", "p-value after Holm's correction for all tests of RQ1 and RQ2 of a case", ".2g")}
 MAGNITUDE = {"magnitude": Column("", "magnitude of the effect by Kitchenham's intervals")}
-EFFECT_ON_ORIGINAL = {
-    "effect_size": Column("", "A12; below 0.5 the algorithm's are more unsafe than the original vehicle", ".3f")
-} | MAGNITUDE
-EFFECT_ON_BASELINE = {"effect_size": Column("", "A12; above 0.5 the algorithm is better", ".3f")} | MAGNITUDE
+EFFECT_ON_ORIGINAL = Column("", "A12; below 0.5 the algorithm's are more unsafe than the original vehicle", ".3f")
+EFFECT_ON_BASELINE = Column("", "A12; above 0.5 the algorithm is better", ".3f")
+RUNS = {"runs": Column("", "number of runs")}
 SIZES = {
     "n1": Column("", "number of values of the algorithm"),
     "n2": Column("", "number of values of the other algorithm, or times that the original's value is repeated"),
@@ -42,7 +43,7 @@ ORIGINAL = {
 }
 ENOUGH = {
     "enough_runs": Hidden("", "whether a test with so many runs can be significant"),
-    "significant": Column("", f"whether p < {ALPHA:g}, corrected if there is p_holm, and there are enough runs"),
+    "significant": Column("", "whether p is below alpha, corrected if there is p_holm, and there are enough runs"),
 }
 OTHER_CASE = {"other": Column("", "case in the other weather")}
 SIZE_OF_CHANGE = partial(Column, "as characteristic", number_format="+.3g")
@@ -58,20 +59,90 @@ class PaperTable(NamedTuple):
 
 
 TABLES: Mapping[str, PaperTable] = {
+    "rq1-runs": PaperTable(
+        "RQ1 over runs: the means of runs against the original vehicle",
+        comparisons.rq1_runs,
+        CASE
+        | ALGORITHM
+        | METRIC
+        | UNCORRECTED
+        | P_HOLM
+        | with_interval("effect_size", EFFECT_ON_ORIGINAL)
+        | MAGNITUDE
+        | RUNS
+        | METHOD
+        | {"mean": Hidden("", "mean of the runs' means")}
+        | {"original": ORIGINAL["original"]}
+        | ENOUGH,
+    ),
+    "rq2-runs": PaperTable(
+        "RQ2 over runs: an algorithm's runs against those of the others",
+        comparisons.rq2_runs,
+        CASE
+        | ALGORITHM
+        | BASELINE
+        | METRIC
+        | UNCORRECTED
+        | P_HOLM
+        | with_interval("effect_size", EFFECT_ON_BASELINE)
+        | MAGNITUDE
+        | SIZES
+        | METHOD
+        | ENOUGH,
+    ),
+    "medians": PaperTable(
+        "Medians over runs",
+        comparisons.median_runs,
+        CASE | ALGORITHM | METRIC | RUNS | with_interval("median", Column("", "median over the runs")),
+    ),
+    "first-collision": PaperTable(
+        "Evaluations to the first collision of a run",
+        comparisons.first_collisions,
+        CASE
+        | ALGORITHM
+        | RUNS
+        | {"collided": Column("", "runs with a collision")}
+        | with_interval("median", Column("", "median by Kaplan and Meier: runs without a collision need more"))
+        | {"p_value": Column("", "p-value of the log-rank test against the algorithm that RQ2 compares", ".2g")}
+        | {"p_holm": Column("", "p-value after Holm's correction for these tests", ".2g")},
+    ),
+    CAUSES: PaperTable(
+        "Distinct minimal causes that a run found",
+        comparisons.minimal_causes,
+        CASE
+        | ALGORITHM
+        | {
+            "run": Column("", "number of the run"),
+            "failures": Column("", "different unsafe solutions"),
+            "examined": Column("", "those whose minimal causes were simulated"),
+            "causes": Column("", "different smallest sets of changes, by characteristic and direction"),
+        },
+        Wide(["setting", "run"], "algorithm", ["causes"]),
+    ),
     "rq1": PaperTable(
-        "RQ1: solutions against the original vehicle",
+        "RQ1 as published, which pools the solutions of all runs: against the original vehicle",
         comparisons.rq1,
-        CASE | ALGORITHM | METRIC | P_VALUE | EFFECT_ON_ORIGINAL | SIZES | METHOD | ORIGINAL | ENOUGH,
+        CASE
+        | ALGORITHM
+        | METRIC
+        | P_VALUE
+        | {"effect_size": EFFECT_ON_ORIGINAL}
+        | MAGNITUDE
+        | SIZES
+        | METHOD
+        | ORIGINAL
+        | ENOUGH,
     ),
     "rq2": PaperTable(
-        "RQ2: an algorithm's solutions and fronts against those of the others",
+        "RQ2 as published, which pools the solutions of all runs: an algorithm against the others",
         comparisons.rq2,
         CASE
         | ALGORITHM
         | BASELINE
         | METRIC
         | P_VALUE
-        | EFFECT_ON_BASELINE
+        | {"effect_size": EFFECT_ON_BASELINE}
+        | MAGNITUDE
         | SIZES
         | METHOD
         | ENOUGH
@@ -79,25 +150,6 @@ TABLES: Mapping[str, PaperTable] = {
             "evaluations": Hidden("", "mean number of settings that a run of the algorithm simulates"),
             "baseline_evaluations": Hidden("", "mean number of settings that a run of the other simulates"),
         },
-    ),
-    "rq1-runs": PaperTable(
-        "RQ1 over runs: the means of runs against the original vehicle",
-        comparisons.rq1_runs,
-        CASE
-        | ALGORITHM
-        | METRIC
-        | P_VALUE
-        | P_HOLM
-        | EFFECT_ON_ORIGINAL
-        | {"runs": Column("", "number of runs")}
-        | METHOD
-        | ORIGINAL
-        | ENOUGH,
-    ),
-    "rq2-runs": PaperTable(
-        "RQ2 over runs: an algorithm's runs against those of the others",
-        comparisons.rq2_runs,
-        CASE | ALGORITHM | BASELINE | METRIC | P_VALUE | P_HOLM | EFFECT_ON_BASELINE | SIZES | METHOD | ENOUGH,
     ),
     "evaluations": PaperTable(
         "Different settings that a run simulates",
