@@ -25,8 +25,9 @@ POOL = InlinePool()
 
 
 @pytest.fixture(autouse=True)
-def _coarse_scans(monkeypatch: pytest.MonkeyPatch) -> None:
+def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+    monkeypatch.setattr("safevar_sumo.questions.compare._needless_braking", lambda a, b: {})
 
 
 def counts_of(answer: sv.Answer) -> tuple[int, int, int]:
