@@ -93,7 +93,6 @@ def test_a_class_that_does_not_meet_the_contract_is_refused_before_a_call(
     ("module", "expected"),
     [
         ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name' ({}:1)"),
-        ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"),
         ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
         ("x = (\n", "SyntaxError: '(' was never closed"),
     ],
@@ -129,11 +128,9 @@ def failing(system: object) -> str:
     ("body", "expected"),
     [
         ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"),
-        ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
         (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("),
         ("pass", "returned None from drive"),
         ("return 0, 2", "returned brake = 2.0 from drive"),
-        ("return float('nan'), 0", "returned throttle = nan"),
     ],
 )
 def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder: Path) -> None:
@@ -165,10 +162,8 @@ ARRAYS += (
     ("body", "expected"),
     [
         ("seen.speed[:] = 0", "ValueError: assignment destination is read-only"),
-        ("return seen.speed", "from drive"),
         ("return (seen.speed * 0, seen.speed), memory", "an object with the attributes throttle, brake"),
         ("return Command(seen.speed * 0, seen.speed[:2]), memory", "brake of shape (2,)"),
-        ("return Command(seen.speed * 0, 0.5), memory", "brake of shape ()"),
     ],
 )
 def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) -> None:
@@ -206,20 +201,13 @@ def vehicle(method: str, body: str) -> str:
     ("method", "body", "expected"),
     [
         ("advance", "result = result._replace(speed=-result.speed - 1)", "returned speed = -"),
-        ("advance", "result = result._replace(speed=result.speed * np.nan)", "returned speed = nan from advance"),
         ("advance", "result = result._replace(speed=np.zeros(7))", "returned speed of shape (7,) from advance"),
-        ("advance", "result = None", "returned None from advance"),
         ("at_rest", "result = result._replace(speed=result.speed + 9)", "returned speed = 9.0 from at_rest"),
         ("sense", "result = result[0]", "from sense"),
         (
             "sense",
             "result = (result[0]._replace(gap=result[0].gap * np.nan), result[1])",
             "returned gap = nan from sense",
-        ),
-        (
-            "sense",
-            "result = (result[0]._replace(speed=result[0].gap + np.inf), result[1])",
-            "returned speed = inf from sense",
         ),
         ("sumo_type", "result = result._replace(decel=0 * result.decel)", "returned decel = 0.0 from sumo_type"),
     ],
@@ -247,18 +235,11 @@ def scenario(method: str, body: str) -> str:
 @pytest.mark.parametrize(
     ("method", "body", "expected"),
     [
-        ("begin", "1 / 0", "raised in begin"),
         ("begin", "world.vehicle_positions('vut')[:] = 0", "read-only"),
-        ("observe", "result = None", "returned None from observe"),
         (
             "observe",
             "result = (result[0]._replace(gap=result[0].gap * np.nan), result[1])",
             "returned gap = nan from observe",
-        ),
-        (
-            "observe",
-            "result = (result[0]._replace(lateral=result[0].gap + np.inf), result[1])",
-            "returned lateral = inf from observe",
         ),
         ("observe", "result = (result[0]._replace(over=result[0].gap), result[1])", "returned over"),
         ("observe", "result = (result[0]._replace(gap='near'), result[1])", "returned gap = 'near'"),
@@ -268,8 +249,6 @@ def scenario(method: str, body: str) -> str:
             "result = result._replace(in_conflict=result.in_conflict | True, distance=result.distance * np.nan)",
             "returned distance = nan",
         ),
-        ("encounter", "result = result._replace(separation=result.separation + np.inf)", "returned separation = inf"),
-        ("encounter", "trace.speed[:] = 0", "read-only"),
     ],
 )
 def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:

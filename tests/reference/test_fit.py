@@ -71,15 +71,6 @@ def test_a_plan_has_the_values_of_its_studies_within_its_bounds(path: Path) -> N
     assert all(row.lower <= value <= row.upper for row, value in zip(plan.parameters, values, strict=True))
 
 
-def test_a_scale_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in_its_bounds() -> None:
-    rows = [fit.Parameter(GAP, 0.3, 30.0, "m", "gap", log=log) for log in (True, False)]
-    cube = fit.Cube.of(rows)
-    assert cube.values(np.array([0.5, 0.5])) == pytest.approx([3.0, 15.15])
-    assert max(cube.values(np.ones(2))) <= 30.0
-    assert cube.values(np.full(2, 1 / 7)) == [0.579209, 4.54286], "six digits, as in the study file"
-    assert cube.places(np.array([3.0, 15.15])) == pytest.approx([0.5, 0.5])
-
-
 def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(data: ReferenceData) -> None:
     """All of the loss is sum(w error / repeatability): a repeatability of 2 halves what one of 1 makes of it."""
     nearer = with_values(load_study("sun"), {GAP: 0.8 * OWN})

@@ -68,7 +68,6 @@ GOOD = {
     "a flow on a route": '<route id="r" edges="oncoming"/>'
     '<flow id="f" type="car" route="r" begin="0" end="9" number="2"/>',
     "a trip": '<trip id="t" type="car" depart="0" from="oncoming" to="oncoming_on"/>',
-    "a trip by a via": '<trip id="t" type="car" depart="0" from="oncoming" via="oncoming" to="oncoming_on"/>',
     "a late vehicle": (
         '<vehicle id="t" type="car" depart="0:0:2"><route edges="oncoming"/><stop edge="oncoming" '
         'duration="1"/></vehicle>'
@@ -118,17 +117,13 @@ TRAFFIC = (
     ('<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>', "'f.0' moves at random"),
     ('<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>', "'f.0' moves at random"),
     ('<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>', "'t' moves at random"),
-    ('<trip id="t" from="oncoming" depart="0"/>', "'t' moves at random"),
     ('<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "vType 'r' drives at random"),
-    ('<vType id="r" speedDev="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "vType 'r' drives at random"),
     (
         '<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r" from="oncoming" depart="0"/>',
         "vType 'r' drives at random",
     ),
     ('<trip id="t" type="car" from="nowhere" depart="0"/>', "The edge 'nowhere' within the route"),
-    ('<trip id="vut" type="car" from="oncoming" depart="0"/>', "A vehicle with id 'vut' already exists"),
     ('<trip id="t" type="vut" from="oncoming" depart="0"/>', "'vut', a vType of its own"),
-    ('<vType id="x" length="-1"/>', "length must be greater than 0"),
     (
         '<person id="w" type="walker" depart="0"><ride from="approach" to="departure" lines="vut"/></person>',
         "has a 'ride'",

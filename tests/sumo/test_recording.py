@@ -130,22 +130,6 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
         verify_in_sumo(system, drawn(system, 60, 5))
 
 
-@pytest.mark.slow
-def test_a_false_claim_that_no_actor_reacts_is_detected(reacting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(reacting)
-    Path("claims.py").write_text(CLAIM)
-    study = load_study(
-        "native",
-        scenario={"model": "claims:Claims", "parameters": {"network": "reacting"}},
-        name="mine",
-        title="",
-        search={"runs": 1, "algorithms": ["rs"], "evaluations": 60},
-        published={},
-    )
-    with pytest.raises(InputError, match=r"in the recorded scene and .* in SUMO, with mass = "):
-        sv.run(study, out="results/it", jobs=1)
-
-
 FIRST = "On a first drive, with nobody in sight, the original vehicle "
 NO_VERDICT = ". So its drives with somebody in sight do not show how it reacts to them: no verdict."
 STANDS = f"{FIRST}never reaches the encounter (it gets 0.0 of 11.9 m){NO_VERDICT}"
