@@ -38,13 +38,9 @@ def repair_of(study: sv.Study) -> tuple[str, str, str]:
     answer = sv.repair(study, promise=PROMISE)
     if not answer.numbers["repairs"]:
         return ("none is needed" if answer.numbers["kept_today"] else "none"), "-", "-"
-    first, price, changes = answer.table("repairs").iloc[0], answer.table("price").iloc[0], answer.table("changes")
-    scenes = f"{price.needless_braking_today} -> {first.needless_braking} of {first.benign_scenes}"
-    texts = [
-        f"{row.parameter} {row.today:g} -> {row.repaired:g} {row.unit}"
-        for row in changes[changes.repair == 1].itertuples()
-    ]
-    return ", ".join(texts), f"{first.metres_earlier:.2f} m", scenes
+    first = answer.table("repairs").iloc[0]
+    scenes = f"{first.needless_braking_today} -> {first.needless_braking} of {first.benign_scenes}"
+    return first.change, f"{first.metres_earlier:.2f} m", scenes
 
 
 def main() -> None:

@@ -7,24 +7,32 @@ counterexample. Today's driving system is the change of no parameter.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import pandas as pd
+import tomli_w
 
+from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
+from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Margin, question
-from safevar_sumo.questions.evaluator import Evaluator, sobol_points
+from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
-from safevar_sumo.questions.repair.answer import answer_of, check_file, write_repair
 from safevar_sumo.questions.repair.attack import Proof, find_failures, prove
+from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import Search
-from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.scenarios import distance_in_words
+from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
 
@@ -37,6 +45,23 @@ MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
 CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
+REPAIRS = {
+    "parameters": Column("", "the parameters that change, with their new values", ".10g", is_shown=False),
+    "change": Column("", "what changes, in words"),
+    "changed": Column("-", "number of parameters that change", is_shown=False),
+    "largest_change": Column("-", "largest change of a parameter, as a share of its range"),
+    "metres_earlier": Column("m", "how much earlier a new vehicle brakes, at most over all points", ".2f"),
+    "metres_earlier_mean": Column("m", "how much earlier it brakes on average over all points", ".2f", is_shown=False),
+    "seconds_earlier": Column("s", "how much earlier it brakes where that is most metres", ".2f", is_shown=False),
+    "most_at": Column("", "the point where that is", is_shown=False),
+    "largest_deceleration": Column("m/s^2", "its largest deceleration", ".1f"),
+    "needless_braking": Column("-", "number of benign scenes in which it brakes"),
+    "needless_braking_today": Column("-", "number of benign scenes in which it brakes today"),
+    "benign_scenes": Column("-", "number of scenes in which nobody needs to brake"),
+    "proof_samples": Column("-", "number of worn vehicles drawn after the parameters were chosen"),
+    "proof_failures": Column("-", "number of them that are unsafe"),
+    "at_most": Column("-", f"share of unsafe vehicles at most, with {100 * CONFIDENCE:g} % confidence", ".2g"),
+}
 
 
 @question
@@ -72,7 +97,7 @@ def repair(
         text = f"{study.name!r} is rated, and its repair would take a whole test matrix for every vehicle and change"
         raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
     if out is not None:
-        check_file(Path(out), study)
+        _check_file(Path(out), study)
     problem = RepairProblem(
         evaluator=evaluator,
         promise=Promise.of(study, evaluator.region, promise),
@@ -88,7 +113,7 @@ def repair(
     is_repairable[~is_repairable] = problem.repairable(vehicles[~is_repairable])
     survivors = _find_survivors(problem, vehicles[is_repairable]) if is_repairable.any() else []
     worst = float(degrees[is_repairable][0] if is_repairable.any() else degrees[0])
-    answer = answer_of(problem, survivors, worst, _not_repairable(problem, vehicles[~is_repairable]))
+    answer = _answer_of(problem, survivors, worst, _not_repairable(problem, vehicles[~is_repairable]))
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
@@ -138,3 +163,117 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     causes = [cause for group in find_minimal_causes(driver, chosen, unsafe) for cause in group]
     limits = [one.boundary for one in find_limits(driver, causes, unsafe)]
     return [limit for number, limit in enumerate(limits) if limit not in limits[:number]]
+
+
+def _answer_of(
+    problem: RepairProblem,
+    survivors: Sequence[tuple[FloatArray, Proof]],
+    worst_today: float,
+    not_repairable: list[dict[str, float]],
+) -> Answer:
+    """The answer from the changes that survive, each with its proof: today's parameters alone if they do.
+
+    `worst_today` is the safety degree of today's driving system with the worst vehicle of the promise that was tried
+    and that a driving system can keep safe [m]; below 0, minus the speed of the impact [m/s].
+    """
+    kept_today = bool(survivors) and not problem.changed_values(survivors[0][0])
+    repairs = [] if kept_today else [_row(problem, *pair) for pair in survivors]
+    tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
+    numbers = {
+        "margin": problem.unsafe.keep,
+        "promise": problem.promise.to_dict(),
+        "worst_today": worst_today,
+        "kept_today": kept_today,
+        "repairs": len(repairs),
+        "not_repairable": not_repairable,
+        "simulations": problem.evaluator.simulated,
+    }
+    wear = f"({problem.promise.in_words}) with {problem.unsafe.keep:g} m left"
+    if kept_today:
+        where = " wherever any driving system can" if not_repairable else ""
+        degree = distance_in_words(worst_today, problem.unsafe.contact)
+        verdict = (
+            f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried has a safety "
+            f"degree of {degree}, and {_proof_in_words(survivors[0][1])}."
+        )
+    elif repairs:
+        verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors[0][1])}."
+    else:
+        names = join_phrases(parameter.name for parameter in problem.parameters)
+        verdict = f"No change of one or two of {names} was found that survives this wear {wear}."
+    if not_repairable:
+        parts = "; or ".join(_limits_in_words(problem, part) for part in not_repairable)
+        verdict += f" No driving system survives {parts}: that needs another part, not a parameter."
+    return Answer(question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables)
+
+
+def _row(problem: RepairProblem, change: FloatArray, proof: Proof) -> JsonObject:
+    """A repair, its price and its proof, by the names of columns."""
+    values = problem.changed_values(change)
+    texts = [
+        f"{name} {today:.6g} -> {values[name]:.10g}{unit_text(row.unit)} ({row.meaning})"
+        for name, row, today in problem.parameters
+        if name in values
+    ]
+    size = float(np.max(np.abs(change - problem.today)))
+    row = {"parameters": values, "change": ", ".join(texts), "changed": len(values), "largest_change": size}
+    return {**row, **price_of(problem.study, values), **proof._asdict()}
+
+
+def _repair_in_words(repair: JsonObject, wear: str) -> str:
+    """A repair and its price on a new vehicle."""
+    number = "One change survives" if repair["changed"] == 1 else "Two changes survive"
+    metres = repair["metres_earlier"]
+    earlier = "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
+    needless = "in an unknown share of benign scenes, of which the study has none"
+    if repair["benign_scenes"]:
+        needless = (
+            f"in {repair['needless_braking']} of {repair['benign_scenes']} benign scenes "
+            f"({repair['needless_braking_today']} today)"
+        )
+    return f"{number} this wear {wear}: {repair['change']}. A new vehicle {earlier} and needlessly {needless}"
+
+
+def _proof_in_words(proof: Proof) -> str:
+    return (
+        f"of {proof.proof_samples:,} fresh worn vehicles {proof.proof_failures} are unsafe (at most "
+        f"{100 * proof.at_most:.2g} %, with {100 * CONFIDENCE:g} % confidence)"
+    )
+
+
+def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
+    """A part that no driving system survives, such as `sensorRange below 21.4 m`."""
+    limits = [
+        f"{member.name} {'below' if part[member.name] < member.original else 'above'} "
+        f"{member.text(part[member.name])}{member.suffix}"
+        for member in problem.promise.region.characteristics
+        if member.name in part
+    ]
+    return " with ".join(limits) or "even the original"
+
+
+def _check_file(path: Path, study: Study) -> None:
+    """Refuse a file that is no study file, cannot be written, or is one of the study's own, before the work begins."""
+    if path.suffix != ".toml" or (path.exists() and any(map(path.samefile, study.origin.files))):
+        raise InputError("out", str(path), "a file that ends in .toml, and is not the study's own")
+    check_writable(path, "out")
+
+
+def write_repair(path: Path, answer: Answer) -> None:
+    """Write a study file with the first repair. It extends the study's file; without a file, it is the whole repaired
+    study.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    study, values = answer.study, answer.table("repairs")["parameters"][0]
+    comment = answer.verdict + (f" Only {study.origin.point} was simulated." if study.origin.point else "")
+    if not study.origin.called and study.name not in study_names():
+        write_study(path, with_parameters(study, values), comment)
+        return
+    base = os.path.abspath(study.origin.called) if study.origin.called else study.name
+    tables = {"extends": base, "name": f"{study.name}-repaired", "ads": {"parameters": values}}
+    with whole_file(path, "out") as file:
+        file.write_text(f"{SCHEMA_LINE}# {comment}\n\n{tomli_w.dumps(tables)}", encoding="utf-8")
