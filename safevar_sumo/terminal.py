@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from html import escape
 from threading import Event, Thread
 from typing import Any
 
@@ -19,7 +18,6 @@ from rich.table import Table
 from rich.text import Text
 
 from safevar_sumo.study import Study
-from safevar_sumo.vehicles import Characteristic
 
 Progress = Callable[[str, int, int], None]
 """A function that shows progress, called with the stage, the amount done in it, and its total; first with nothing done.
@@ -85,27 +83,6 @@ def print_text(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def meanings(characteristics: Iterable[Characteristic]) -> Table:
-    """The descriptions of characteristics, one row each; a characteristic without description is left out."""
-    table = Table.grid(padding=(0, 2))
-    for characteristic in characteristics:
-        if characteristic.words:
-            table.add_row(printable_text(characteristic.name), printable_text(characteristic.words))
-    return table
-
-
-def print_meanings(console: Console, characteristics: Iterable[Characteristic]) -> None:
-    """Print the descriptions of characteristics."""
-    if (table := meanings(characteristics)).row_count:
-        console.print(table)
-
-
-def print_answer(console: Console, study: Study, no_verdict: str, parts: Iterable[str | Table]) -> None:
-    """Print the answer to a question about a study below its title; parts as in `print_parts`."""
-    print_heading(console, study.title, no_verdict)
-    print_parts(console, parts)
-
-
 def print_parts(console: Console, parts: Iterable[str | Table]) -> None:
     """Print sentences and tables, of which those without rows are left out."""
     for part in parts:
@@ -113,55 +90,6 @@ def print_parts(console: Console, parts: Iterable[str | Table]) -> None:
             print_text(console, part)
         elif part.row_count:
             console.print(part)
-
-
-class Answer:
-    """An answer to a question, which a terminal or a notebook can show."""
-
-    study: Study
-    no_verdict: str
-
-    def sentences(self) -> Iterable[str | Table]:
-        """The answer in sentences and tables, the verdict first."""
-        raise NotImplementedError
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.study.name}: {next(iter(self.sentences()))}>"
-
-    def _repr_html_(self) -> str:
-        return answer_as_html(self)
-
-
-def answer_as_html(answer: Any) -> str:
-    """The sentences and tables that a terminal shows, as HTML for a notebook."""
-    lines = [
-        f"<p>{escape(answer.no_verdict)}</p>" if answer.no_verdict else "",
-        f"<h4>{escape(answer.study.title)}</h4>",
-    ]
-    for part in answer.sentences():
-        lines += [f"<p>{escape(part)}</p>"] if isinstance(part, str) else _table_as_html(part)
-    return "\n".join(filter(None, lines))
-
-
-def _table_as_html(table: Table) -> list[str]:
-    if not table.row_count:
-        return []
-    title = getattr(table, "_title_line", "")
-    columns = [list(column.cells) for column in table.columns]
-    heads = "".join(f"<th>{escape(str(column.header))}</th>" for column in table.columns) if table.show_header else ""
-    rows = ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in zip(*columns, strict=True)]
-    return [
-        f"<table><caption>{escape(str(title))}</caption>" if title else "<table>",
-        *(f"<tr>{row}</tr>" for row in (heads, *rows) if row),
-        "</table>",
-    ]
-
-
-def print_heading(console: Console, title: str, no_verdict: str) -> None:
-    """Print a study's title, below the reason, if any, why no verdict on its ADS is possible."""
-    if no_verdict:
-        print_text(console, no_verdict)
-    print_text(console, title)
 
 
 def constraints_in_words(study: Study) -> list[str]:

@@ -11,19 +11,16 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from safevar_sumo.errors import INTERRUPT_EXIT_CODE, InputError, SafevarError, did_you_mean
 from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
-
-if TYPE_CHECKING:
-    from safevar_sumo.study import Study
 
 COMMANDS_BY_GROUP = {
     "From a driving system to a decision": {
@@ -203,17 +200,6 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
-def print_note(message: object) -> None:
-    """Print a note to standard error."""
-    click.echo(f"note: {message}", err=True)
-
-
 def print_warning(message: object) -> None:
     """Print a warning to standard error."""
     click.echo(f"warning: {message}", err=True)
-
-
-def print_remarks(study: Study, further_remarks: Iterable[str] = ()) -> None:
-    """Print the remarks on a study, such as a key that has no effect, to standard error."""
-    for remark in (*study.origin.remarks, *further_remarks):
-        print_note(remark)

@@ -54,14 +54,6 @@ def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, flo
     return ", ".join(change_texts(characteristics, values)) or "no change at all"
 
 
-def simulate_command(study: str, values: Mapping[str, float], point: str = "") -> str:
-    """The command that simulates changes of a study, in eight digits; `point` may name a point of the study's
-    matrix.
-    """
-    changes = (f"--set {quote(f'{name}={value:.8g}')}" for name, value in values.items())
-    return " ".join([question_command("simulate", study, point), *changes])
-
-
 def question_command(question: str, subject: str, point: str = "") -> str:
     """The command that asks a question about results or a study; `point` may name a point of the study's matrix."""
     return f"{PROGRAM_COMMAND} {question} {quote(subject)}" + (f" --point {quote(point)}" if point else "")

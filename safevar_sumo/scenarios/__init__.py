@@ -34,7 +34,6 @@ SCENARIOS: Mapping[str, type] = {
 }
 
 _TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
-_PHRASES: dict[str, str] = {name: table.pop("phrase") for name, table in _TABLES.items()}  # the rest is the weather
 WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
 """Weathers by name."""
 
@@ -63,14 +62,6 @@ def equals_clear(weather: Weather) -> bool:
         and weather.light == clear.light
         and msgspec.structs.replace(weather, name=clear.name) == clear
     )
-
-
-def weather_in_words(weather: Weather) -> str:
-    """The beginning of a sentence: the phrase of a weather in weather.toml, or the name of any other weather.
-
-    A weather that has the name of one in weather.toml and other effects is another weather.
-    """
-    return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"
 
 
 def distance_in_words(safety_degree: float, contact: float) -> str:

@@ -50,11 +50,6 @@ def driven_entry(no_verdict: str) -> dict[str, bool]:
     return {"driven": False} if no_verdict else {}
 
 
-def summary_entry(no_verdict: str) -> list[dict[str, dict[str, bool]]]:
-    """The last record of an answer's JSON array if no verdict is possible."""
-    return [{"summary": driven_entry(no_verdict)}] if no_verdict else []
-
-
 def _problem(runs: SimulationRuns) -> str:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing."""
     trace = runs.trace
