@@ -37,7 +37,7 @@ WEATHER = NAME | {
     "visibility": Column("", "factor on the distance at which sensors detect an obstacle"),
     "recognition_delay": Column("s", "additional time to recognise somebody"),
     "light": Column("", "day or night"),
-    "wet": Column("", "whether the road is wet"),
+    "water": Column("mm", "depth of the water on the road"),
     "effect": Column("", "none: an ADS drives as in clear weather, unless its parameters differ"),
 }
 OBJECTIVES: Mapping[str, object] = {

@@ -244,7 +244,7 @@ def _verdict(
 ) -> str:
     """How many points the variant loses and in which tests; without a variant, the original's points."""
     weather, road = weather_of(study.weather, f"study {study.name!r}"), ""
-    if weather.wet or weather.road_friction != 1:
+    if weather.water or weather.road_friction != 1:
         road = (
             f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
             f"{darken(weather).name!r}."

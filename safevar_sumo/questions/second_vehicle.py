@@ -35,11 +35,11 @@ METRES_PER_CM = 0.01  # m
 
 
 class Road(NamedTuple):
-    """The road as `Vehicle.prepare` gets it: its factor on the tyres' friction, its slope, and whether it is wet."""
+    """The road as `Vehicle.prepare` gets it: its factor on the tyres' friction, its slope, and the water on it."""
 
     friction: Any
     slope: Slope
-    wet: bool | BoolArray
+    water: float | FloatArray
 
 
 def _brakes_for(force: FloatArray, mass: float) -> JsonObject:
@@ -54,7 +54,7 @@ def _brakes_for(force: FloatArray, mass: float) -> JsonObject:
 
 def _represent_worn(vehicle: WornVehicle, values: Characteristics, original: Mapping[str, float], road: Road) -> Plant:
     # What is read here does not depend on the step of 1 s: mass, grip, and the rear axle's share of the weight.
-    prepared = vehicle.prepare(values, road.friction, 1.0, road.slope, road.wet)
+    prepared = vehicle.prepare(values, road.friction, 1.0, road.slope, road.water)
     return build_plant(
         prepared.mass,
         vehicle.kerb_mass,
@@ -62,7 +62,7 @@ def _represent_worn(vehicle: WornVehicle, values: Characteristics, original: Map
         centre=prepared.rear_load * vehicle.wheelbase,
         wheelbase=vehicle.wheelbase,
         height=vehicle.centre_height,
-        friction=prepared.grip,
+        friction=vehicle.friction(prepared, np.zeros_like(prepared.mass)),
         front_brake_share=vehicle.front_share,
         front_drive_share=load_bmw_parameters().T_se,
         brake_delay=values["brakeResponse"],
@@ -219,17 +219,17 @@ class SecondVehicle(Vehicle):
         road_friction: Any,
         step: float,
         slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
+        water: float | FloatArray = 0.0,
     ) -> Prepared:
-        road, settings = Road(road_friction, slope, wet), np.stack([*characteristics.values()], axis=1)
+        road, settings = Road(road_friction, slope, water), np.stack([*characteristics.values()], axis=1)
         original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
         plant, original_plant = (
             self._represent(self._engine, values, self._original, road) for values in (represented, original)
         )
         return Prepared(
-            vehicle=self._vehicle.prepare(characteristics, road_friction, step, slope, wet),
-            original=self._engine.prepare(original, road_friction, step, slope, wet),
+            vehicle=self._vehicle.prepare(characteristics, road_friction, step, slope, water),
+            original=self._engine.prepare(original, road_friction, step, slope, water),
             plant=plant,
             engine_mass=original_plant.mass + WHEEL_COUNT * original_plant.wheel_inertia / original_plant.radius**2,
             engine_radius=original_plant.radius,
@@ -263,6 +263,8 @@ class SecondVehicle(Vehicle):
 
     def advance(self, prepared: Prepared, state: SecondState, command: Command) -> SecondState:
         plant, body, brake = prepared.plant, state.body, state.brake
+        if isinstance(self._engine, WornVehicle):
+            plant = plant._replace(friction=self._engine.friction(prepared.vehicle, state.speed))
         original, drive_torque = self._advance_engine(prepared, state, command.throttle)
         commands = state.brake_commands.extended(command.brake)
         demand = commands.delayed()

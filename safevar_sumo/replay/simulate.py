@@ -14,6 +14,7 @@ import pandas as pd
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, warn
+from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Range, find_question
@@ -64,6 +65,7 @@ POINTS = {
     "relative_impact_speed": Column("m/s", "relative speed of the impact", ".2f", is_shown=False),
     SAFETY_DEGREE: Column("m", "safety degree; minus the collision's speed in m/s", ".2f"),
     "gap": Column("m", "least distance between bodies", ".2f", is_shown=False),
+    STOPPING_DISTANCE.name: Column("m", "distance from the first brake force to standstill", ".1f"),
     "test_speed_error": Column("km/h", "deviation from the test speed before the driving system acts", "+.1f"),
     "warning_ttc": Column("s", "time to collision at the first warning", is_shown=False),
     "side": Column("", "side of the vehicle that touches", is_shown=False),
@@ -331,6 +333,9 @@ def _verdict(simulation: Simulation) -> list[str]:
 
 
 def _safety_comparison(simulation: Simulation) -> str:
+    stop, original = (one.metrics.get(STOPPING_DISTANCE.name, np.nan) for one in (simulation, simulation.original))
+    if np.isfinite(stop / original):
+        return f"in {stop / original:.2f} times the distance of the original"
     degree, original = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):
         return "whether that is less safe cannot be decided"

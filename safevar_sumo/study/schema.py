@@ -80,10 +80,11 @@ class VehicleTable(Table, frozen=True, kw_only=True):
 class Weather(Table, frozen=True, kw_only=True):
     """Weather as data: its `name`, and its effects on the road and on the sensors.
 
-    `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose
-    further friction. `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for
-    every ADS; the reaction time of an ADS is one of its parameters. `light` decides only whether a rating darkens the
-    weather for its tests by night.
+    `road_friction` and `visibility` are factors relative to the dry, clear case [-]. `water` is its depth on the road
+    [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as the grip of the same road when dry.
+    `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; the
+    reaction time of an ADS is one of its parameters. `light` decides only whether a rating darkens the weather for its
+    tests by night.
     """
 
     name: str
@@ -91,7 +92,7 @@ class Weather(Table, frozen=True, kw_only=True):
     visibility: Annotated[float, Meta(gt=0, le=1.5)]
     recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
     light: Literal["day", "night"] = "day"
-    wet: bool = False
+    water: Annotated[float, Meta(ge=0, le=20)] = 0.0
 
 
 class MetricsTable(Table, frozen=True, kw_only=True):

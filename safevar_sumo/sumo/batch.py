@@ -221,14 +221,14 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
 
 def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, ...]:
     """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres' friction (a number if
-    all points share it), time step and, unless all roads are level and dry, slope and wetness.
+    all points share it), time step and, unless all roads are level and dry, slope and water.
     """
     size = n // len(points)
     friction = per_vehicle([point.weather.road_friction for point in points], size)
-    grades, wetness = [point.scenario.grade for point in points], [point.weather.wet for point in points]
+    grades, water = [point.scenario.grade for point in points], [point.weather.water for point in points]
     slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
-    if any(wetness):
-        return friction, step, slope, np.repeat(wetness, size)
+    if any(water):
+        return friction, step, slope, np.repeat(water, size)
     return (friction, step, slope) if any(grades) else (friction, step)
 
 

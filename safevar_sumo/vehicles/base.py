@@ -214,12 +214,13 @@ class Vehicle:
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
+        water: float | FloatArray = 0.0,
     ) -> Prepared:
         """Constants of a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further
-        effects. `slope` and `wet` are passed only on roads that have a slope or are wet.
+        `road_friction` is the weather's factor on the tyres' friction; the depth of the `water` [mm] is for models that
+        compute its effect, for which `road_friction` is that of the road without it. `slope` and `water` are passed
+        only on roads that have a slope or are wet.
         """
 
     @abstractmethod

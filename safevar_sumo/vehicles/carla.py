@@ -165,7 +165,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
+        water: float | FloatArray = 0.0,
     ) -> _Prepared:
         c = characteristics
         radius = c["radius"] / 100

@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
 
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles
@@ -134,7 +134,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
+        water: float | FloatArray = 0.0,
     ) -> _Prepared:
         c, substep = characteristics, step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]

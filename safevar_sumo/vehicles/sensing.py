@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import (
     LEVEL,
     Characteristics,
@@ -25,17 +25,7 @@ from safevar_sumo.vehicles.base import (
     Vehicle,
     sensed_observation,
 )
-
-DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
-"""Tread depths with published stopping distances [mm]; the last depth is the legal minimum in Europe."""
-DEEP_TREAD_RATIO = 1.368
-"""Stopping distance at 1.6 mm over the distance at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
-HALF_WORN_RATIO = 39.9 / 31.7
-"""Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m)
-[-].
-"""
-HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
-"""Loss of friction at 3 mm over the loss at 1.6 mm [-], as friction is proportional to 1 / stopping distance."""
+from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 
 RELEASED_BRAKE = 1e-6
 """Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command that fades out between
@@ -164,7 +154,7 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
+        water: float | FloatArray = 0.0,
     ) -> _PreparedSumo:
         c = characteristics
         mass_ratio = self.reference_mass / c["mass"]
@@ -206,14 +196,16 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 class _PreparedWorn(NamedTuple):
     """Constants of a run, SI, shape (N,); see `SensingVehicle`.
 
-    `grip` is the friction coefficient; `front_load` and `rear_load` are the axles' shares of the weight at rest [-].
+    `grip` is the friction coefficient at rest, `lift` its fall with speed (wet_road.py) [s^2/m^2]; `front_load` and
+    `rear_load` are the axles' shares of the weight at rest [-].
     """
 
     step: float
     mass: FloatArray
     drive: FloatArray
     brake: FloatArray
-    grip: FloatArray
+    grip: float | FloatArray
+    lift: FloatArray
     max_speed: float
     front_load: FloatArray
     rear_load: FloatArray
@@ -234,21 +226,17 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     drive_force, brake_force, front_share
         Largest forces of engine and brakes [N], and the front axle's share of the brake force [-].
     tyre_friction
-        Friction coefficient on a dry road [-].
-    tread_loss
-        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. The default is 1 - 1 / 1.368:
-        their stopping distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes
-        for other depths.
+        Friction coefficient on a dry road of new and worn tyres [-]: the mean of the roads of published stops.
+    water_lift, road_texture
+        Constants a [s^2/m^2 mm^0.5] and b [mm] of the friction on a wet road (wet_road.py), fitted to published stops.
     max_speed
         Top speed [m/s].
 
     Notes
     -----
-    The loss of friction on a wet road is linear in tread depth between published points: none from 6.7 mm on,
-    `tread_loss` at 1.6 mm, and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA
-    for Continental, from 50 mph). The line from 3 mm to 1.6 mm continues below 1.6 mm (assumption). The loss was
-    measured from 50 mph and acts at every speed (assumption; tyres lose less at lower speeds). The weather determines
-    whether a road is wet; on a dry road the tread has no effect.
+    The friction coefficient mu on a dry road is `tyre_friction` times the weather's `road_friction`, whatever the
+    tread. Under water this is the grip at rest, and mu falls with speed, water and lost tread, step by step
+    (wet_road.py).
 
     Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is the smallest of F /
     m (brake force and mass), mu g, and, for each axle, the a at which that axle reaches its limit while the other axle
@@ -275,8 +263,9 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     drive_force: Positive = 3900.0
     brake_force: Positive = 16500.0
     front_share: Annotated[float, Meta(gt=0, lt=1)] = 0.7
-    tyre_friction: Positive = 0.9
-    tread_loss: Annotated[float, Meta(ge=0, lt=0.5)] = 1 - 1 / DEEP_TREAD_RATIO
+    tyre_friction: Positive = WET_FRICTION["worn"]["tyre_friction"]
+    water_lift: Positive = WET_FRICTION["worn"]["water_lift"]
+    road_texture: Positive = WET_FRICTION["worn"]["road_texture"]
     max_speed: Positive = 55.56
 
     def prepare(
@@ -285,18 +274,19 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        wet: bool | BoolArray = False,
+        water: float | FloatArray = 0.0,
     ) -> _PreparedWorn:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         rear_load = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
-        grip_share = np.where(wet, 1 - self.tread_loss * _loss_share(np.maximum(c["treadDepth"], 0.0)), 1.0)
+        tread = np.maximum(c["treadDepth"], 0.0)
         return _PreparedWorn(
             step=step,
             mass=mass,
             drive=self.drive_force / mass,
             brake=c["brakeTorque"] * (self.brake_force / mass),
-            grip=self.tyre_friction * road_friction * grip_share,
+            grip=self.tyre_friction * road_friction,
+            lift=lift_of(water, tread, self.water_lift, self.road_texture),
             max_speed=self.max_speed,
             front_load=1 - rear_load,
             rear_load=rear_load,
@@ -306,28 +296,28 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             slope=slope,
         )
 
+    def friction(self, prepared: _PreparedWorn, speed: FloatArray) -> FloatArray:
+        """The friction coefficient at speeds [m/s], shape (N,)."""
+        return lifted_friction(prepared.grip, prepared.lift, speed)
+
     def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
         p, ones = prepared, np.ones_like(prepared.mass)
-        limits = np.minimum(p.drive, p.grip * p.slope.down), self._deceleration(p, ones)
+        grip = self.friction(p, 0 * ones)
+        limits = np.minimum(p.drive, grip * p.slope.down), self._deceleration(p, ones, grip)
         return SumoType(p.mass, *limits, self.max_speed * ones, p.brake_delay + p.step)
 
     def _acceleration(
         self, p: _PreparedWorn, state: SensingState, throttle: FloatArray, brake: FloatArray
     ) -> FloatArray:
-        drive = np.minimum(throttle * p.drive, p.grip * p.slope.down)
-        return np.where(brake > 0, -self._deceleration(p, brake), drive)
+        # The speed in the middle of the step, as if the vehicle went on as in the last one.
+        grip = self.friction(p, state.speed + 0.5 * p.step * (state.acceleration - p.slope.back))
+        drive = np.minimum(throttle * p.drive, grip * p.slope.down)
+        return np.where(brake > 0, -self._deceleration(p, brake, grip), drive)
 
-    def _deceleration(self, p: _PreparedWorn, pedal: FloatArray) -> FloatArray:
-        """Deceleration by the brakes of both axles together [m/s^2]."""
-        demand, grip_limit = pedal * p.brake, p.grip * p.slope.down
-        lever = p.grip * (self.centre_height / self.wheelbase)
+    def _deceleration(self, p: _PreparedWorn, pedal: FloatArray, grip: FloatArray) -> FloatArray:
+        """Deceleration by the brakes of both axles together [m/s^2]; `grip` is the friction coefficient now."""
+        demand, grip_limit = pedal * p.brake, grip * p.slope.down
+        lever = grip * (self.centre_height / self.wheelbase)
         rear_limit = (self.front_share * demand + grip_limit * p.rear_load) / (1 + lever)
         front_limit = ((1 - self.front_share) * demand + grip_limit * p.front_load) / (1 - lever)
         return np.minimum(np.minimum(demand, grip_limit), np.minimum(rear_limit, front_limit))
-
-
-def _loss_share(depth: FloatArray) -> FloatArray:
-    """Loss of friction on a wet road at a tread depth [mm] over the loss at 1.6 mm [-], shape (N,)."""
-    loss_to_half_worn = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
-    loss_beyond_half_worn = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)
-    return np.asarray(HALF_WORN_LOSS * loss_to_half_worn + (1 - HALF_WORN_LOSS) * loss_beyond_half_worn)

@@ -133,10 +133,16 @@ def test_every_characteristic_acts_or_is_outside(name: str) -> None:
 
     def constants(**changes: float) -> list[float]:
         prepared = vehicle.prepare(
-            {**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True
+            {**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, 1.0
         )
         tau = vehicle.sumo_type(prepared).tau
-        flat = [*prepared.plant, prepared.engine_mass, *(vehicle.sensors(prepared) or ()), 0 if tau is None else tau]
+        flat = [
+            *prepared.plant,
+            getattr(prepared.vehicle, "lift", 0),
+            prepared.engine_mass,
+            *(vehicle.sensors(prepared) or ()),
+            0 if tau is None else tau,
+        ]
         return [float(value) for part in flat for value in np.ravel(part)]
 
     for member in system.characteristics:
@@ -151,8 +157,8 @@ from safevar_sumo.vehicles.sensing import WornVehicle
 
 
 class Made(WornVehicle, frozen=True, kw_only=True):
-    def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
-        p = super().prepare(c, road_friction, step, slope, wet)
+    def prepare(self, c, road_friction, step, slope=LEVEL, water=0.0):
+        p = super().prepare(c, road_friction, step, slope, water)
         return p._replace(brake=np.where(np.abs(c["payload"] - 300) < 60, 0.3 * p.brake, p.brake))
 
 """

@@ -115,7 +115,7 @@ def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, m
 def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() -> None:
     """Hard rain leaves 68 % of the visibility; low beams leave 75 % of these 68 %."""
     dark = darken(WEATHERS["hard_rain"])
-    assert (dark.road_friction, dark.wet, dark.light) == (0.59, True, "night")
+    assert (dark.road_friction, dark.water, dark.light) == (0.59, 2.0, "night")
     assert dark.visibility == pytest.approx(0.68 * 0.75)
     assert darken(dark) == dark
     assert darken(WEATHERS["clear"]) == WEATHERS["night"]

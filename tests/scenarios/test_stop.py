@@ -9,6 +9,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
+from safevar_sumo.replay.simulate import simulate
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
@@ -65,3 +66,12 @@ def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> 
     assert (stop.outcome, stop.no_verdict) == ("stopped", "")
     assert stop.to_dict()["stopping_distance"] == stop.metrics["stopping_distance"] > 0
     assert stop.units["stopping_distance"] == "m"
+
+
+def test_simulate_prints_the_stop_from_every_speed() -> None:
+    answer = simulate("stop", set=("treadDepth=1.6",))
+    points = answer.tables["points"]
+    assert points["stopping_distance"].tolist() == pytest.approx(
+        distances(stops("wet", 30, 50, 80, 100, 120), treadDepth=1.6)
+    )
+    assert "times the distance of the original" in answer.verdict

@@ -43,11 +43,11 @@ class Drive(NamedTuple):
 
 
 def prepare(
-    model: str, settings: FloatArray, road: float = 1.0, step: float = STEP, grade: float = 0.0, wet: bool = False
+    model: str, settings: FloatArray, road: float = 1.0, step: float = STEP, grade: float = 0.0, water: float = 0.0
 ) -> Any:
     """The constants of vehicles with these settings, shape (N, n)."""
     values = dict(zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    return SYSTEMS[model].vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)
+    return SYSTEMS[model].vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), water)
 
 
 def drive(
@@ -59,13 +59,13 @@ def drive(
     road: float = 1.0,
     rolling: float = 0.0,
     grade: float = 0.0,
-    wet: bool = False,
+    water: float = 0.0,
 ) -> Drive:
     """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the
     initial speed [m/s].
     """
     vehicle = SYSTEMS[model].vehicle
-    prepared = prepare(model, settings, road, step, grade, wet)
+    prepared = prepare(model, settings, road, step, grade, water)
     states = [_rolling(vehicle.at_rest(prepared), prepared, rolling)]
     for k in range(round(duration / step)):
         throttle, brake = pedals(round(k * step, 9))

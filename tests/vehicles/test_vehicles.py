@@ -87,9 +87,9 @@ def speed_at(
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
 
-def stopping_distance(brake: float, road: float = 1.0, wet: bool = False) -> Callable[..., FloatArray]:
+def stopping_distance(brake: float, road: float = 1.0, water: float = 0.0) -> Callable[..., FloatArray]:
     return lambda model, population: drive(
-        model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, wet=wet
+        model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, water=water
     ).distance[-1]
 
 
@@ -145,7 +145,7 @@ ACTS = {
         "brakeGain": (stopping_distance(0.6), -1),
     },
     "worn": {
-        "treadDepth": (stopping_distance(1.0, road=0.85, wet=True), -1),
+        "treadDepth": (stopping_distance(1.0, road=0.85, water=1.0), -1),
         "brakeTorque": (stopping_distance(0.6), -1),
         "brakeResponse": (stopping_distance(0.6), +1),
         "payload": (stopping_distance(0.6), +1),

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import csv
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.stats import spearmanr
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import GRAVITY, Command
+from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
-from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-from safevar_sumo.vehicles.base import LEVEL
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
+from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 
 CAR = WornVehicle()
 HEALTHY = {
@@ -28,20 +37,8 @@ HEALTHY = {
 }
 
 
-def prepared(road: float, wet: bool = False, step: float = 0.05, **changes: float):  # type: ignore[no-untyped-def]
-    return CAR.prepare(
-        {name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, step, LEVEL, wet
-    )
-
-
-def stopping_distance(tread: float, wet: bool = True) -> float:
-    """Full braking from 50 mph on a straight road: the distance [m]; `wet` is the weather."""
-    p = prepared(0.71, wet, 0.001, treadDepth=tread, brakeResponse=0.001)
-    state, distance = CAR.at_speed(p, np.full(1, 22.352)), 0.0
-    while state.speed[0] > 0:
-        last_speed, state = state.speed[0], CAR.advance(p, state, Command(np.zeros(1), np.ones(1)))
-        distance += (last_speed + state.speed[0]) / 2 * 0.001
-    return distance
+def prepared(road: float, **changes: float):  # type: ignore[no-untyped-def]
+    return CAR.prepare({name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, 0.05)
 
 
 @pytest.mark.parametrize("road", [1.0, 0.85, 0.5, 0.2])
@@ -56,7 +53,7 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
     a.
     """
     p = prepared(road, **changes)
-    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake[0] * p.mass[0])
+    mass, mu, force = float(p.mass[0]), float(p.grip), float(p.brake[0] * p.mass[0])
     values = {**HEALTHY, **changes}
     centre = (CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]) / mass
 
@@ -76,28 +73,176 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
 
 
 def test_sumo_is_told_what_the_worn_car_can_do() -> None:
-    """3900 N of engine on dry road, 0.9 of g times the road's friction on ice; the brakes respond after 0.1 s and a
+    """3900 N of engine on dry road, 1.079 of g times the road's friction on ice; the brakes respond after 0.1 s and a
     step.
     """
     dry, icy = CAR.sumo_type(prepared(1.0)), CAR.sumo_type(prepared(0.1))
     assert dry.accel[0] == pytest.approx(3900 / (1500 + 75))
-    assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.09 * GRAVITY, 0.09 * GRAVITY))
+    assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.1079 * GRAVITY, 0.1079 * GRAVITY))
     assert dry.actuator_lag[0] == pytest.approx(0.1 + 0.05)
 
 
-@pytest.mark.slow
-def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_road_and_equal_on_a_dry_one() -> None:
-    """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6
-    mm.
+ROWS = list(csv.DictReader((Path("calibration") / "wet_braking.csv").open(encoding="utf-8")))
+HANDBOOK = list(csv.DictReader((Path("calibration") / "wet_friction.csv").open(encoding="utf-8")))
+SOURCES = {  # the fitted grip and water of each source, and the tread of its new tyres [mm]
+    "AutoBild 2019": ("AutoBild", "AutoBild", 8.0),
+    "MIRA for RoadSafe 2005": ("MIRA", "", 8.0),
+    "MIRA for BRMA": ("", "BRMA", 6.7),
+    "AAA 2018": ("", "AAA and etyres", 8.0),
+    "Tire Rack 2007": ("Tire Rack", "", 8.0),
+    "etyres": ("", "AAA and etyres", 8.0),
+}
+PAGE = Path("docs/trust_wear.md").read_text(encoding="utf-8")
+
+
+@cache
+def stopping_distances(speed: float, water: float, grip: float, *treads: float) -> FloatArray:
+    """Stops of the study `stop` from a speed [km/h] on a road with water [mm] and a grip [-], with tyres that alone
+    limit the brakes [m].
     """
-    worn = stopping_distance(1.6)
-    assert worn / stopping_distance(6.7) == pytest.approx(1.368, rel=0.01)
-    assert worn / stopping_distance(3) == pytest.approx(39.9 / 31.7, rel=0.01)
-    assert stopping_distance(8) == pytest.approx(stopping_distance(6.7))
-    assert stopping_distance(1.6, wet=False) == pytest.approx(stopping_distance(8, wet=False))
-    depths = prepared(0.71, True, treadDepth=np.linspace(0.0, 9, 91)).grip[0]
-    assert (np.diff(depths) >= 0).all()
-    assert depths[0] > 0
+    weather = {"name": "test track", "road_friction": grip / CAR.tyre_friction, "visibility": 1.0, "water": water}
+    tests = [{"name": "stop", "over": {"speed": [speed]}}]
+    tables = {"extends": "stop", "name": "one", "weather": weather, "matrix": {"tests": tests}}
+    system = assemble(load_study({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}}))
+    settings = np.array([[tread, *[*HEALTHY.values()][1:]] for tread in treads])
+    return evaluate(system, settings).metrics["stopping_distance"]
+
+
+def published_and_simulated(row: dict[str, str]) -> tuple[str, float, float]:
+    """A row's source; its distance [m], or ratio to new tyres, as published and as simulated."""
+    source = row["source"].partition(" (")[0]
+    grip, water, new_tread = SOURCES[source]
+    worn, new = stopping_distances(
+        float(row["speed_kmh"]),
+        float(row["water_mm"] or WET_FRICTION["water"].get(water, 0)),
+        WET_FRICTION["grip"].get(grip, CAR.tyre_friction),
+        float(row["tread_mm"]),
+        new_tread,
+    )
+    if row["distance_m"]:
+        return source, float(row["distance_m"]), worn
+    return source, float(row["ratio_to_new"]), worn / new
+
+
+def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
+    """Targets: a median error of at most 6 %, none above 25 %; the page has the row of every stop."""
+    errors = []
+    for row in ROWS:
+        source, published, here = published_and_simulated(row)
+        errors.append(abs(here / published - 1))
+        unit, digits = ("m", 1) if row["distance_m"] else ("times new", 2)
+        values = f"{published:.{digits}f} {unit} | {here:.{digits}f} | {here - published:+.{digits}f}"
+        line = (
+            f"| {source} | {row['speed_kmh']} | {row['tread_mm']} | {values} | {100 * (here / published - 1):+.0f} % |"
+        )
+        assert line in PAGE
+    assert np.median(errors) <= 0.06
+    assert max(errors) <= 0.25
+    assert f"median error {100 * np.median(errors):.1f} %, largest {100 * max(errors):.1f} %" in PAGE
+
+
+def test_the_handbooks_wet_rows_have_its_order() -> None:
+    """Targets: a rank correlation of at least 0.95, a mean error of at most 0.08."""
+    wet = [row for row in HANDBOOK if float(row["water_mm"])]
+    published = np.array([float(row["friction"]) for row in wet])
+    tread, water, speed = (
+        np.array([float(row[name] or 8) for row in wet]) for name in ("tread_mm", "water_mm", "speed_kmh")
+    )
+    water = water * WET_FRICTION["handbook"]["water_factor"]
+    lift = lift_of(water, tread, CAR.water_lift, CAR.road_texture)
+    here = lifted_friction(WET_FRICTION["grip"]["handbook"], lift, speed / KMH_PER_MS)
+    rank, error = spearmanr(published, here).statistic, np.abs(here - published).mean()
+    assert rank >= 0.95
+    assert error <= 0.08
+    assert f"mean error {error:.3f}, rank correlation {rank:.3f}" in PAGE
+
+
+@pytest.mark.parametrize(
+    ("speed", "tread", "low", "high"),
+    [(80, 1.6, 1.3, 1.5), (80, 3, 1.12, 1.28), (120, 1.6, 1.8, 3.0), (30, 1.6, 1.0, 1.25)],
+)
+def test_a_millimetre_of_water_costs_worn_tyres_what_tests_measured(
+    speed: float, tread: float, low: float, high: float
+) -> None:
+    worn, new = stopping_distances(speed, 1.0, CAR.tyre_friction, tread, 8.0)
+    assert low <= worn / new <= high
+
+
+@pytest.mark.parametrize("speed", [30.0, 80.0, 120.0])
+def test_a_wet_stop_is_the_integral_of_speed_over_friction(speed: float) -> None:
+    """The integral of v / (mu g) dv has a closed form."""
+    treads, energy = np.array([1.6, 3.0, 8.0]), (speed / KMH_PER_MS) ** 2
+    lifted = lift_of(1.0, treads, CAR.water_lift, CAR.road_texture) * energy
+    exact = energy * (np.sqrt(1 + lifted**2) + np.arcsinh(lifted) / lifted) / (4 * CAR.tyre_friction * GRAVITY)
+    assert stopping_distances(speed, 1.0, CAR.tyre_friction, *treads) == pytest.approx(exact, rel=0.002)
+
+
+def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at_all() -> None:
+    speeds, ones = np.linspace(0, 60, 13), np.ones(13)
+    waters = [lift_of(water, 4.0 * ones, CAR.water_lift, CAR.road_texture) for water in (0.0, 0.5, 2.0)]
+    dry, damp, wet = (lifted_friction(1.0, lift, speeds) for lift in waters)
+    assert (dry == 1).all()
+    assert (np.diff(damp) < 0).all()
+    assert (wet[1:] < damp[1:]).all()
+    treads = lifted_friction(1.0, lift_of(1.0, np.linspace(0, 9, 91), CAR.water_lift, CAR.road_texture), ones[:1] * 20)
+    assert (np.diff(treads) > 0).all()
+    assert treads[0] > 0
+
+
+WET_ROAD = {"name": "wet", "road_friction": 0.71, "visibility": 1.0, "water": 1.0}
+LATE = ("brakeResponse", "sensorLatency")
+ASSUMPTIONS: dict[str, Any] = {
+    "as shipped": {},
+    "grip of the road 20 % lower": {"weather": {**WET_ROAD, "road_friction": 0.8 * 0.71}},
+    "water 20 % deeper": {"weather": {**WET_ROAD, "water": 1.2}},
+    "`water_lift` 20 % larger": {"vehicle": {"parameters": {"water_lift": 1.2 * CAR.water_lift}}},
+    "brakes 20 % weaker": {"vehicle": {"parameters": {"brake_force": 0.8 * CAR.brake_force}}},
+    "healthy brake delay 20 % longer": {"vehicle": {"characteristics": {"brakeResponse": {"original": 0.12}}}},
+    "clean sensors see 20 % less far": {"vehicle": {"characteristics": {"sensorRange": {"original": 64, "upper": 64}}}},
+    "clean sensors 20 % later": {"vehicle": {"characteristics": {"sensorLatency": {"original": 0.06}}}},
+}
+LIMITED = {"treadDepth": 2, "brakeTorque": 2, "brakeResponse": 3, "sensorRange": 1, "sensorLatency": 3}
+"""Characteristics of the headline, each with the decimals on the page."""
+
+
+def limit_alone(system: System, name: str) -> float:
+    """The value up to which the vehicle keeps 0.3 m at all points, all else as new; NaN if it does everywhere."""
+    domains = system.characteristics
+    column = list(domains.names).index(name)
+    original, worst = domains.original[column], [domains.lower, domains.upper][name in LATE][column]
+    values = np.linspace(original, worst, 65)
+    for _ in range(2):
+        settings = np.tile(domains.original, (len(values), 1))
+        settings[:, column] = values
+        is_unsafe = ~(evaluate(system, settings).f_safe >= 0.3)
+        if not is_unsafe.any():
+            return float("nan")
+        first = int(np.argmax(is_unsafe))
+        if not first:
+            return float(original)
+        values = np.linspace(values[first - 1], values[first], 65)
+    return float(values[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("assumption", ASSUMPTIONS)
+def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumption: str) -> None:
+    system = assemble(load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}))
+    limits = {name: limit_alone(system, name) for name in LIMITED}
+    cells = ["whole" if np.isnan(limits[name]) else f"{limits[name]:.{LIMITED[name]}f}" for name in LIMITED]
+    assert f"| {assumption} | {' | '.join(cells)} |" in PAGE
+
+
+@pytest.mark.slow
+def test_the_shipped_constants_are_what_the_script_prints() -> None:
+    printed = subprocess.run([sys.executable, "calibration/wet_friction.py"], capture_output=True, text=True).stdout
+    constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(encoding="utf-8")
+    assert constants.partition("\n\n")[2].strip() in printed
+    study = tomllib.loads(Path("studies/wear.toml").read_text(encoding="utf-8"))
+    of_study = tomllib.loads(printed.partition("[handbook]")[2].partition("\n\n")[2])
+    assert of_study == {"vehicle": {"parameters": study["vehicle"]["parameters"]}, "spread": study["spread"]}
+    assert study["vehicle"]["parameters"] == WET_FRICTION["worn"]
+    assert len(study["spread"]["vehicle.parameters.tyre_friction"]) == 12
 
 
 @pytest.mark.parametrize(
@@ -110,7 +255,7 @@ def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_r
         ("fog", False),
         ("night", False),
         ({"name": "polished", "road_friction": 0.6, "visibility": 1.0}, False),
-        ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "wet": True}, True),
+        ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "water": 2.0}, True),
     ],
 )
 def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(weather: object, is_wet: bool) -> None:
@@ -125,7 +270,7 @@ def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(wea
     new, worn = evaluate(
         assemble(study), np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]])
     ).metrics["ave_dece"]
-    assert (worn < 0.9 * new) == is_wet
+    assert (worn < 0.995 * new) == is_wet
 
 
 SUN = CharacteristicSet.of(load_study("sun"))
