@@ -17,8 +17,6 @@ from rich.progress import BarColumn, Progress as Bar, ProgressColumn, Task, Text
 from rich.table import Table
 from rich.text import Text
 
-from safevar_sumo.study import Study
-
 Progress = Callable[[str, int, int], None]
 """A function that shows progress, called with the stage, the amount done in it, and its total; first with nothing done.
 """
@@ -81,24 +79,6 @@ def printable_text(text: object, style: str = "") -> Text:
 def print_text(console: Console, text: str) -> None:
     """Print a line of text without wrapping and markup."""
     console.print(text, soft_wrap=True, markup=False, highlight=False)
-
-
-def print_parts(console: Console, parts: Iterable[str | Table]) -> None:
-    """Print sentences and tables, of which those without rows are left out."""
-    for part in parts:
-        if isinstance(part, str):
-            print_text(console, part)
-        elif part.row_count:
-            console.print(part)
-
-
-def constraints_in_words(study: Study) -> list[str]:
-    """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
-    characteristics = study.vehicle.characteristics
-    conditions = "; ".join(
-        f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}" for constraint in study.constraints
-    )
-    return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
 
 
 def show_no_progress(stage: str, done: int, total: int) -> None:

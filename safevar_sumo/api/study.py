@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
-import pandas as pd
 
-from safevar_sumo.api.running import load_for_search
-from safevar_sumo.campaign import Campaign, RunKey, all_runs, run_campaign
+from safevar_sumo.api.running import load_for_search, run
+from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.campaign.campaign import choose_engine, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import open_pool
@@ -19,45 +18,30 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Jobs, Range
-from safevar_sumo.questions.case import Case, UnanswerableError, build_case
-from safevar_sumo.questions.research_questions.comparisons import compare_over_runs, opponents_of, titles_of
+from safevar_sumo.questions.case import UnanswerableError
+from safevar_sumo.questions.research_questions.answer import answer_questions
+from safevar_sumo.questions.research_questions.comparisons import titles_of
+from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.questions.words import ending_in_words, list_of_changes, number_of, question_command
-from safevar_sumo.records import Evaluations, JsonObject, Outcome
-from safevar_sumo.results import CHOICES, evaluations_frame, failure_lines, load_runs, record, solutions_frame
-from safevar_sumo.scenarios import degree_note
-from safevar_sumo.study import Study, label_of, load_study
+from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.results import CHOICES
+from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import System
-from safevar_sumo.terminal import open_progress
-from safevar_sumo.vehicles import CharacteristicSet
 
-ALGORITHM = {"algorithm": Column("", "algorithm")}
-STATUS = ALGORITHM | {
+ALGORITHMS = {
+    "algorithm": Column("", "algorithm"),
     "finished": Column("", "finished runs"),
     "runs": Column("", "runs"),
     "simulated": Column("", "different settings simulated so far"),
     "collisions": Column("", "those that collide"),
+    "invalid_tests": Column("", "those that leave a test's speed before the ADS acts: neither failure nor success"),
     "simulator_errors": Column("", "those that cannot be simulated"),
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
+    "solutions": Column("", "solutions of finished runs"),
 }
-SUMMARY = {
-    "algorithm": Column("", "algorithm, or the original vehicle"),
-    "evaluations": Column("", "different settings that a run simulates, mean", ".0f"),
-    "simulated_collisions": Column("", "simulations that collide"),
-    "solutions": Column("", "solutions"),
-    "collisions": Column("", "solutions that collide"),
-}
-COMPARISONS = {
-    "question": Column("", "research question"),
-    "algorithm": Column("", "algorithm"),
-    "baseline": Column("", "the other algorithm, or the original vehicle"),
-    "metric": Column("", "safety metric or quality of the runs' fronts"),
-    "effect_size": Column("", "A12 over runs; RQ1: below 0.5 more unsafe; RQ2: above 0.5 better", ".2f"),
-    "p_holm": Column("", "p-value after Holm's correction", ".2g"),
-    "significant": Column("", "whether it is significant"),
-}
-REMARKS = {"remark": Column("", "what to know about these results")}
 
 
 def study(
@@ -118,7 +102,7 @@ def study(
     as_written = load_study(study)
     directory = out or Path("results") / as_written.name
     if status:
-        return read_status(directory)
+        return summarise(load(directory))
     search, given = as_written.search, {"runs": runs, "evaluations": evaluations, "seed": seed}
     changes: JsonObject = {name: value for name, value in given.items() if value is not None}
     if algorithms is not None:
@@ -131,19 +115,23 @@ def study(
     keys = _select_runs(all_runs(loaded), only, shard)
     if not keys:
         warn(f"--shard {shard} selects none of the runs")
-    with open_pool(jobs, cluster) as pool:
-        if dry_run:
+    if dry_run:
+        with open_pool(jobs, cluster) as pool:
             used, reason = choose_engine(system, engine)
             task = Task(study=loaded, engine=used, batch_size=batch or settings_per_batch(system, used))
             return _forecast(loaded, len(keys), measure_speed(task, pool), f"{used}: {reason}")
-        try:
-            with open_progress(not quiet) as show:
-                arguments = (loaded, system, keys, directory, pool, show, warn, batch, engine)
-                campaign = run_campaign(*arguments, retry_failed=retry_failed)
-        except KeyboardInterrupt:
-            warn(f"finished evaluations are kept in {directory}: run the same command again to continue")
-            raise
-    return None if quiet else _summary(loaded, system, campaign, directory)
+    options: dict[str, Any] = {"jobs": jobs, "cluster": cluster, "only": keys, "batch": batch, "engine": engine}
+    try:
+        results = run(loaded, directory, progress=not quiet, retry_failed=retry_failed, **options)
+    except KeyboardInterrupt:
+        warn(f"finished evaluations are kept in {directory}: run the same command again to continue")
+        raise
+    if quiet:
+        return None
+    answer, reason = summarise(results), why_no_verdict(system)
+    following = ", ".join(question_command(name, str(directory)) for name in ("explain", "tolerance"))
+    verdict = f"{reason or _verdict(results, system)} Next: {following}"
+    return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
 
 def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
@@ -160,27 +148,6 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
             raise InputError("shard", repr(shard), "K/N, with K in 1..N")
         keys = keys[int(rank) - 1 :: int(count)]
     return keys
-
-
-def read_status(directory: Path) -> Answer:
-    """How far the study in a directory is: runs, evaluations, collisions."""
-    results = load_runs(directory)
-    study, finished = msgspec.convert(results.manifest["study"], Study), Counter(name for name, _ in results.finished)
-    if "imported" in results.manifest:
-        raise InputError(directory, "holds imported solutions, which have no runs", "results of the command `study`")
-    rows = []
-    for algorithm in map(label_of, study.search.algorithms):
-        group = results.evaluations[results.evaluations["algorithm"] == algorithm]
-        counts = [(group["outcome"] == outcome).sum() for outcome in (Outcome.COLLISION, Outcome.SIMULATOR_ERROR)]
-        rows.append((algorithm, finished[algorithm], study.search.runs, len(group), *counts, group["f_safe"].min()))
-    runs = study.search.runs * len(rows)
-    return Answer(
-        question="study",
-        study=study,
-        verdict=f"{sum(finished.values())} of {number_of(runs, 'run')} finished in {directory}.",
-        numbers={"finished": sum(finished.values()), "runs": runs, "evaluations": study.search.evaluations},
-        tables={"algorithms": tabulate(study.title, STATUS, rows)},
-    )
 
 
 def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
@@ -204,102 +171,65 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
     )
 
 
-def _summary(study: Study, system: System, campaign: Campaign, directory: Path) -> Answer:
-    """The verdict, the original and each algorithm's solutions, RQ1 and RQ2 over runs, and the next two commands."""
-    names = system.characteristics.names
-    solutions = solutions_frame(names, [(run.key, run.solutions) for run in campaign.runs])
-    case = build_case(
-        study,
-        record(campaign.original, row=0),
-        solutions,
-        solutions_frame(names, []),
-        tuple(run.key for run in campaign.runs),
-        scoring=campaign.scoring,
-    )
-    remarks = [degree_note(contact_degree(system)), "TET and TIT are means over solutions without collision."]
-    comparisons, reason = _compare_over_runs(case)
-    remarks += [reason] if reason else []
-    if failures := [failure for run in campaign.runs for failure in run.failures]:
-        lines = "; ".join(failure_lines(failures))
-        remarks.append(f"{len(failures)} settings could not be simulated (simulator-error): {lines}.")
-    if invalid := sum(run.invalid_tests for run in campaign.runs):
-        remarks.append(
-            f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
-            "they are neither failures nor successes, and no result contains them."
-        )
-    verdict = [campaign.no_verdict] if campaign.no_verdict else _verdict(case, system, campaign.original)
-    following = ", ".join(question_command(name, str(directory)) for name in ("explain", "tolerance"))
-    return Answer(
-        question="study",
-        study=study,
-        verdict=" ".join([*verdict, f"Next: {following}"]),
-        numbers={
-            "driven": not campaign.no_verdict,
-            "results": str(directory),
-            "runs": len(campaign.runs),
-            "solutions": len(solutions),
-            "unsafe": str(case.unsafe),
-        },
-        tables={
-            "algorithms": _summary_table(study, campaign, solutions),
-            "comparisons": tabulate("RQ1 and RQ2 over runs", COMPARISONS, comparisons, words=titles_of([case])),
-            "remarks": tabulate("Remarks", REMARKS, [(remark,) for remark in remarks]),
-        },
-    )
-
-
-def _verdict(case: Case, system: System, original: Evaluations) -> list[str]:
+def _verdict(results: Results, system: System) -> str:
     """How many solutions are unsafe, and how little is enough."""
-    unsafe, names = case.unsafe, list(case.characteristics.names)
-    if original.collided[0] and not system.rater:
-        return ["The original vehicle itself collides: no change is needed."]
+    case, names = results.case, list(system.characteristics.names)
+    if results.original["collision"] and not system.rater:
+        return "The original vehicle itself collides: no change is needed."
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
-        return ["No solution."]
-    failures = solutions[unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
-    counts = f"{len(failures)} of {len(solutions)} different solutions are unsafe: {unsafe.description}."
+        return "No solution."
+    failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
+    counts = f"{len(failures)} of {len(solutions)} different solutions are unsafe: {case.unsafe.description}."
     if failures.empty:
-        return [counts]
+        return counts
     fewest = failures.iloc[0]
     ending = ending_in_words(fewest["outcome"], fewest["f_safe"], contact_degree(system))
     if system.rater:
         ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
     changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})
-    return [counts, f"With the fewest changes it {ending}: {changes}."]
+    return f"{counts} With the fewest changes it {ending}: {changes}."
 
 
-def _summary_table(study: Study, campaign: Campaign, solutions: pd.DataFrame) -> pd.DataFrame:
-    """The original vehicle, and each algorithm's solutions: their number, collisions, and means of metrics."""
-    metrics = campaign.scoring.metrics
-    original = evaluations_frame(CharacteristicSet.of(study).names, [(("", 0), campaign.original)])
-    rows = [("original", np.nan, int(campaign.original.collided[0]), np.nan, np.nan, *_means(original, campaign))]
+def summarise(results: Results) -> Answer:
+    """How far a study is: a row for each algorithm, and RQ1 and RQ2 over runs as far as they have an answer.
+
+    Raises
+    ------
+    InputError
+        If the results are imported.
+    """
+    case, study = results.case, results.study
+    if not case.has_runs:
+        problem = "holds imported solutions, which have no runs"
+        raise InputError(results.directory, problem, "results of the command `study`")
+    finished, rows = Counter(name for name, _ in results.finished), []
     for name in study.search.labels:
-        runs = [run for run in campaign.runs if run.key.algorithm == name]
-        found = solutions[solutions["algorithm"] == name]
-        if runs:
-            counts = (np.mean([run.simulated for run in runs]), sum(run.collisions for run in runs), len(found))
-            collisions = (found["outcome"] == Outcome.COLLISION).sum()
-            rows.append((name, *counts, collisions, *_means(found, campaign)))
-    columns = SUMMARY | {metric.name: Column(metric.unit, f"mean {metric.title}", ".2f") for metric in metrics}
-    return tabulate(study.title, columns, rows)
-
-
-def _means(frame: pd.DataFrame, campaign: Campaign) -> list[float]:
-    return [frame[metric.name].mean() for metric in campaign.scoring.metrics]
-
-
-def _compare_over_runs(case: Case) -> tuple[pd.DataFrame, str]:
-    """The rows of `COMPARISONS`, and why some are missing."""
+        simulated, solutions = (frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions))
+        outcomes = Counter(simulated["outcome"])
+        counts = [outcomes[kind] for kind in (Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
+        means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
+        best = simulated["f_safe"].min()
+        rows.append((name, finished[name], study.search.runs, len(simulated), *counts, best, len(solutions), *means))
+    metrics = {metric.name: Column(metric.unit, "mean over solutions", ".2f") for metric in case.scoring.metrics}
+    table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     try:
-        tests = compare_over_runs(case).rename_axis("question").reset_index()
-    except UnanswerableError as error:
-        return pd.DataFrame(), f"RQ1 and RQ2: {error.problem}."
-    if "baseline" not in tests:
-        tests["baseline"] = None
-    tests["baseline"] = tests["baseline"].fillna("original")
-    try:
-        opponents_of(case)
-    except UnanswerableError as error:
-        return tests, f"RQ2: {error.problem}."
-    few = tests[~tests["enough_runs"]]["question"].unique()
-    return tests, f"Too few runs for a test: {', '.join(few)}." if len(few) else ""
+        over_runs = answer_questions([case], names=("rq1-runs", "rq2-runs")).tables
+    except UnanswerableError:
+        over_runs = {}
+    runs = study.search.runs * len(rows)
+    return Answer(
+        question="study",
+        study=study,
+        verdict=f"{len(results.finished)} of {number_of(runs, 'run')} finished in {results.directory}.",
+        numbers={
+            "results": str(results.directory),
+            "finished": len(results.finished),
+            "runs": runs,
+            "evaluations": study.search.evaluations,
+            "solutions": len(results.solutions),
+            "original_outcome": results.original["outcome"],
+            "original_degree": results.original[SAFETY_DEGREE],
+        },
+        tables={"algorithms": table, **over_runs},
+    )

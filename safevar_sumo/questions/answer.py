@@ -31,7 +31,7 @@ from safevar_sumo.questions.tables import (
 )
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import print_parts, print_text
+from safevar_sumo.terminal import print_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -142,7 +142,11 @@ class Answer:
         """Print the verdict, the tables and the numbers."""
         print_text(console, self.verdict)
         for frame in self._short_tables.values():
-            print_parts(console, terminal_tables(frame, console.width))
+            for part in terminal_tables(frame, console.width):
+                if isinstance(part, str):
+                    print_text(console, part)
+                elif part.row_count:
+                    console.print(part)
         if self._long_tables:
             print_text(console, self._long_tables)
         print_text(console, "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()))

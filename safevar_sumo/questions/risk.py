@@ -21,11 +21,10 @@ from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, tabulate, w
 from safevar_sumo.questions.ask import Count, Criterion, Share, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.questions.words import constraints_in_words, join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
-from safevar_sumo.terminal import constraints_in_words
 
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case

@@ -17,10 +17,9 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.questions.words import constraints_in_words, join_phrases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import constraints_in_words
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from shlex import quote
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
+from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 OUTCOME_VERBS = {
@@ -98,3 +99,12 @@ def share_in_words(share: float) -> str:
 def two_decimals(value: float | None) -> str:
     """A value with two decimals, never `-0.00`; `-` if undefined."""
     return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"  # -0.0 + 0.0 is 0.0
+
+
+def constraints_in_words(study: Study) -> list[str]:
+    """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
+    characteristics = study.vehicle.characteristics
+    conditions = "; ".join(
+        f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}" for constraint in study.constraints
+    )
+    return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []

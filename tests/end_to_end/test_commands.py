@@ -56,11 +56,11 @@ def test_a_title_is_no_markup(in_tmp: Path) -> None:
 def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
     output = run("study", "smoke").stdout
     for part in (
-        "original",
-        "nsga2",
-        "RQ1",
-        "RQ2",
-        "Too few runs for a test: RQ1",
+        "original_outcome: stopped",
+        "NSGA-II",
+        "RQ1 over runs",
+        "RQ2 over runs",
+        "too few runs for all 8 tests of RQ1 (8 are needed)",
         "Next: python -m safevar_sumo explain results/smoke, python -m safevar_sumo tolerance results/smoke",
     ):
         assert part in output

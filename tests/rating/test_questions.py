@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -21,6 +22,7 @@ from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.explain.failures import compare_at_cells
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.questions.tolerance.scans import scan
+from safevar_sumo.results import record
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, run, searched
@@ -88,7 +90,8 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_po
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure["points"])
     assert [sorted(changes) for changes in answer.tables["causes"]["changes"]] == [["brakeTorque"]]
     assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [None] * 3
-    _, verdict = _verdict(case, assemble(case.study), original)
+    results: Any = SimpleNamespace(case=case, original=record(original, row=0))
+    verdict = _verdict(results, assemble(case.study))
     kept = evaluations.column("rating_points")[case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]]
     assert f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
 

@@ -48,12 +48,11 @@ from safevar_sumo.questions.preventability import (
     judge_sample,
 )
 from safevar_sumo.questions.tables import Column, tabulate, with_interval
-from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of, share_in_words
+from safevar_sumo.questions.words import constraints_in_words, ending_in_words, join_phrases, number_of, share_in_words
 from safevar_sumo.records import BoolArray, JsonObject, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import constraints_in_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -84,8 +84,8 @@ def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
         return causes_of_runs(case, evaluator, limit)
 
 
-def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT) -> Answer:
-    """Every table of the cases; a table that no case answers has no row, and a remark says why.
+def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: Collection[str] = TABLES) -> Answer:
+    """Every named table of the cases; a table that no case answers has no row, and a remark says why.
 
     Raises
     ------
@@ -95,7 +95,8 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT) -> Answe
     words = titles_of(cases)
     frames: dict[str, pd.DataFrame] = {}
     remarks, errors = list[tuple[str, str]](), list[UnanswerableError]()
-    for name, (title, compute, columns, wide) in TABLES.items():
+    for name in names:
+        title, compute, columns, wide = TABLES[name]
         if name == CAUSES and not choices.causes:
             continue
         parts = list[pd.DataFrame]()

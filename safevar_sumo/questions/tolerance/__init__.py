@@ -25,12 +25,11 @@ from safevar_sumo.questions.tolerance.boxes import random_settings
 from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.questions.tolerance.rows import limit_rows
 from safevar_sumo.questions.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, scan
-from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.questions.words import constraints_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study, limits_of
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import constraints_in_words
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
