@@ -111,7 +111,8 @@ def first_sentence(function: str) -> str:
     """The first paragraph of a function's docstring, read from its file: to load it takes long."""
     module, _, name = function.partition(":")
     path = Path(__file__).parents[1] / module.replace(".", "/")
-    source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
+    file = path.with_suffix(".py")
+    source = (file if file.exists() else path / "__init__.py").read_text(encoding="utf-8")
     docstring = re.search(rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', source, re.DOTALL | re.MULTILINE)
     assert docstring is not None
     return " ".join(docstring[1].split())
