@@ -15,7 +15,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import region_of
 from tests.in_process import json_of, run
 from tests.search.test_algorithms import SUN
@@ -102,10 +102,6 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     ):
         said = run(*question.split(), "--unsafe", "below=2.5").stdout
         assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in said, question
-
-
-def constrained(*constraints: Mapping[str, Any]) -> Study:
-    return load_study("smoke", constraints=list(constraints))
 
 
 def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_feasible() -> None:
