@@ -150,9 +150,10 @@ def explain(
     holding, ranges = list[BoolArray](), Ranges()
     if fits and study.spread and len(runs):
         chosen = [cause for group in of_chosen for cause in group]
-        holding = across(evaluator, fits, lambda each: are_causes(each, chosen, population.unsafe))
+        unverified = evaluator.for_study(study, verified=0)
+        holding = across(unverified, fits, lambda each: are_causes(each, chosen, population.unsafe))
         shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-        ranges = ranges_across_fits(evaluator, fits, runs, population.unsafe, *shares)
+        ranges = ranges_across_fits(unverified, fits, runs, population.unsafe, *shares)
     solutions = _solutions_frame(population, evaluator, reasons)
     tables = {
         "causes": _causes_table(population, evaluator, holding, solutions, of_chosen),
@@ -285,11 +286,11 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
         ends = [
-            f"the {who} {ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)}"
+            f"The {who} {ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)}."
             for who, run in (("worst", nearest), ("original", population.original))
             if len(run)
         ]
-        return f"{counts} {join_phrases(ends)}.".replace(" the", " The", 1)
+        return " ".join([counts, *ends])
     leading = causes.iloc[0]
     if not leading["changes"]:
         return f"The original vehicle itself is unsafe: no change is needed. {counts}"
