@@ -28,7 +28,7 @@ from safevar_sumo.results import record
 from safevar_sumo.scenarios import Scenario, distance_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study as read_study
 from safevar_sumo.sumo.batch import drive_all, score
-from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
+from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble, create_shipped_models
@@ -178,6 +178,14 @@ class Simulation:
         return float(self.evaluation.gaps(self._contact)[0])
 
     @property
+    def numbers(self) -> JsonObject:
+        """Outcome, metrics, objectives and gap as plain values, None where undefined; `driven` is false if simulations
+        of the study tell nothing about its ADS.
+        """
+        gap = finite_or_none(self.gap)
+        return {"driven": not self.no_verdict, **record(self.evaluation, row=0), "gap": gap}
+
+    @property
     def verdict(self) -> str:
         """How the simulation ended, in words."""
         if self.outcome is Outcome.COLLISION:
@@ -189,14 +197,8 @@ class Simulation:
         )
 
     def to_dict(self) -> JsonObject:
-        """The JSON of `simulate`: plain values, None where undefined."""
-        return {
-            "study": self.study.name,
-            **driven_entry(self.no_verdict),
-            "vcs": dict(self.setting),  # vehicle characteristics
-            **record(self.evaluation, row=0),
-            "gap": finite_or_none(self.gap),
-        }
+        """Study, setting (vcs: vehicle characteristics), outcome and all numbers as plain values."""
+        return {"study": self.study.name, "vcs": dict(self.setting), **self.numbers}
 
     def _repr_html_(self) -> str:
         import pandas as pd

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,13 +17,17 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, tabulate
-from safevar_sumo.questions.ask import Range, find_question
+from safevar_sumo.questions.ask import Range
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import number_of, points_in_words
 from safevar_sumo.records import FloatArray, JsonObject
-from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, record, row_of_handle
+from safevar_sumo.replay import animation
+from safevar_sumo.replay.comparison import compare_setting, list_differences, why_different
+from safevar_sumo.replay.figure import draw_comparison
+from safevar_sumo.replay.gui import show_in_gui
+from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -37,11 +41,6 @@ from safevar_sumo.sumo.matrix import (
 )
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from safevar_sumo.replay.comparison import Comparison
 
 REMARKS = {"remark": Column("", "what to know about this simulation")}
 CHARACTERISTICS = {
@@ -156,7 +155,7 @@ def simulate(
     requested = _combine(values, target.setting(system), system)
     if not beyond and set:
         system.check_feasible(requested, "set", filtered=not no_filter, switch="--beyond")
-    for path, name, endings in ((trace, "trace", (".csv",)), (animate, "animate", (".gif", ".html"))):
+    for path, name, endings in ((trace, "trace", (".csv",)), (animate, "animate", animation.ENDINGS)):
         if path is not None:
             check_writable(path, name, endings, but=SOLUTIONS)
     if any(len(options) > 1 for options in values.values()):
@@ -170,29 +169,13 @@ def simulate(
     if trace is not None:
         with whole_file(trace, "trace") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")
-    compare = cache(partial(_compare, target.study, system, simulation.evaluation.settings[0]))
+    compare = cache(partial(compare_setting, target.study, system, simulation.evaluation.settings[0]))
     if animate is not None:
-        from safevar_sumo.replay import animation
-
         animation.animate(compare(), animate)
     if gui:
-        from safevar_sumo.replay.gui import show_in_gui
-
         show_in_gui(compare(), slower=slower)
     answer = _answer(target, system, simulation, with_spread=spread)
-    return replace(answer, draw=lambda _: _draw(compare()))
-
-
-def _compare(study: Study, system: System, setting: FloatArray) -> Comparison:
-    from safevar_sumo.replay.comparison import compare_setting
-
-    return compare_setting(study, system, setting)
-
-
-def _draw(comparison: Comparison) -> Figure:
-    from safevar_sumo.replay.figure import draw_comparison
-
-    return draw_comparison(comparison)
+    return replace(answer, draw=lambda _: draw_comparison(compare()))
 
 
 def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
@@ -202,8 +185,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     tables = {"characteristics": _characteristics(simulation), "results": _results(simulation)}
     verdict = [simulation.no_verdict, *_verdict(simulation)]
     if system.rater is not None:
-        command = _rating_command(target, system, simulation)
-        verdict.append(f"{len(system.matrix)} cells and variations: run `{command}`.")
+        verdict.append(f"The command `rating` simulates all {len(system.matrix)} cells and variations.")
     elif system.matrix:
         points = [_point_row(result) for result in simulate_all_points(system, setting[np.newaxis])]
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
@@ -220,7 +202,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         question="simulate",
         study=study,
         verdict=" ".join(filter(None, verdict)),
-        numbers={"driven": not simulation.no_verdict, **handle, **_numbers(simulation)},
+        numbers={**handle, **simulation.numbers},
         tables=tables,
     )
 
@@ -260,8 +242,6 @@ def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -
 
 
 def _warn_of_differences(target: Target, row: JsonObject, simulation: Simulation) -> None:
-    from safevar_sumo.replay.comparison import list_differences, why_different
-
     why = why_different(is_imported="run" not in row)
     for difference in list_differences(simulation.evaluation, row):
         warn(f"{target.handle} of {target.source}: {difference}; {why}")
@@ -300,10 +280,6 @@ def _remark_table(remarks: list[str]) -> pd.DataFrame:
     return tabulate("Remarks", REMARKS, [(remark,) for remark in dict.fromkeys(remarks)])
 
 
-def _numbers(simulation: Simulation) -> JsonObject:
-    return {**record(simulation.evaluation, row=0), "gap": simulation.gap}
-
-
 def _characteristics(simulation: Simulation) -> pd.DataFrame:
     def row(item: Characteristic) -> tuple[Any, ...]:
         value = simulation.setting[item.name]
@@ -314,7 +290,7 @@ def _characteristics(simulation: Simulation) -> pd.DataFrame:
 
 
 def _results(simulation: Simulation) -> pd.DataFrame:
-    original, simulated = _numbers(simulation.original), _numbers(simulation)
+    original, simulated = simulation.original.numbers, simulation.numbers
     names = {"outcome": "", **simulation.units}
     return tabulate("Results", RESULTS, [(name, unit, original[name], simulated[name]) for name, unit in names.items()])
 
@@ -358,14 +334,3 @@ def _resets(simulation: Simulation) -> list[str]:
         f"{simulation.setting[name]:g}; --no-filter keeps it."
         for name, value in simulation.reset_values.items()
     ]
-
-
-def _rating_command(target: Target, system: System, simulation: Simulation) -> str:
-    """The command that rates the simulated vehicle: a solution, and the values that differ from it or from the
-    original.
-    """
-    base = target.setting(system).tolist()
-    pairs = zip(system.characteristics.names, base, strict=True)
-    changes = [f"{name}={simulation.setting[name]!r}" for name, value in pairs if simulation.setting[name] != value]
-    solution = None if target.handle is None else str(target.handle)
-    return find_question("rating").command_line([target.source], None, {"set": tuple(changes), "solution": solution})

@@ -45,11 +45,6 @@ def why_no_verdict(system: System) -> str:
     )
 
 
-def driven_entry(no_verdict: str) -> dict[str, bool]:
-    """The entry that an answer's JSON object has if no verdict is possible."""
-    return {"driven": False} if no_verdict else {}
-
-
 def _problem(runs: SimulationRuns) -> str:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing."""
     trace = runs.trace
