@@ -154,17 +154,25 @@ STEP_DECIMALS = 6
 
 
 class DelayLine(NamedTuple):
-    """A delay line: the delay as `steps` and a `fraction` of a step, and the past values, oldest first."""
+    """A delay line: the delay as `steps` and a `fraction` of a step, one for all vehicles or one for each, and the past
+    values, oldest first.
+    """
 
     steps: int
-    fraction: float
+    fraction: float | FloatArray
     past: tuple[FloatArray, ...] = ()
 
     @classmethod
     def by(cls, delay: float, step: float) -> DelayLine:
         """The delay line for a delay [s] at a time step [s]."""
-        steps, fraction = divmod(round(delay / step, STEP_DECIMALS), 1)
-        return cls(int(steps), fraction)
+        steps, fraction = cls.parts(delay, step)
+        return cls(int(steps), float(fraction))
+
+    @staticmethod
+    def parts(delay: float | FloatArray, step: float) -> tuple[Any, Any]:
+        """Whole steps and the fraction of a step of a delay [s], or of several."""
+        steps, fraction = np.divmod(np.round(np.asarray(delay) / step, STEP_DECIMALS), 1)
+        return steps, fraction
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
         """The values one delay ago, linear between two steps, and the next delay line.
@@ -174,11 +182,11 @@ class DelayLine(NamedTuple):
         """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older, newer = past[0], past[1]
-        if self.fraction:
+        if np.any(self.fraction):
             with np.errstate(invalid="ignore"):  # the difference of two infinities
                 mixture = newer + (older - newer) * self.fraction
-            is_defined = np.isfinite(mixture)
-            newer = mixture if is_defined.all() else np.where(is_defined, mixture, older)
+            is_defined, undelayed = np.isfinite(mixture), np.asarray(self.fraction) == 0
+            newer = mixture if is_defined.all() else np.where(is_defined, mixture, np.where(undelayed, newer, older))
         return newer, DelayLine(self.steps, self.fraction, past)
 
 

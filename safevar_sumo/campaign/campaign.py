@@ -112,7 +112,7 @@ def run_campaign(
 
 def evaluate_original(task: Task, pool: Pool) -> Evaluations:
     """Evaluate the original vehicle; raises an error if a search cannot compare with it."""
-    settings = np.array([[row.original for row in task.study.vehicle.characteristics.values()]])
+    settings = np.array([[row.original for row in task.study.domains.values()]])
     original: Evaluations = carry_out(evaluate_settings, [(task, settings)], pool)[0]
     if original.failed[0]:
         raise SimulationError(

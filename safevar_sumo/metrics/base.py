@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Legal, UserCode, quoted
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import SAFETY_DEGREE, MetricsTable, unit_text
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, MetricsTable, unit_text
 
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
@@ -151,17 +151,40 @@ class Objective(Struct, frozen=True, kw_only=True):
         return -1.0 if self.maximised else 1.0
 
 
-class Scoring(Struct, frozen=True, kw_only=True):
-    """The metrics of a study and the objectives of its searches; stored in results beside the study."""
+class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The metrics of a study and the objectives of its searches; stored in results beside the study.
+
+    In a study that searches its scenario, a setting is feasible if the original vehicle has at least the safety degree
+    `safe_original` in the same encounter [m].
+    """
 
     metrics: tuple[MetricFacts, ...]
     objectives: tuple[Objective, ...]
+    safe_original: float | None = None
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether settings can be infeasible, which their evaluation tells."""
+        return self.safe_original is not None
+
+    def violation(self, evaluations: Evaluations) -> FloatArray:
+        """By how much the original vehicle is not safe in each setting's encounter, shape (M,); 0 if it is, infinite if
+        it could not be simulated.
+        """
+        if self.safe_original is None:
+            return np.zeros(len(evaluations))
+        shortfall = self.safe_original - evaluations.column(ORIGINAL_DEGREE)
+        return np.where(np.isnan(shortfall), np.inf, np.maximum(shortfall, 0.0))
 
     def values(self, evaluations: Evaluations) -> FloatArray:
         """Values of the objectives, smaller being better; shape (M, objectives)."""
         return np.stack([objective.sign * evaluations.column(objective.name) for objective in self.objectives], axis=1)
 
     def valid(self, evaluations: Evaluations) -> BoolArray:
+        """Whether the simulation succeeded, every objective is defined and the setting is feasible; shape (M,)."""
+        return np.asarray(self.scored(evaluations) & (self.violation(evaluations) == 0))
+
+    def scored(self, evaluations: Evaluations) -> BoolArray:
         """Whether the simulation succeeded and every objective is defined; shape (M,)."""
         return np.asarray(evaluations.valid & np.isfinite(self.values(evaluations)).all(axis=1))
 

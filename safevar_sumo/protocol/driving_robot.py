@@ -50,8 +50,8 @@ class DrivingRobot:
         self, points: Sequence[Point], vehicle: Vehicle, prepared: Prepared, state: VehicleState, step: float
     ) -> None:
         n = len(state.speed)
-        speeds = [point.scenario.test_speed for point in points]
-        self._test_speed = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
+        speeds = [np.nan if speed is None else speed for speed in (point.scenario.test_speed for point in points)]
+        self._test_speed = np.concatenate([np.broadcast_to(speed, n // len(points)) for speed in speeds])
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()

@@ -165,7 +165,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     SimulationError, InputError
         If `simulate` raises it.
     """
-    original = system.characteristics.original
+    original = system.characteristics.with_original_vehicle(setting)
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     worst_system = system_at_worst_point(system, settings)
     worst = worst_system.scenario, worst_system.weather

@@ -89,7 +89,8 @@ def load_runs(directory: str | Path) -> StoredResults:
     """
     folder = Path(directory)
     manifest = read_manifest(folder)
-    characteristics = manifest["study"]["vehicle"]["characteristics"]
+    study = manifest["study"]
+    characteristics = [*study["vehicle"]["characteristics"], *study["scenario"].get("search", ())]
     if "imported" in manifest:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))

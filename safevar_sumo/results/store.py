@@ -87,7 +87,7 @@ class ResultsDirectory:
 
     def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
-        frame = solutions_frame(self._study.vehicle.characteristics, solutions.items())
+        frame = solutions_frame(self._study.domains, solutions.items())
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
     def extent_remarks(self, names: Collection[str]) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -17,7 +17,17 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Coordinates, Frame, PreCrash, Roads, World, XmlChanges
+from safevar_sumo.scenarios.base import (
+    Coordinates,
+    Frame,
+    Layout,
+    PreCrash,
+    Roads,
+    World,
+    XmlChanges,
+    as_text,
+    driven_distance,
+)
 from safevar_sumo.scenarios.euro_ncap import (
     BODIES,
     EXIT_LANE,
@@ -25,6 +35,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     JUNCTION_LANE,
     KMH,
     SAME_DIRECTION,
+    TARGET,
     VUT_LANE,
     BodySize,
     Direction,
@@ -62,17 +73,17 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
     """
 
     @property
-    def gap(self) -> float:
+    def gap(self) -> Any:
         """Gap to the target at the start [m]."""
         raise NotImplementedError
 
     @property
-    def target_speed_at(self) -> Callable[[float], float]:
+    def target_speed_at(self) -> Callable[[Any], Any]:
         """The target's speed [m/s] as a function of the time [s]."""
         raise NotImplementedError
 
     @property
-    def offset(self) -> float:
+    def offset(self) -> Any:
         """Distance of the target's rear to the right of the lane's middle [m]."""
         return lateral_offset(self.impact_location, self.vut_width)
 
@@ -114,9 +125,9 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
                 **({f"vType[@id='{replaced}']": target_type(name)} if replaced else {}),
                 "vehicle[@id='target']": {
                     "type": name,
-                    "departPos": repr(START_POSITION + self.gap + self._body.length),
-                    "departPosLat": repr(-self.offset),
-                    "departSpeed": repr(self.target_speed_at(0.0)),
+                    "departPos": as_text(START_POSITION + self.gap + self._body.length),
+                    "departPosLat": as_text(-self.offset),
+                    "departSpeed": as_text(self.target_speed_at(0.0)),
                 },
             }
         exit_along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
@@ -127,6 +138,13 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
             "vType[@id='target']": target_type(name),
             "vehicle[@id='target']": {**rotated, "departPosLat": "0", "departSpeed": "0"},
         }
+
+    def layout(self, roads: Roads, step: float, samples: int) -> Layout:
+        times = np.arange(samples)[:, np.newaxis] * step
+        speeds = self.target_speed_at(times) + np.zeros_like(times)
+        along = START_POSITION + self.gap + self._body.length + driven_distance(speeds, step)
+        frame = Frame.of(roads.lane(ROAD_LANE))
+        return Layout(frame, None, self.test_speed, TARGET, along, np.asarray(-self.offset), speeds)
 
     def _motion(self, world: World) -> TargetMotion:
         direction, depth, offset, speed_at = self.direction, self._depth, self.offset, self.target_speed_at
@@ -214,17 +232,17 @@ class Along(TargetAhead, frozen=True, kw_only=True):
         return f"{super().obstacle()} ahead"
 
     @property
-    def duration(self) -> float:
+    def duration(self) -> Any:
         """Length of a run [s]."""
         return self.time_to_impact + self.time_after
 
     @property
-    def gap(self) -> float:
+    def gap(self) -> Any:
         """Gap to the target at the start, which closes in the time to impact [m]."""
         return self.test_speed * self.time_to_impact - self._profile.travelled(self.time_to_impact)
 
     @property
-    def target_speed_at(self) -> Callable[[float], float]:
+    def target_speed_at(self) -> Callable[[Any], Any]:
         """The target's speed [m/s] as a function of the time [s]."""
         return self._profile.speed_at
 
@@ -281,14 +299,14 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
             force_setattr(self, "network", JUNCTION if self.heading else "car_to_car")
 
     @property
-    def duration(self) -> float:
+    def duration(self) -> Any:
         """Length of a run [s]."""
         return self._time_to_impact() + self.time_after
 
     @property
-    def gap(self) -> float:
+    def gap(self) -> Any:
         """Gap to the target at the start [m]."""
-        return float(self.parameter("headway")) * self.speed * KMH
+        return self.parameter("headway") * self.speed * KMH
 
     @property
     def direction(self) -> Direction:
@@ -303,22 +321,23 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return self.pre_crash == PreCrash.LEAD_DECELERATING
 
     @property
-    def _target_speed(self) -> float:
+    def _target_speed(self) -> Any:
         """Speed of the target at the start [m/s]."""
-        slower_speed = 20.0 + max(self.speed - STEADY_SPEED_LIMIT, 0.0)
+        slower_speed = 20.0 + np.maximum(self.speed - STEADY_SPEED_LIMIT, 0.0)
         default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(self.pre_crash, self.speed)
         return (default if self.target_speed is None else self.target_speed) * KMH
 
     @property
-    def target_speed_at(self) -> Callable[[float], float]:
+    def target_speed_at(self) -> Callable[[Any], Any]:
         """The target's speed [m/s] as a function of the time [s]."""
         first_speed, brakes_at, deceleration = self._target_speed, self.brakes_at, self.target_deceleration
         if not self._target_brakes:
             return lambda time: first_speed
-        last_speed = min(first_speed, FINAL_SPEED * KMH)
-        return lambda time: max(first_speed - deceleration * max(time - brakes_at, 0.0), last_speed)
+        last_speed = np.minimum(first_speed, FINAL_SPEED * KMH)
+        return lambda time: np.maximum(first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed)
 
-    def _time_to_impact(self) -> float:
+    @np.errstate(all="ignore")  # of the speeds that do not count
+    def _time_to_impact(self) -> Any:
         """Time to the impact if the vehicle does not brake [s].
 
         The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until
@@ -326,17 +345,16 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """
         closing_speed, gap = self.test_speed - self._target_speed, self.gap
         if not self._target_brakes:
-            if closing_speed <= 0:
-                raise InputError(
-                    "scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target"
-                )
+            if np.any(closing_speed <= 0):
+                problem = f"speed = {np.min(self.speed):g} km/h never reaches the target"
+                raise InputError("scenario.parameters", problem, "a slower target")
             return gap / closing_speed
         gap_at_braking = gap - closing_speed * self.brakes_at
-        if gap_at_braking <= 0:
-            return gap / closing_speed
         b, speed_lost = self.target_deceleration, self._target_speed - self.target_speed_at(math.inf)
         closed_by_braking = (closing_speed + speed_lost / 2) * speed_lost / b
-        if gap_at_braking > closed_by_braking:
-            gap_after_braking = gap_at_braking - closed_by_braking
-            return self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
-        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking) - closing_speed) / b
+        gap_after_braking = gap_at_braking - closed_by_braking
+        after_braking = self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
+        root = np.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking)
+        in_braking = self.brakes_at + (root - closing_speed) / b
+        braking = np.where(gap_at_braking > closed_by_braking, after_braking, in_braking)
+        return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[()]

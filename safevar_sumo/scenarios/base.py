@@ -153,14 +153,14 @@ class World(Protocol):
     def person_width(self, actor: str) -> float:
         """Width of a person [m]."""
 
-    def walk(self, person: str, speed: float) -> None:
-        """Make a person continue at a walking speed [m/s], in all copies."""
+    def walk(self, person: str, speed: float | FloatArray) -> None:
+        """Make a person continue at a walking speed [m/s], one for all copies or one for each."""
 
-    def drive(self, vehicle: str, speed: float) -> None:
-        """Make a vehicle reach a speed [m/s] within the coming step, in all copies."""
+    def drive(self, vehicle: str, speed: float | FloatArray) -> None:
+        """Make a vehicle reach a speed [m/s] within the coming step, one for all copies or one for each."""
 
-    def turn_back(self, person: str) -> None:
-        """Make a person turn round and walk back to its first edge at an unchanged speed."""
+    def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
+        """Make a person turn round and walk back to its first edge at an unchanged speed, by default in all copies."""
 
 
 class Scene(NamedTuple):
@@ -225,6 +225,39 @@ def check_fields(code: UserCode, scenario: Any) -> None:
 
 ScenarioMemory = Any
 """What a scenario remembers of a run: an object of its own class with named attributes."""
+
+
+class Layout(NamedTuple):
+    """Where the actors of N runs are whose scenarios differ in parameters that a study searches.
+
+    `front` is the position of the vehicle under test on its lane at the start [m], and `speed` its speed [m/s], numbers
+    or of shape (N,); None if no parameter moves it. `target` is the id of the actor that these parameters move. At T
+    samples its front is `along` the frame of the vehicle's lane and to its `left` [m], with the speeds `speeds` [m/s];
+    shape (T, N). `along` is None for a person who walks on the network's footpath. `backwards` is true where the target
+    has turned round.
+    """
+
+    frame: Frame
+    front: Any
+    speed: Any
+    target: str
+    along: FloatArray | None
+    left: Any
+    speeds: Any
+    backwards: BoolArray | bool = False
+
+
+def driven_distance(speeds: FloatArray, step: float) -> FloatArray:
+    """Distances that targets have driven since the first of T samples, shape (T, N) [m], as SUMO's ballistic update
+    adds them.
+    """
+    covered = (speeds[1:] + speeds[:-1]) / 2 * step
+    return np.concatenate([np.zeros_like(speeds[:1]), np.add.accumulate(covered, axis=0)])
+
+
+def as_text(value: Any) -> str:
+    """A number as SUMO's files have it."""
+    return repr(float(value))
 
 
 class Scenario:
@@ -302,6 +335,12 @@ class Scenario:
     def actors(self, roads: Roads) -> XmlChanges:
         """Changes to the network's traffic."""
         return {}
+
+    def layout(self, roads: Roads, step: float, samples: int) -> Layout:
+        """Where the actors are at samples `step` seconds apart, if parameters of this scenario are arrays of N values:
+        the same as `actors` and `observe` make SUMO do.
+        """
+        raise NotImplementedError
 
     def remarks(self) -> list[str]:
         """Remarks for the user on the scenario's parameters."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -11,7 +10,7 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Frame, PreCrash, Roads, World, XmlChanges
+from safevar_sumo.scenarios.base import PEDESTRIAN, Frame, Layout, PreCrash, Roads, World, XmlChanges, driven_distance
 from safevar_sumo.scenarios.euro_ncap import (
     BODIES,
     FROM_LEFT,
@@ -19,6 +18,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     JUNCTION,
     KMH,
     STOP_DISTANCE,
+    TARGET,
     TESTS,
     VUT_LANE,
     BodySize,
@@ -75,9 +75,9 @@ class _Start(NamedTuple):
     mover: PersonMover | VehicleMover
     direction: Direction
     extent: BodySize
-    impact_left: float
-    distance_to_impact: float
-    time_to_impact: float
+    impact_left: Any
+    distance_to_impact: Any
+    time_to_impact: Any
     profile: SpeedProfile
 
     @classmethod
@@ -105,8 +105,8 @@ class _Start(NamedTuple):
             distance = (lateral_start + impact_lateral) * test.start_share
             run_up = test.parameter("acceleration_distance")
             shortest_time = (distance + run_up) / speed
-            time = test.time_to_impact or float(
-                max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP)
+            time = test.time_to_impact or np.maximum(
+                TIME_TO_IMPACT, np.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP
             )
             profile = SpeedProfile.with_arrival(distance, time - test.lead, speed, run_up)
         mover = (
@@ -210,7 +210,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return f"{'an' if target == 'adult' else 'a'} {target} from {start}"
 
     @property
-    def duration(self) -> float:
+    def duration(self) -> Any:
         """Length of a run [s]."""
         return _Start.of(self).time_to_impact + self.time_after
 
@@ -222,12 +222,30 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         """The vehicle before the target's path, the target beside the vehicle's lane, and the parked cars, if any."""
         frame, start = Frame.of(roads.lane(VUT_LANE)), _Start.of(self)
         impact_position = start.mover.impact_position(frame, roads, start.impact_left)
-        front = impact_position - start.extent.length / 2 - self.test_speed * start.time_to_impact
         return {
-            **self._vehicle_at(front),
+            **self._vehicle_at(self._front(start, impact_position)),
             **start.mover.actors(frame, roads, start.impact_left, start.distance_to_impact),
             **self._parked_cars(frame, impact_position, roads),
         }
+
+    def _front(self, start: _Start, impact_position: Any) -> Any:
+        """Position of the vehicle's front on its lane at the start [m]."""
+        return impact_position - start.extent.length / 2 - self.test_speed * start.time_to_impact
+
+    def layout(self, roads: Roads, step: float, samples: int) -> Layout:
+        frame, start, times = Frame.of(roads.lane(VUT_LANE)), _Start.of(self), np.arange(samples)[:, np.newaxis] * step
+        impact_position = start.mover.impact_position(frame, roads, start.impact_left)
+        front = self._front(start, impact_position)
+        if isinstance(start.mover, PersonMover):
+            path, speeds = start.mover.path(times, step)
+            return Layout(frame, front, self.test_speed, PEDESTRIAN, None, start.mover.sign * path, speeds)
+        speeds = start.profile.speed_at(times)
+        path = driven_distance(speeds, step) - start.distance_to_impact + BODIES[start.mover.target].length / 2
+        along, left = (
+            place + component * path
+            for place, component in zip((impact_position, start.impact_left), start.direction, strict=True)
+        )
+        return Layout(frame, front, self.test_speed, TARGET, along, left, speeds)
 
     def _parked_cars(self, frame: Frame, impact_position: float, roads: Roads) -> XmlChanges:
         """The parked cars beside the lane, if any."""

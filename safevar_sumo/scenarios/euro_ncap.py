@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
@@ -24,6 +25,7 @@ from safevar_sumo.scenarios.base import (
     Roads,
     World,
     XmlChanges,
+    as_text,
 )
 
 KMH = 1 / KMH_PER_MS
@@ -183,52 +185,54 @@ TESTS = {
 
 class SpeedProfile(NamedTuple):
     """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to `speed` [m/s] within
-    `run_up` [m].
+    `run_up` [m]; or of N targets, in arrays.
     """
 
-    begin: float
-    speed: float
+    begin: Any
+    speed: Any
     run_up: float
 
     @classmethod
-    def with_arrival(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
+    def with_arrival(cls, distance: Any, time: Any, speed: Any, run_up: float) -> SpeedProfile:
         """The profile that covers `distance` [m] by `time` [s].
 
         Past the run-up, distance = speed * (time - begin) - run_up.
         """
-        if distance < run_up:
+        if np.any(distance < run_up):
             raise InputError(
                 "scenario.parameters",
-                f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m",
+                f"acceleration_distance = {run_up:g} m is longer than the distance of {np.min(distance):g} m",
             )
         shortest_time = (distance + run_up) / speed
         begin = time - shortest_time
-        if begin < 0:
+        if np.any(begin < 0):
             raise InputError(
                 "scenario.parameters",
-                f"the target needs {shortest_time:.2f} s to the impact and has {time:g} s",
+                f"the target needs {np.max(shortest_time):.2f} s to the impact and has {np.max(time):g} s",
                 "a faster target, a shorter distance or a longer time_to_impact",
             )
         return cls(begin, speed, run_up)
 
-    def travelled(self, time: float) -> float:
+    @np.errstate(all="ignore")  # where there is no run-up
+    def travelled(self, time: Any) -> Any:
         """Distance covered [m] at a time [s]."""
-        elapsed = max(time - self.begin, 0.0)
-        if elapsed >= 2 * self.run_up / self.speed:  # the run-up takes twice the time that it would take at full speed
-            return self.speed * elapsed - self.run_up
-        return self.speed * self.speed / (4 * self.run_up) * elapsed * elapsed
+        elapsed = np.maximum(time - self.begin, 0.0)
+        return np.where(
+            elapsed >= 2 * self.run_up / self.speed,  # twice the time that the run-up would take at full speed
+            self.speed * elapsed - self.run_up,
+            self.speed * self.speed / (4 * np.float64(self.run_up)) * elapsed * elapsed,
+        )[()]
 
-    def speed_at(self, time: float) -> float:
+    @np.errstate(all="ignore")
+    def speed_at(self, time: Any) -> Any:
         """Speed [m/s] at a time [s]."""
         elapsed = time - self.begin
-        if elapsed < 0:
-            return 0.0
-        if elapsed >= 2 * self.run_up / self.speed:
-            return self.speed
-        return self.speed * self.speed / (2 * self.run_up) * elapsed
+        rising = self.speed * self.speed / (2 * np.float64(self.run_up)) * elapsed
+        steady = np.where(elapsed >= 2 * self.run_up / self.speed, self.speed, rising)
+        return np.where(elapsed < 0, 0.0, steady)[()]
 
 
-def lateral_offset(location: float, width: float) -> float:
+def lateral_offset(location: Any, width: float) -> Any:
     """Distance of an impact location [% of `width`] from the middle of the front [m].
 
     It is below 0 on the side from which `location` counts.
@@ -240,6 +244,10 @@ WALK_EDGES = {1.0: ("footpath", "footpath_on"), -1.0: ("footpath_on", "footpath"
 """Edges that a pedestrian walks on, in this order, to the left of the vehicle (key 1.0) or to its right (-1.0)."""
 STOP_DISTANCE = 5.0
 """Distance past the middle of the lane at which a pedestrian stops [m]."""
+
+
+LEAST_WALKING_SPEED = 0.001
+"""Speed below which SUMO's persons stand [m/s] (utils/common/StdDefs.h, NUMERICAL_EPS)."""
 
 
 class PersonMover(NamedTuple):
@@ -258,7 +266,7 @@ class PersonMover(NamedTuple):
         """No changes: the pedestrian uses the network's footpath."""
         return {}
 
-    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
+    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: Any) -> Any:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
         lane's middle [m].
         """
@@ -276,10 +284,10 @@ class PersonMover(NamedTuple):
             problem = f"lateral_start = {-self.start:g} m is not on the footpath"
             expected = f"a number in [{half_length - max(ends):.2f}, {half_length - min(ends):.2f}] m"
             raise InputError("scenario.parameters", problem, expected)
-        person = {"type": self.target, "departPos": repr(abs(front - ends[0]))}
+        person = {"type": self.target, "departPos": as_text(abs(front - ends[0]))}
         # One metre before the end of the last edge (-1); a walk to the right goes along it backwards, to metre 1.
         arrival_position = -int(self.sign)
-        walk = {"edges": " ".join(edges), "speed": repr(self.profile.speed), "arrivalPos": repr(arrival_position)}
+        walk = {"edges": " ".join(edges), "speed": as_text(self.profile.speed), "arrivalPos": repr(arrival_position)}
         return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
 
     @property
@@ -298,13 +306,26 @@ class PersonMover(NamedTuple):
         """
         return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
 
-    def next_speed(self, sample: int, step: float) -> float:
+    def next_speed(self, sample: int, step: float) -> Any:
         """Mean speed in the coming step [m/s]."""
-        walking_distance = self.stop - self.start
-        walked, next_walked = (min(self.profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
+        walked, next_walked = (self.walked(k * step) for k in (sample, sample + 1))
         return (next_walked - walked) / step
 
-    def set_speed(self, world: World, speed: float) -> None:
+    def walked(self, time: Any) -> Any:
+        """Distance walked [m] at a time [s]."""
+        return np.minimum(self.profile.travelled(time), self.stop - self.start)
+
+    def path(self, times: Any, step: float) -> tuple[FloatArray, FloatArray]:
+        """Distances from the middle of the lane in the direction of the walk [m], of the target's front at times
+        [s], and its mean speeds in the steps before them [m/s].
+        """
+        walked = self.walked(times)
+        mean_speeds = np.diff(walked, axis=0, prepend=walked[:1]) / step
+        mean_speeds = np.where(mean_speeds < LEAST_WALKING_SPEED, 0.0, mean_speeds)
+        front = self.start + BODIES[self.target].length / 2
+        return front + np.add.accumulate(mean_speeds * step, axis=0), mean_speeds
+
+    def set_speed(self, world: World, speed: Any) -> None:
         world.walk(PEDESTRIAN, speed)
 
 
@@ -313,7 +334,7 @@ class VehicleMover(NamedTuple):
 
     target: str
     direction: Direction
-    speed_at: Callable[[float], float]
+    speed_at: Callable[[Any], Any]
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
         """Changes that rotate the target's lanes around their crossing with the vehicle's lane; none for a target from
@@ -327,7 +348,7 @@ class VehicleMover(NamedTuple):
         ahead, leftward = ((end_left - start_left) / 2 * component for component in self.direction)
         return change_target_lanes(frame, (along - ahead, -leftward), (along + ahead, leftward), self.direction)
 
-    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
+    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: Any) -> Any:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
         lane's middle [m].
         """
@@ -352,8 +373,8 @@ class VehicleMover(NamedTuple):
             "vType[@id='target']": target_type(self.target),
             "vehicle[@id='target']": {
                 "type": self.target,
-                "departPos": repr(front),
-                "departSpeed": repr(self.initial_speed),
+                "departPos": as_text(front),
+                "departSpeed": as_text(self.initial_speed),
             },
         }
 
@@ -363,7 +384,7 @@ class VehicleMover(NamedTuple):
         return along * self.direction.along + left * self.direction.left
 
     @property
-    def initial_speed(self) -> float:
+    def initial_speed(self) -> Any:
         """Speed at the start [m/s]."""
         return self.speed_at(0.0)
 
@@ -377,9 +398,9 @@ class VehicleMover(NamedTuple):
         along = frame.along(positions) - self.direction.along * half_length
         return along, frame.left(positions) - self.direction.left * half_length
 
-    def next_speed(self, sample: int, step: float) -> float:
+    def next_speed(self, sample: int, step: float) -> Any:
         """Speed at the end of the coming step [m/s]."""
         return self.speed_at((sample + 1) * step)
 
-    def set_speed(self, world: World, speed: float) -> None:
+    def set_speed(self, world: World, speed: Any) -> None:
         world.drive(TARGET, speed)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Encounter, FloatArray, Trace
+from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import (
     CROSSING_LANE,
     NETWORK_KEY,
@@ -16,13 +16,23 @@ from safevar_sumo.scenarios.base import (
     VUT,
     Frame,
     Grade,
+    Layout,
     PreCrash,
+    Roads,
     Scenario,
     Scene,
     World,
+    XmlChanges,
+    as_text,
 )
+from safevar_sumo.scenarios.euro_ncap import VUT_LANE
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
+ROUNDING = 1e-6
+"""How far beyond the place where he turns a pedestrian may get by rounding errors [m]."""
+FOOTPATH_LANE = "footpath_0"
+WALKING_SPEED, LATERAL_START = 1.8, 5.16
+"""The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic file."""
 
 
 class _Memory(NamedTuple):
@@ -35,14 +45,14 @@ class _Memory(NamedTuple):
     conflict_point, clear_point
         Positions of the vehicle's front at which the conflict begins and ends [m].
     last_lateral, has_turned
-        The pedestrian's last lateral position [m], shape (N,), and whether the pedestrian has turned round.
+        The pedestrians' last lateral positions [m], and which of them have turned round; shape (N,).
     """
 
     frame: Frame
     conflict_point: float
     clear_point: float
     last_lateral: FloatArray
-    has_turned: bool
+    has_turned: BoolArray
 
 
 class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -56,45 +66,83 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         Distance past the middle of the lane at which the pedestrian turns round [m]; None if the pedestrian walks on.
     lane_width
         Width of the lane [m]: the pedestrian leaves the lane at half of this width from the middle.
+    distance
+        Gap at the start, from the front bumper to the middle of the pedestrian's path [m].
+    walking_speed, lateral_start
+        The pedestrian's speed [m/s], and start to the right of the lane's middle [m].
     grade
         Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
-    Positions, speed and the turn are taken from the published study's package.
+    Positions, speed and the turn are by default those of the traffic file, from the published study's package.
     """
 
     network: str = "pedestrian_crossing"
     duration: Positive = 9.5
     turns_after: float | None = 0.7
     lane_width: Positive = 3.5
+    distance: Positive | None = None
+    walking_speed: Positive | None = None
+    lateral_start: Positive | None = None
     grade: Grade = 0.0
     reactive_actors = False
     pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
+
+    def actors(self, roads: Roads) -> XmlChanges:
+        """The vehicle, the pedestrian's start and speed, as far as the study sets them."""
+        changes = dict[str, dict[str, str]]()
+        if self.distance is not None:
+            changes["vehicle[@id='vut']"] = {"departPos": as_text(self._front(roads))}
+        if self.lateral_start is not None:
+            _, left = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
+            changes["person[@id='pedestrian']"] = {"departPos": as_text(-left - self.lateral_start)}
+        if self.walking_speed is not None:
+            changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
+        return changes
+
+    def _front(self, roads: Roads) -> Any:
+        """Position of the vehicle's front on its lane at the start [m]; None as in the traffic file."""
+        if self.distance is None:
+            return None
+        return Frame.of(roads.lane(VUT_LANE)).crossing_position(roads, CROSSING_LANE) - self.distance
+
+    def layout(self, roads: Roads, step: float, samples: int) -> Layout:
+        frame, times = Frame.of(roads.lane(VUT_LANE)), np.arange(samples)[:, np.newaxis]
+        speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
+        start = LATERAL_START if self.lateral_start is None else self.lateral_start
+        lateral, turned = speed * step * times - start, np.zeros((samples, 1), dtype=bool)
+        if self.turns_after is not None:
+            beyond = lateral > self.turns_after + ROUNDING
+            first = np.where(beyond[-1], np.argmax(beyond, axis=0), samples)  # he is back at his place two steps before
+            turned = times >= first
+            lateral = lateral - 2 * speed * step * np.maximum(times - first + 1, 0)
+        speeds = np.broadcast_to(speed, lateral.shape)
+        return Layout(frame, self._front(roads), None, PEDESTRIAN, None, lateral, speeds, turned)
 
     def begin(self, world: World) -> _Memory:
         frame = Frame.through_origin(world.lane_of(VUT))
         path = frame.crossing_position(world, CROSSING_LANE)
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
-        if self.turns_after is not None and lateral[0] > self.turns_after:
+        if self.turns_after is not None and lateral.max() > self.turns_after:
             raise InputError(
                 NETWORK_KEY,
-                f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
+                f"the pedestrian begins {lateral.max():.2f} m to the left of the vehicle",
                 "to the right of it, or turns_after = None",
             )
         half_width = world.person_width(PEDESTRIAN) / 2
         clear_point = path + half_width + world.vehicle_length(VUT)
-        return _Memory(frame, path - half_width, clear_point, lateral, has_turned=False)
+        return _Memory(frame, path - half_width, clear_point, lateral, np.zeros(len(lateral), dtype=bool))
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle_positions = world.vehicle_positions(VUT)
         lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle_positions)
         lateral_speed = (lateral - memory.last_lateral) / step
-        # The pedestrian does the same in all copies, so the first stands for all.
-        turns_now = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
-        if turns_now and not memory.has_turned:
-            world.turn_back(PEDESTRIAN)
-            memory = memory._replace(has_turned=True)
+        if self.turns_after is not None:
+            turns_now = ~memory.has_turned & (lateral + step * lateral_speed > self.turns_after + ROUNDING)
+            if turns_now.any():
+                world.turn_back(PEDESTRIAN, np.flatnonzero(turns_now).tolist())
+                memory = memory._replace(has_turned=memory.has_turned | turns_now)
         front = memory.frame.along(vehicle_positions)
         moves_away = lateral * lateral_speed > 0
         over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)
@@ -119,7 +167,9 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         )
 
 
-PARKED_VEHICLE = "parked_ahead"
+PARKED_VEHICLE, PARKED_POSITION, VUT_FRONT = "parked_ahead", 85.0, 20.0
+"""Id of the parked vehicle ahead; fronts of this vehicle and of the one under test in the traffic file [m]."""
+PARKED_LENGTH = 4.7
 
 
 class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -129,6 +179,8 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
     ----------
     duration
         Length of a run [s].
+    distance
+        Gap at the start, from the front bumper to the parked vehicle [m]; by default that of the traffic file.
     grade
         Rise of the road over its length, negative downhill [%].
 
@@ -139,10 +191,24 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
 
     network: str = "lead_vehicle_stopped"
     duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
+    distance: Positive | None = None
     grade: Grade = 0.0
     reactive_actors = False
     pre_crash = PreCrash.LEAD_STOPPED
     centre_to_centre = True
+
+    def actors(self, roads: Roads) -> XmlChanges:
+        """The vehicle at its distance from the parked one, if the study sets it."""
+        return {} if self.distance is None else {"vehicle[@id='vut']": {"departPos": as_text(self._front)}}
+
+    @property
+    def _front(self) -> Any:
+        """Position of the vehicle's front on its lane at the start [m]."""
+        return VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
+
+    def layout(self, roads: Roads, step: float, samples: int) -> Layout:
+        frame, still = Frame.of(roads.lane("road_0")), np.zeros((samples, 1))
+        return Layout(frame, self._front, None, PARKED_VEHICLE, still + PARKED_POSITION, still, still)
 
     def begin(self, world: World) -> tuple[Frame, FloatArray]:
         frame = Frame.through_origin(world.lane_of(VUT))

@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import ALL_TRUE, BoolArray, FloatArray
-from safevar_sumo.scenarios.base import VUT, Frame, Grade, PreCrash, Scenario, Scene, World, XmlChanges
+from safevar_sumo.scenarios.base import VUT, Frame, Grade, PreCrash, Scenario, Scene, World, XmlChanges, as_text
 from safevar_sumo.scenarios.euro_ncap import (
     KMH,
     TESTS,
@@ -101,7 +101,7 @@ class Memory(NamedTuple):
     motion
         The target's motion.
     last_lateral, last_speed
-        The target's last lateral position [m], and the speed that it was last set to [m/s].
+        The target's last lateral position [m], and the speed that it was last set to [m/s], one or shape (N,).
     sample
         Number of the current sample.
     approached
@@ -111,7 +111,7 @@ class Memory(NamedTuple):
     motion: TargetMotion
     last_lateral: FloatArray
     sample: int
-    last_speed: float
+    last_speed: Any
     approached: BoolArray
 
 
@@ -178,7 +178,7 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             raise InputError("scenario.parameters", "the way to the target is longer than the road", "a shorter time")
         return {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
-            "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.test_speed)},
+            "vehicle[@id='vut']": {"departPos": as_text(front), "departSpeed": as_text(self.test_speed)},
         }
 
     def begin(self, world: World) -> Memory:
@@ -199,7 +199,7 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         """Set the target's next speed, as `observe` does, without computing the scene."""
         mover = memory.motion.mover
         speed = mover.next_speed(memory.sample, step)
-        if speed != memory.last_speed:
+        if np.any(speed != memory.last_speed):
             mover.set_speed(world, speed)
         return memory._replace(sample=memory.sample + 1, last_speed=speed)
 

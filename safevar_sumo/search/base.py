@@ -25,8 +25,8 @@ class Problem:
     """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
     `population` is the number of settings of a generation, for algorithms with generations; `scoring` defines the
-    objectives. `region` is the feasible region of a study with constraints: yielded settings must lie in this region
-    after the filter.
+    objectives, and which evaluated settings are feasible. `region` is the feasible region of a study with constraints:
+    yielded settings must lie in this region after the filter.
     """
 
     characteristics: CharacteristicSet

@@ -9,8 +9,10 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Scoring
+from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
+from safevar_sumo.study import ORIGINAL_DEGREE
 
 
 class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -90,10 +92,12 @@ class _Ranges:
         self._problem, self._characteristics, self._scoring = problem, problem.characteristics, problem.scoring
         self._original_objective = problem.scoring.values(problem.original)[0, 0]
         self.lower, self.upper = problem.characteristics.lower.copy(), problem.characteristics.upper.copy()
-        self.max_changes = len(problem.characteristics)
+        self.max_changes = len(problem.characteristics.vehicle)
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to `max_changes`."""
+        """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to `max_changes`, in an
+        encounter drawn uniformly.
+        """
         return self._characteristics.filter(np.stack([self._draw_feasible_setting(rng) for _ in range(number)]))
 
     def _draw_feasible_setting(self, rng: np.random.Generator) -> FloatArray:
@@ -108,7 +112,10 @@ class _Ranges:
 
     def _draw_setting(self, rng: np.random.Generator) -> FloatArray:
         setting = self._characteristics.original.copy()
-        for i in rng.choice(len(setting), size=rng.integers(1, self.max_changes, endpoint=True), replace=False):
+        count = len(self._characteristics.vehicle)
+        for i in rng.choice(count, size=rng.integers(1, self.max_changes, endpoint=True), replace=False):
+            setting[i] = self._draw_value(i, rng)
+        for i in range(count, len(setting)):
             setting[i] = self._draw_value(i, rng)
         return setting
 
@@ -130,7 +137,7 @@ class _Ranges:
         """End each range at the mean of the increased values and the mean of the decreased values, over the settings of
         `window` that are less safe than the original.
         """
-        is_less_safe = self._scoring.values(window)[:, 0] < self._original_objective
+        is_less_safe = self._scoring.values(window)[:, 0] < self._originals(window)
         less_safe = window.take(self._scoring.valid(window) & is_less_safe)
         if not len(less_safe):
             return
@@ -141,6 +148,12 @@ class _Ranges:
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
         self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))  # rounded, halves upwards
+
+    def _originals(self, window: Evaluations) -> FloatArray:
+        """The first objective of the original vehicle; in its own encounter, if that is a safety degree there."""
+        if self._scoring.is_constrained and self._scoring.objectives[0] == F_SAFE:
+            return window.column(ORIGINAL_DEGREE)
+        return np.full(len(window), self._original_objective)
 
 
 def _scores(evaluations: Evaluations, scoring: Scoring, safety_weight: float) -> FloatArray:

@@ -43,6 +43,8 @@ class Individual(list[float]):
     ----------
     fitness, evaluation
         Once evaluated: the values of the objectives, and the batch of evaluations with the row in it.
+    violation
+        By how much the original vehicle is not safe in the same encounter; 0 in studies that search only the vehicle.
     standing
         What survivors are compared by: less is better.
     has_failed
@@ -51,6 +53,7 @@ class Individual(list[float]):
 
     fitness: base.Fitness
     evaluation: tuple[Evaluations, int]
+    violation: float = 0.0
     standing: tuple[float, ...]
     has_failed: bool = False
 
@@ -61,7 +64,8 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     The variables are the characteristics' unfiltered values; simulation and results use filtered ones.
     The default mutation probability is 1/n per variable; crossover is simulated binary, mutation polynomial, both
     bounded by the domains. A tournament has `tournament_size` individuals. The result is the non-dominated part of the
-    last population. A setting whose simulation failed does not survive.
+    last population. A setting whose simulation failed does not survive. In a study that searches its scenario, a
+    feasible setting is better than an infeasible one, and of two infeasible ones that with the smaller violation.
     """
 
     crossover_probability: Probability = 0.9
@@ -156,19 +160,25 @@ def initial_population(problem: Problem, rng: np.random.Generator) -> list[Indiv
 def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
-    fitness, valid = fitness_class(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
-    for row, (individual, values) in enumerate(
-        zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)
-    ):
-        individual.evaluation, individual.has_failed = (evaluated, row), not valid[row]
+    scoring, fitness = problem.scoring, fitness_class(len(problem.scoring.objectives))
+    violations = scoring.violation(evaluated)
+    failed = ~(scoring.scored(evaluated) & np.isfinite(violations))
+    columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
+    for row, (individual, values, violation, has_failed) in enumerate(zip(individuals, *columns, strict=True)):
+        individual.evaluation, individual.violation, individual.has_failed = (evaluated, row), violation, has_failed
         individual.fitness = fitness(tuple(values))
     return len(individuals)
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
     """Select the best `number` by rank, then by crowding distance, as DEAP's slower `selNSGA2` does; sets their
-    `standing`: the rank, from 0, then the negative crowding distance.
+    `standing`: the rank, from 0, then the negative crowding distance. Infeasible individuals follow all feasible ones,
+    each in a rank of its own, by their violation (constrained domination, Deb et al. 2002).
     """
+    infeasible = sorted((one for one in individuals if one.violation), key=lambda one: one.violation)
+    for place, individual in enumerate(infeasible):
+        individual.standing = len(individuals) + place, 0.0
+    individuals = [individual for individual in individuals if not individual.violation]
     sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
     for rank, front in enumerate(sort_into_fronts(sorted_individuals)):
@@ -178,7 +188,7 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
         best += sorted(front, key=lambda individual: individual.standing)
         if len(best) >= number:
             break
-    return best[:number]
+    return [*best, *infeasible][:number]
 
 
 def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:

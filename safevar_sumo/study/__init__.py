@@ -3,6 +3,7 @@
 from safevar_sumo.study.characteristics import (
     CharacteristicTable as CharacteristicTable,
     Constraint as Constraint,
+    Domain as Domain,
     Limit as Limit,
     limits_of as limits_of,
     unit_text as unit_text,
@@ -21,6 +22,7 @@ from safevar_sumo.study.file import (
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,
+    ORIGINAL_DEGREE as ORIGINAL_DEGREE,
     PYMOO as PYMOO,
     SAFETY_DEGREE as SAFETY_DEGREE,
     FreeParameter as FreeParameter,
@@ -30,6 +32,7 @@ from safevar_sumo.study.schema import (
     ModelTable as ModelTable,
     Origin as Origin,
     RatingTable as RatingTable,
+    ScenarioTable as ScenarioTable,
     SearchTable as SearchTable,
     Study as Study,
     StudyLike as StudyLike,

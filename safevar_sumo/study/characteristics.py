@@ -29,21 +29,17 @@ def mistake(problem: str, legal: str) -> ValueError:
     return ValueError(f"{problem}\n{legal}")
 
 
-class CharacteristicTable(Table, frozen=True, kw_only=True):
-    """One row of the characteristics table: its `original` value, and the ends `lower` and `upper` of its domain, in
-    `unit`; f_diff multiplies its change by `weight`.
+class Domain(Table, frozen=True, kw_only=True):
+    """What a search varies: its `original` value, and the ends `lower` and `upper` of its domain, in `unit`.
 
-    `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket);
-    `counterpart` is the part of a real vehicle that sets it.
+    `meaning` describes it and begins with a short name (up to the first comma or bracket).
     """
 
     unit: str
     original: float
     lower: float
     upper: float
-    weight: PositiveNumber = 1.0
     meaning: Description = ""
-    counterpart: Description = ""
 
     def __post_init__(self) -> None:
         if max(abs(self.original), abs(self.lower), abs(self.upper)) > MAX_MAGNITUDE:
@@ -52,6 +48,18 @@ class CharacteristicTable(Table, frozen=True, kw_only=True):
             raise mistake(f"lower = {self.lower} and upper = {self.upper}", "lower < upper")
         if not self.lower <= self.original <= self.upper:
             raise mistake(f"original = {self.original}", f"a value in [{self.lower}, {self.upper}]")
+
+
+class CharacteristicTable(Domain, frozen=True, kw_only=True):
+    """One row of the characteristics table; f_diff multiplies its change by `weight`, and `counterpart` is the part of
+    a real vehicle that sets it.
+    """
+
+    weight: PositiveNumber = 1.0
+    counterpart: Description = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.original == 0:
             raise mistake("original = 0", "a value other than 0: changes are relative to it")
 
@@ -156,7 +164,7 @@ class Correlation(Table, frozen=True, kw_only=True):
 
 
 def check_variation(
-    rows: Mapping[str, CharacteristicTable], variation: Mapping[str, Distribution], correlations: Sequence[Correlation]
+    rows: Mapping[str, Domain], variation: Mapping[str, Distribution], correlations: Sequence[Correlation]
 ) -> None:
     """Refuse distributions and correlations that do not fit the characteristics' domains, or each other."""
     for name, distribution in variation.items():
@@ -178,7 +186,7 @@ def stated_values(distribution: Distribution) -> dict[str, float]:
     return {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
 
 
-def _check_distribution(key: str, row: CharacteristicTable, distribution: Distribution) -> None:
+def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:
     unit, stated = unit_text(row.unit), stated_values(distribution)
     lower, upper = stated.get("lower", row.lower), stated.get("upper", row.upper)
     mode = stated.get("mode", row.original)
@@ -221,12 +229,12 @@ class Constraint(Table, frozen=True, kw_only=True):
         ]
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))  # the first term has its sign without a space
 
-    def unit_of(self, rows: Mapping[str, CharacteristicTable]) -> str:
+    def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""
         units = {rows[name].unit for name in self.sum if name in rows}
         return self.unit if self.unit is not None else next(iter(units), "-")
 
-    def bounds_in_words(self, rows: Mapping[str, CharacteristicTable]) -> str:
+    def bounds_in_words(self, rows: Mapping[str, Domain]) -> str:
         """The bounds in words."""
         unit = unit_text(self.unit_of(rows))
         bounds = {"at least": self.at_least, "at most": self.at_most}
@@ -241,7 +249,7 @@ def check_bounds(at_least: float | None, at_most: float | None) -> None:
         raise mistake(f"at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most")
 
 
-def check_constraints(rows: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]) -> None:
+def check_constraints(rows: Mapping[str, Domain], constraints: Sequence[Constraint]) -> None:
     """Refuse constraints that name unknown characteristics or add quantities of different units."""
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
@@ -272,7 +280,7 @@ class Limit(Table, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_bounds(self.at_least, self.at_most)
 
-    def interval(self, row: CharacteristicTable) -> tuple[float, float]:
+    def interval(self, row: Domain) -> tuple[float, float]:
         """The limited interval [unit]; a side without a limit ends with the domain."""
         low = row.lower if self.at_least is None else self.at_least
         high = row.upper if self.at_most is None else self.at_most
@@ -280,10 +288,7 @@ class Limit(Table, frozen=True, kw_only=True):
 
 
 def limits_of(
-    texts: Iterable[str],
-    rows: Mapping[str, CharacteristicTable],
-    stated: Mapping[str, Limit] | None = None,
-    source: str = "limits",
+    texts: Iterable[str], rows: Mapping[str, Domain], stated: Mapping[str, Limit] | None = None, source: str = "limits"
 ) -> dict[str, Limit]:
     """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >= 3`, and where a text
     does not replace them, those `stated` in a study.
@@ -313,9 +318,7 @@ def limits_of(
     return {name: limits[name] for name in rows if name in limits}
 
 
-def check_limits(
-    rows: Mapping[str, CharacteristicTable], limits: Mapping[str, Limit], source: object = "", table: str = ""
-) -> None:
+def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], source: object = "", table: str = "") -> None:
     """Refuse limits of unknown characteristics, outside the domain, or that exclude the original."""
     for name, limit in limits.items():
         if name not in rows:

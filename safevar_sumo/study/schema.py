@@ -17,6 +17,7 @@ from safevar_sumo.study.characteristics import (
     Constraint,
     Correlation,
     Distribution,
+    Domain,
     Limit,
     PositiveNumber,
     Table,
@@ -39,6 +40,8 @@ SPREAD_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may stand in [spread]."""
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the safety degree."""
+ORIGINAL_DEGREE: Final = "original_safety_degree"
+"""Column of the original vehicle's safety degree in the same encounter, in a study that searches its scenario."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
@@ -63,6 +66,16 @@ class ModelTable(Table, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.kind != "fmu" and (self.inputs or self.outputs):
             raise mistake(f"{self.model!r} is no FMU, but has inputs or outputs", 'kind = "fmu", or no such keys')
+
+
+class ScenarioTable(ModelTable, frozen=True, kw_only=True):
+    """The scenario: its `model` and `parameters`; and those of its parameters, and of the weather's, that are searched
+    together with the vehicle, under `search` by name.
+
+    The original vehicle drives in the same encounter as each variant, and must be safe there.
+    """
+
+    search: dict[str, Domain] = {}
 
 
 class VehicleTable(Table, frozen=True, kw_only=True):
@@ -251,7 +264,7 @@ class Study(Table, frozen=True, kw_only=True):
     # results/manifest.py. Any other new key becomes part of the identity of results.
     name: Name
     title: str
-    scenario: ModelTable
+    scenario: ScenarioTable
     weather: str | Weather
     vehicle: VehicleTable
     ads: ModelTable
@@ -277,7 +290,8 @@ class Study(Table, frozen=True, kw_only=True):
             raise InputError("", "vehicle.characteristics: none", "at least one")
         if self.scenario.kind:
             raise InputError("", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU")
-        check_variation(rows, self.variation, self.correlations)
+        self._check_search()
+        check_variation(self.domains, self.variation, self.correlations)
         check_constraints(rows, self.constraints)
         check_limits(rows, self.limits, table="limits.")
         if len({len(values) for values in self.spread.values()}) > 1 or not all(self.spread.values()):
@@ -285,6 +299,29 @@ class Study(Table, frozen=True, kw_only=True):
             raise InputError("", problem, "a list for each parameter, all of one length")
         if 0 in self.published.values():
             raise InputError("", f"published = {self.published}", "numbers other than 0")
+
+    def _check_search(self) -> None:
+        """Refuse searched parameters that something else sets, too."""
+        tests = [] if self.matrix is None else self.matrix.tests
+        for name in self.scenario.search:
+            key = f"scenario.search.{name}"
+            if self.matrix is not None and self.matrix.protocol:
+                raise InputError("", f"{key}: the cells of {self.matrix.protocol} are fixed", "matrix.tests")
+            if name in self.vehicle.characteristics:
+                raise InputError("", f"{key}: a characteristic of the vehicle has this name", "a unique name")
+            if name in self.scenario.parameters:
+                value = self.scenario.parameters[name]
+                legal = "one of the two: a value, or a domain"
+                raise InputError("", f"{key}: scenario.parameters.{name} = {value!r} fixes it", legal)
+            for test in tests:
+                if name in (*test.parameters, *test.over):
+                    problem = f"{key}: test {test.name!r} of the matrix sets {name}, too"
+                    raise InputError("", problem, "a domain, or values in the tests")
+
+    @property
+    def domains(self) -> dict[str, Domain]:
+        """What a search varies: the vehicle's characteristics, then parameters of the scenario."""
+        return {**self.vehicle.characteristics, **self.scenario.search}
 
     @property
     def source(self) -> str:

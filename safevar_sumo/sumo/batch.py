@@ -32,8 +32,9 @@ from safevar_sumo.scenarios import VUT, Lane, Point, Scene
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.bodies import Contacts, Motion, World
-from safevar_sumo.sumo.engine import Engine, open_world
-from safevar_sumo.sumo.network import copied_network, stage_network
+from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
+from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
+from safevar_sumo.sumo.network import copied_network, stage_network, stage_networks
 from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, TargetObserver, encounter_of, per_vehicle
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
@@ -100,22 +101,37 @@ def drive_all(
     InputError
         If a user's ADS fails.
     """
-    points, n = system.points, len(settings)
+    points, n, (fleet, vehicles) = system.points, len(settings), system.at_encounters(settings)
     with user_errors(system.source):
-        if is_recorded(system, engine):
-            scenes = [scene for scene in system.scenes.of(points) if isinstance(scene, Recording)]
-            targets = [point.scenario for point in points if isinstance(point.scenario, TargetTest)]
-            world = RecordedWorld(scenes, n)
-            observer = TargetObserver(targets, scenes, n) if targets else None
-            return drive(system, np.tile(settings, (len(points), 1)), world, observer, listen)
-        with open_points_world(system, n) as sumo_world:
-            return drive(system, settings, sumo_world, listen=listen)
+        if not is_recorded(system, engine):
+            with open_points_world(system, settings) as sumo_world:
+                return drive(fleet, vehicles, sumo_world, listen=listen)
+        scenes = [scene for scene in system.scenes.of(points) if isinstance(scene, Recording)]
+        if fleet is not system:
+            size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])
+            scenario = system.at_encounters(settings[::size])[0].scenario
+            world = RecordedWorld([scenes_of_encounters(scenes[0], scenario, n // size)], size)
+            return drive(fleet, vehicles, world, listen=listen)
+        targets = [point.scenario for point in points if isinstance(point.scenario, TargetTest)]
+        observer = TargetObserver(targets, scenes, n) if targets else None
+        return drive(system, np.tile(settings, (len(points), 1)), RecordedWorld(scenes, n), observer, listen)
 
 
-def open_points_world(system: System, n: int) -> AbstractContextManager[SumoWorld]:
-    """Start SUMO on `n` copies of the network of the system's only point."""
-    (point,) = system.points
-    return open_world(copied_network(stage_network(point.scenario), n), n, system.scenes.options)
+def _vehicles_per_encounter(encounters: FloatArray) -> int:
+    """How many vehicles in a row meet the same encounter: 2 if a variant and the original take turns, else 1."""
+    is_paired = len(encounters) % 2 == 0 and np.array_equal(encounters[::2], encounters[1::2])
+    return 2 if is_paired else 1
+
+
+def open_points_world(system: System, settings: FloatArray) -> AbstractContextManager[SumoWorld]:
+    """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
+    (point,), options, n = system.points, system.scenes.options, len(settings)
+    encounters = system.characteristics.scenario
+    if not len(encounters):
+        return open_world(copied_network(stage_network(point.scenario), n), n, options)
+    rows = settings[:, ~system.characteristics.of_vehicle].tolist()
+    points = [encounter(point, dict(zip(encounters.names, row, strict=True))) for row in rows]
+    return open_varied_world(stage_networks([point.scenario for point in points]), options)
 
 
 @np.errstate(all="ignore")
@@ -134,7 +150,7 @@ def drive(
     ads_memory = ads.start(n, system.nominal, step)
     size = n // len(system.points)
     perception = Perception([point.weather for point in system.points], step, size)
-    last_step = np.repeat([round(point.scenario.duration / step) for point in system.points], size)
+    last_step = np.round(per_vehicle([point.scenario.duration / step for point in system.points], size)).astype(int)
     log = _Log(n, int(last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)

@@ -99,17 +99,20 @@ def write_roads(root: ElementTree.Element, n: int, file: Path, source: Path) -> 
     _write(root, blocks, file)
 
 
-def write_demand(root: ElementTree.Element, n: int, file: Path, source: Path) -> None:
-    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file.
+def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path, source: Path) -> None:
+    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file. There is
+    one traffic for all copies, or one for each.
 
     Raises
     ------
     InputError
         If an element of the `source` cannot be copied.
     """
-    texts = [(time, _marked_xml(child, DEMAND_IDS, source)) for child, time in _departures(root)]
-    copies = sorted(((time, copy, text) for copy in range(n) for time, text in texts), key=itemgetter(0))
-    _write(root, [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
+    texts = [[(time, _marked_xml(child, DEMAND_IDS, source)) for child, time in _departures(root)] for root in roots]
+    copies = sorted(
+        ((time, copy, text) for copy in range(n) for time, text in texts[copy % len(texts)]), key=itemgetter(0)
+    )
+    _write(roots[0], [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element, float]]:

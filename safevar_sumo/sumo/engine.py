@@ -15,7 +15,7 @@ from io import StringIO
 from pathlib import Path
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
-from safevar_sumo.sumo.network import CopiedNetwork
+from safevar_sumo.sumo.network import CopiedNetwork, Network, varied_network
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 CONNECTION_ATTEMPTS = 15
@@ -49,6 +49,13 @@ def open_world(files: CopiedNetwork, n: int, options: Sequence[str] = ()) -> Ite
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
         yield SumoWorld(libsumo, n)
+
+
+@contextmanager
+def open_varied_world(networks: Sequence[Network], options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+    """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
+    with varied_network(networks) as files, open_world(files, len(networks), options) as world:
+        yield world
 
 
 @contextmanager

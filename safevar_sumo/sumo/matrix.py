@@ -27,7 +27,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.scenarios.target import TargetTest
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import drive_all, is_recorded, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
@@ -103,12 +103,23 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds
-    the result of setting i at its worst point.
+    the result of setting i at its worst point. In a study that searches its scenario, row i also holds the safety
+    degree of the original vehicle in the encounter of setting i.
     """
+    if not len(system.characteristics.scenario):
+        return _evaluate_in_batches(system, settings, engine)
+    originals = system.characteristics.with_original_vehicle(settings)
+    pairs = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])  # take turns: they share scenes
+    both, variants = _evaluate_in_batches(system, pairs, engine), np.arange(0, len(pairs), 2)
+    metrics = {name: values[variants] for name, values in both.metrics.items()}
+    return replace(both.take(variants), metrics={**metrics, ORIGINAL_DEGREE: both.f_safe[variants + 1]})
+
+
+def _evaluate_in_batches(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
     size = batch_size(system, engine)
     if len(settings) > size:
         batches = (settings[start : start + size] for start in range(0, len(settings), size))
-        return Evaluations.concatenate([evaluate(system, batch, engine) for batch in batches])
+        return Evaluations.concatenate([_evaluate_in_batches(system, batch, engine) for batch in batches])
     if system.rater is not None:
         return rate_settings(system, settings, engine)[0]
     if system.matrix:
@@ -148,7 +159,11 @@ def evaluate_cells(system: System, settings: FloatArray, part: tuple[int, int], 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
-    return max(largest_batch(system) // len(system.points), MAX_COPIES) if is_recorded(system, engine) else MAX_COPIES
+    if not is_recorded(system, engine):
+        return MAX_COPIES
+    if len(system.characteristics.scenario):  # the original vehicle drives beside each; the points one after another
+        return largest_batch(system) // 2
+    return max(largest_batch(system) // len(system.points), MAX_COPIES)
 
 
 def largest_batch(system: System) -> int:
@@ -206,7 +221,7 @@ def simulate_groups(
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
-    if is_recorded(system, engine):
+    if is_recorded(system, engine) and not len(system.characteristics.scenario):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)

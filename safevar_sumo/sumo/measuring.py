@@ -19,7 +19,7 @@ from safevar_sumo.metrics import (
 )
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.study import Study
+from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.vehicles import CHANGES, Change, checked_change
 
 RESULT_COLUMNS = (
@@ -34,6 +34,7 @@ RESULT_COLUMNS = (
     "f_safe",
     "f_diff",
     "f_num_diff",
+    ORIGINAL_DEGREE,
 )
 """Names of result columns, which no characteristic or metric may use."""
 OBJECTIVES_KEY = "search.objectives"
@@ -72,7 +73,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         if member.code is not None:
             is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
             record = (checked_change if is_change else checked_metric)(member.code)
-            if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
+            if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.domains):
                 raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
             user_records[name] = user_records[record.name] = record
             if isinstance(record, Change):

@@ -12,11 +12,13 @@ import os
 import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError, did_you_mean
@@ -155,7 +157,7 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
         write_roads(parse_xml(built_network(network)), size, into / NETWORK_FILE, source)
 
     def copy_traffic(into: Path) -> None:
-        write_demand(_changed(traffic_file, network.traffic_changes), n, into / TRAFFIC_FILE, traffic_file)
+        write_demand([_changed(traffic_file, network.traffic_changes)], n, into / TRAFFIC_FILE, traffic_file)
 
     roads = cache_folder_name(network, size, _road_digests(network))
     traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)])
@@ -164,6 +166,19 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
         ensure_cached(traffic, TRAFFIC_FILE, copy_traffic),
         network.path(OPTIONS_FILE),
     )
+
+
+@contextmanager
+def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
+    """A copy of one network for each of N traffics, whose file exists until the end; raises the errors of
+    `copied_network`.
+    """
+    files, traffic_file = copied_network(networks[0], len(networks)), networks[0].path(TRAFFIC_FILE)
+    with TemporaryDirectory() as folder:
+        file = Path(folder, TRAFFIC_FILE)
+        roots = [_changed(traffic_file, network.traffic_changes) for network in networks]
+        write_demand(roots, len(roots), file, traffic_file)
+        yield files._replace(traffic=file)
 
 
 def built_network(network: Network) -> Path:

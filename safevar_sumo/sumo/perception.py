@@ -34,13 +34,14 @@ class Perception:
 
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
         self._visibility = per_vehicle([weather.visibility for weather in weathers], size)
-        delays = np.repeat([weather.recognition_delay for weather in weathers], size)
-        distinct_delays = np.unique(delays).tolist()
+        delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         everybody: Any = slice(None)  # faster than indices
-        self._lines = [
-            (everybody if len(distinct_delays) == 1 else np.flatnonzero(delays == delay), DelayLine.by(delay, step))
-            for delay in distinct_delays
-        ]
+        if np.ndim(delays) == 0:
+            self._lines = [(everybody, DelayLine.by(delays, step))]
+            return
+        steps, fractions = DelayLine.parts(delays, step)
+        groups = [np.flatnonzero(steps == count) for count in np.unique(steps)]
+        self._lines = [(group, DelayLine(int(steps[group[0]]), fractions[group])) for group in groups]
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """The observation at this step; must be called in every step.
@@ -121,8 +122,11 @@ def encounter_of(points: Sequence[Point], trace: Trace) -> Encounter:
 
 
 def per_vehicle(values: Sequence[Any], size: int) -> Any:
-    """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value if all are equal."""
-    return values[0] if all(value == values[0] for value in values) else np.repeat(values, size)
+    """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value, or that of the only
+    point, if all are equal.
+    """
+    is_shared = len(values) == 1 or all(value == values[0] for value in values)
+    return values[0] if is_shared else np.repeat(values, size)
 
 
 def _table(columns: Sequence[Any], length: int) -> Any:

@@ -39,24 +39,26 @@ def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) 
 class RecordedWorld:
     """K recorded scenes of one road with `size` vehicles in each; a `World` in which other actors move as recorded.
 
-    Scenarios see the first scene.
+    Scenarios see the first scene. Instead of K scenes there may be one whose `start`, `speed` and tracks are arrays of
+    one value for each of K vehicles (`encounters.py`).
     """
 
     def __init__(self, recordings: Sequence[Recording], size: int) -> None:
         self._size = size
         self._scene = recordings[0]  # road and vehicle under test are the same in all
-        self.n, self.step_length = size * len(recordings), self._scene.step_length
+        self._motion, self._sizes = _joined_tracks(recordings)
+        self.n, self.step_length = size * self._motion.shape[1], self._scene.step_length
         self.sample: Any = 0
-        self._speeds = np.repeat([recording.speed for recording in recordings], size)
+        self._speeds = np.repeat(np.hstack([recording.speed for recording in recordings]), size)
         self._lane_number = np.zeros(self.n, dtype=np.intp)
-        self._lane_position = np.repeat([recording.start for recording in recordings], size)
+        self._lane_position = np.repeat(np.hstack([recording.start for recording in recordings]), size)
         self._lanes = self._scene.way.at(self._lane_number)
         self._fronts: FloatArray | None = None
         self._struck: dict[int, int] = {}
         """The bodies that vehicles strike in this step, by vehicle: numbers among `_others`, all bodies beside them."""
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
+        self._met_persons = self._lanes.meets_persons != 0
         self._last_coordinates = self._last_fronts @ self._scene.along
-        self._motion, self._sizes = _joined_tracks(recordings)
         self._starts, self._ends = self._extents()
 
     @classmethod
@@ -80,6 +82,7 @@ class RecordedWorld:
             If a vehicle leaves its last lane.
         """
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
+        self._met_persons = self._lanes.meets_persons != 0
         distances = distance_covered(self._speeds, speeds, self.step_length)
         if np.count_nonzero(is_open) < self.n:
             speeds, distances = np.where(is_open, speeds, self._speeds), np.where(is_open, distances, 0.0)
@@ -105,7 +108,9 @@ class RecordedWorld:
 
     def vehicle_positions(self, actor: str) -> FloatArray:
         if actor != VUT:
-            return np.full((self.n, 2), self._scene.tracks[actor].motion[self.sample, :2])
+            motion = self._scene.tracks[actor].motion
+            places = motion[self.sample, ..., :2]
+            return np.full((self.n, 2), places) if motion.ndim == 2 else places.repeat(self._size, axis=0)
         if self._fronts is None:
             self._fronts = self._lanes.positions(self._lane_position)
         return self._fronts
@@ -133,7 +138,8 @@ class RecordedWorld:
         """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle number.
 
         SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
-        moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
+        moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`). Persons who cross a junction are checked
+        against vehicles whose front is on it (`MSLane::detectCollisions`).
         """
         self._struck = {}
         scenes, actors = self._adjacent_pairs(is_open).T
@@ -142,9 +148,12 @@ class RecordedWorld:
         motion, (length, width, is_person) = self._motion[self.sample, scenes, actors], self._sizes[scenes, actors].T
         self._others = Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
         is_beside = is_open.reshape(-1, self._size)[scenes]
-        is_beside_person = is_beside & (is_person != 0)[:, np.newaxis]
-        first_hits = self._overlap(self._last_fronts, is_beside_person, scenes, is_person != 0)
-        second_hits = self._overlap(self.vehicle_positions(VUT), is_beside, scenes, is_person != 0)
+        persons = (is_person != 0)[:, np.newaxis]
+        met, meet = (
+            flags.reshape(-1, self._size)[scenes] for flags in (self._met_persons, self._lanes.meets_persons != 0)
+        )
+        first_hits = self._overlap(self._last_fronts, is_beside & persons & met, scenes, is_person != 0)
+        second_hits = self._overlap(self.vehicle_positions(VUT), is_beside & (~persons | meet), scenes, is_person != 0)
         # In the order of the bodies, and for each body of the checks, of which `first` takes a vehicle's first hit:
         bodies, checks, vehicles_in_scene = np.argwhere(np.stack([first_hits, second_hits], axis=1)).T
         vehicles, first = np.unique(scenes[bodies] * self._size + vehicles_in_scene, return_index=True)
@@ -221,11 +230,13 @@ def _joined_tracks(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatAr
     """
     n_actors = max(len(recording.tracks) for recording in recordings)
     n_samples = max((len(track.motion) for recording in recordings for track in recording.tracks.values()), default=1)
-    motion = np.full((n_samples, len(recordings), n_actors, 5), np.nan)
-    sizes = np.full((len(recordings), n_actors, 3), np.nan)
-    for k, recording in enumerate(recordings):
+    k_of = [slice(k, k + 1) for k in range(len(recordings))] if len(recordings) > 1 else [slice(None)]
+    n_scenes = max(len(recordings), np.size(recordings[0].speed))
+    motion = np.full((n_samples, n_scenes, n_actors, 5), np.nan)
+    sizes = np.full((n_scenes, n_actors, 3), np.nan)
+    for k, recording in zip(k_of, recordings, strict=True):
         for actor, track in enumerate(recording.tracks.values()):
-            motion[: len(track.motion), k, actor] = track.motion
+            motion[: len(track.motion), k, actor] = track.motion.reshape(len(track.motion), -1, 5)
             sizes[k, actor] = track.length, track.width, track.is_person
     return motion, sizes
 

@@ -39,7 +39,8 @@ class LaneSequence(NamedTuple):
     """The L lanes of a straight line that the vehicle under test follows, in order; shape (L,) or (L, 2) [m].
 
     A lane's shape leads from `first` along `vector`, over `shape_length`. SUMO counts positions on the lane from 0 to
-    `end`; `stretch` is `shape_length` / `end`.
+    `end`; `stretch` is `shape_length` / `end`. `meets_persons` is 1 where SUMO looks for collisions with persons: on
+    the lanes of junctions, which persons cross, or everywhere if there is no junction; else 0.
     """
 
     first: FloatArray
@@ -47,6 +48,7 @@ class LaneSequence(NamedTuple):
     end: FloatArray
     stretch: FloatArray
     shape_length: FloatArray
+    meets_persons: FloatArray
 
     def at(self, lane: IntArray) -> LaneSequence:
         """The current lanes of N vehicles, given by lane number; columns of length N."""
@@ -70,8 +72,8 @@ class Recording:
     """
 
     step_length: float
-    start: float
-    speed: float
+    start: Any
+    speed: Any
     length: float
     width: float
     way: LaneSequence
@@ -231,4 +233,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     largest_turn, largest_gap = np.abs(direction - direction[0]).max(), np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:
         return None
-    return LaneSequence(starts, vector, lengths, np.maximum(shape_length, POSITION_EPS) / lengths, shape_length)
+    is_junction = np.array([float(copy_and_name(lane)[1].startswith(":")) for lane in lanes])
+    meets_persons = is_junction if is_junction.any() else np.ones(len(lanes))
+    stretch = np.maximum(shape_length, POSITION_EPS) / lengths
+    return LaneSequence(starts, vector, lengths, stretch, shape_length, meets_persons)

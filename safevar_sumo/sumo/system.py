@@ -16,6 +16,7 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.metrics.unsafe import margin_of
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
@@ -23,7 +24,8 @@ from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
-from safevar_sumo.sumo.measuring import Measuring, measuring_of
+from safevar_sumo.sumo.encounters import check_domains, encounter
+from safevar_sumo.sumo.measuring import RESULT_COLUMNS, Measuring, measuring_of
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recording import Scenes
@@ -31,21 +33,6 @@ from safevar_sumo.sumo.traci_controller import Controller, TraciController, subs
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
 from safevar_sumo.vehicles.base import Prepared
 
-RESULT_COLUMNS = (
-    "algorithm",
-    "run",
-    "evaluation",
-    "outcome",
-    "handle",
-    "collision",
-    "collision_speed",
-    "setting",
-    "f_safe",
-    "f_diff",
-    "f_num_diff",
-)
-"""Names of result columns, which no characteristic or metric may use."""
-OBJECTIVES_KEY = "search.objectives"
 MIN_HEADWAY = 0.5
 """Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
 CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
@@ -89,6 +76,18 @@ class System:
     def points(self) -> tuple[Point, ...]:
         """Points at which a setting is simulated: the points of the matrix, or the study's only scenario."""
         return self.matrix or (Point(self.scenario, self.weather),)
+
+    def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
+        """The system at the encounters of N settings, shape (N, n): its only point, with arrays as the parameters that
+        the study searches; and the settings of the vehicles. Both are as they were if the study searches none.
+        """
+        if not len(self.characteristics.scenario):
+            return self, settings
+        (point,), of_vehicle = self.points, self.characteristics.of_vehicle
+        columns = np.ascontiguousarray(settings[:, ~of_vehicle].T)
+        values = dict(zip(self.characteristics.scenario.names, columns, strict=True))
+        system = replace(self.at(encounter(point, values)), characteristics=self.characteristics.vehicle)
+        return system, settings[:, of_vehicle]
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
@@ -153,7 +152,8 @@ class System:
 
     def _prepared_original(self) -> Prepared:
         """The constants of the original vehicle."""
-        original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
+        vehicle = self.characteristics.vehicle
+        original = dict(zip(vehicle.names, vehicle.original[:, np.newaxis], strict=True))
         return self.vehicle.prepare(original, 1.0, 0.1)  # road friction 1, time step 0.1 s
 
 
@@ -196,8 +196,16 @@ def _assemble(study: Study, source: str) -> System:
     matrix = _matrix_points(study if rater is None else expand_protocol(study, weather), source)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network, f"{source}: {NETWORK_KEY}")
-    region = region_of(study, source)
-    nominal = calibration_drive(vehicle, region.characteristics)
+    if study.scenario.search:
+        points = matrix or (Point(scenario, weather),)
+        check_domains(study, points, source)
+        original = {name: domain.original for name, domain in study.scenario.search.items()}
+        scenario, weather, *_ = encounter(points[0], original)
+        matrix = tuple(encounter(point, original) for point in matrix)
+    region, scenes = region_of(study, source), Scenes(study.step_length)
+    if study.scenario.search:
+        measuring = _with_safe_original(study, measuring, scenes, scenario)
+    nominal = calibration_drive(vehicle, region.characteristics.vehicle)
     if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
@@ -211,10 +219,20 @@ def _assemble(study: Study, source: str) -> System:
         measuring=measuring,
         region=region,
         source=source,
-        scenes=Scenes(study.step_length),
+        scenes=scenes,
         matrix=matrix,
         rater=rater,
     )
+
+
+def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scenario: Scenario) -> Measuring:
+    """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
+    (scene,) = scenes.of([Point(scenario, weather_of("clear", study.source))])
+    if isinstance(scene, str):
+        raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
+    contact = scene.length if scenario.centre_to_centre else 0.0
+    limit = contact + margin_of(study, None)
+    return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
 
 
 def models_of(study: Study, source: str) -> tuple[Vehicle, Ads, Scenario, Weather]:

@@ -35,11 +35,12 @@ def drive_again(
     Returns the quantities that `COMPARED` names, shape (T, N), and the `collision` speeds [m/s], NaN without a
     collision, shape (T, N). `watch` is called with SUMO's world at every sample.
     """
-    (point,), trace = system.points, runs.trace
-    n = len(runs.outcome)
+    trace, n = runs.trace, len(runs.outcome)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
-    with user_errors(system.source), open_points_world(system, n) as world:
-        _, _, motion = enter(system, settings, world)
+    fleet, vehicles = system.at_encounters(settings)
+    point = fleet.points[0]
+    with user_errors(system.source), open_points_world(system, settings) as world:
+        _, _, motion = enter(fleet, vehicles, world)
         observer, is_open = SceneObserver(point.scenario, world), np.ones(n, dtype=bool)
         contacts = Contacts(n, np.full(n, point.scenario.test_speed is not None))
         frame = Frame.through_origin(world.lane_of(VUT))

@@ -212,18 +212,18 @@ class SumoWorld:
     def person_width(self, actor: str) -> float:
         return float(self.api.person.getWidth(self.ids(actor)[0]))
 
-    def walk(self, person: str, speed: float) -> None:
-        for id_ in self.ids(person):
-            self.api.person.setSpeed(id_, speed)
+    def walk(self, person: str, speed: float | FloatArray) -> None:
+        for id_, value in zip(self.ids(person), np.broadcast_to(speed, self.n).tolist(), strict=True):
+            self.api.person.setSpeed(id_, value)
 
-    def drive(self, vehicle: str, speed: float) -> None:
-        for id_ in self.ids(vehicle):
+    def drive(self, vehicle: str, speed: float | FloatArray) -> None:
+        for id_, value in zip(self.ids(vehicle), np.broadcast_to(speed, self.n).tolist(), strict=True):
             self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
-            self.api.vehicle.setSpeed(id_, speed)
+            self.api.vehicle.setSpeed(id_, value)
 
-    def turn_back(self, person: str) -> None:
-        api = self.api.person
-        for id_ in self.ids(person):
+    def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
+        api, ids = self.api.person, self.ids(person)
+        for id_ in ids if copies is None else (ids[copy] for copy in copies):
             back = [api.getRoadID(id_), api.getEdges(id_)[0]]
             api.appendWalkingStage(id_, back, 0.0, speed=api.getSpeed(id_))
             api.removeStage(id_, 0)

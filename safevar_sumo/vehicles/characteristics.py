@@ -1,4 +1,6 @@
-"""Vehicle characteristics: their domains, the filter of small changes, and measures of change."""
+"""Vehicle characteristics, and parameters of the scenario that a study searches with them: their domains, the filter of
+small changes, and measures of change.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ section 2).
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """One characteristic of the vehicle under test; all quantities are in `unit`.
+    """One characteristic of the vehicle under test, or a searched parameter of the scenario (`is_scenario`); all
+    quantities are in `unit`.
 
     A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names the part of a real
     vehicle that determines it; both may be empty.
@@ -45,6 +48,7 @@ class Characteristic:
     weight: float = 1.0
     meaning: str = ""
     counterpart: str = ""
+    is_scenario: bool = False
 
     @property
     def short_name(self) -> str:
@@ -61,7 +65,14 @@ class Characteristic:
 
     @property
     def threshold(self) -> float:
-        """Largest change that the filter removes: Th = beta (u - l) (method section 2)."""
+        """Largest change that the filter removes: Th = beta (u - l) (method section 2); 0 for a parameter of the
+        scenario, of which any value is an encounter.
+        """
+        return 0.0 if self.is_scenario else self.resolution
+
+    @property
+    def resolution(self) -> float:
+        """A change that matters little: beta (u - l) (method section 2)."""
         width = self.upper - self.lower
         return next(share for smallest_width, share in FILTER_SHARES if width >= smallest_width) * width
 
@@ -71,13 +82,13 @@ class Characteristic:
         return PLAUSIBLE_MULTIPLE * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
-        """A value as text, rounded so that one unit of its last digit is at most a quarter of the threshold."""
+        """A value as text, rounded so that one unit of its last digit is at most a quarter of `resolution`."""
         return f"{value:.{self.digits}f}"
 
     @property
     def digits(self) -> int:
         """Number of decimals of `text`."""
-        return max(0, math.ceil(-math.log10(self.threshold / 4)))
+        return max(0, math.ceil(-math.log10(self.resolution / 4)))
 
     def rounded(self, value: float, *, upwards: bool) -> float:
         """A limit rounded to the digits of `text`, upwards or downwards; never beyond the original."""
@@ -131,15 +142,21 @@ class Characteristic:
 
 @dataclass(frozen=True)
 class CharacteristicSet:
-    """The n characteristics C_1..C_n of a study; N settings are an array of shape (N, n)."""
+    """The n characteristics C_1..C_n of a study, those of the vehicle before the parameters of its scenario; N settings
+    are an array of shape (N, n).
+    """
 
     members: tuple[Characteristic, ...]
 
     @classmethod
     def of(cls, study: Study) -> CharacteristicSet:
         """The characteristics of a study, in its order."""
-        rows = study.vehicle.characteristics.items()
-        return cls(tuple(Characteristic(name=name, **msgspec.structs.asdict(row)) for name, row in rows))
+        return cls(
+            tuple(
+                Characteristic(name=name, is_scenario=name in study.scenario.search, **msgspec.structs.asdict(row))
+                for name, row in study.domains.items()
+            )
+        )
 
     def __len__(self) -> int:
         return len(self.members)
@@ -150,6 +167,25 @@ class CharacteristicSet:
     @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(characteristic.name for characteristic in self.members)
+
+    @cached_property
+    def vehicle(self) -> CharacteristicSet:
+        """The characteristics of the vehicle alone."""
+        return CharacteristicSet(tuple(member for member in self.members if not member.is_scenario))
+
+    @cached_property
+    def scenario(self) -> CharacteristicSet:
+        """The searched parameters of the scenario; empty in most studies."""
+        return CharacteristicSet(tuple(member for member in self.members if member.is_scenario))
+
+    @cached_property
+    def of_vehicle(self) -> BoolArray:
+        """Which members are the vehicle's, shape (n,)."""
+        return np.array([not member.is_scenario for member in self.members], dtype=bool)
+
+    def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
+        """The original vehicle in the encounters of settings, shape (N, n)."""
+        return np.where(self.of_vehicle, self.original, settings)
 
     @cached_property
     def original(self) -> FloatArray:
@@ -187,13 +223,15 @@ class CharacteristicSet:
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
         """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w (method section 3,
-        where w = 1).
+        where w = 1), of the vehicle's characteristics.
         """
-        return np.asarray(np.max(self.weight * (np.abs(self.original - filtered) / np.abs(self.original)), axis=1))
+        vehicle = self.vehicle
+        change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / np.abs(vehicle.original)
+        return np.asarray(np.max(vehicle.weight * change, axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
-        """f_numDiff, the number of characteristics changed, shape (N,) (method section 3)."""
-        return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
+        """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method section 3)."""
+        return np.asarray(np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1), dtype=float)
 
     def setting(
         self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True"

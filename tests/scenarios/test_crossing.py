@@ -134,7 +134,7 @@ class ArtificialWorld:
     def person_width(self, actor: str) -> float:
         return WIDTH
 
-    def turn_back(self, person: str) -> None:
+    def turn_back(self, person: str, copies: object = None) -> None:
         self.turned_at = self.lateral
 
 

@@ -1,0 +1,137 @@
+"""Encounters of a study that searches its scenario: each setting has values of its own for some parameters of scenario
+and weather.
+
+A scenario whose parameters are arrays of N values stands for N scenarios. Its scene is a recorded one, in which each
+vehicle starts elsewhere and meets a target that moves otherwise (`Scenario.layout`).
+"""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec.structs import force_setattr
+
+from safevar_sumo import scenarios
+from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.scenarios import SCENARIOS, Lane, Point, Scenario
+from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.study import Study
+from safevar_sumo.study.schema import FreeParameter
+from safevar_sumo.sumo.bodies import Track
+from safevar_sumo.sumo.network import stage_networks
+from safevar_sumo.sumo.recording import Recording
+
+SEARCHABLE = msgspec.convert(
+    tomllib.loads(Path(str(scenarios.__file__)).with_name("searchable.toml").read_text(encoding="utf-8")),
+    dict[str, dict[str, FreeParameter]],
+)
+"""Parameters that a study may search, by shipped scenario, or `weather`, and name: scenarios/searchable.toml."""
+
+
+def searchable_in(scenario: type) -> Mapping[str, FreeParameter]:
+    """Parameters of a scenario and its weather that a study may search; none of a user's scenario, or without an
+    encounter.
+    """
+    name = next((name for name, shipped in SCENARIOS.items() if scenario is shipped), "")
+    return {**SEARCHABLE[name], **SEARCHABLE["weather"]} if name in SEARCHABLE else {}
+
+
+def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
+    """Refuse a searched parameter that a scenario of the study does not have, a domain that is wider than the
+    scenario's, and domains in which an encounter is impossible.
+    """
+    for point in points:
+        legal = searchable_in(type(point.scenario))
+        for name, domain in study.scenario.search.items():
+            key = f"scenario.search.{name}"
+            if name not in legal:
+                model = type(point.scenario).__name__
+                raise unknown_name(source, f"{key}: {model} has no such parameter to search", name, legal)
+            widest = legal[name]
+            if domain.unit != widest.unit:
+                raise InputError(source, f"{key}.unit = {domain.unit!r}", repr(widest.unit))
+            if domain.lower < widest.lower or domain.upper > widest.upper:
+                problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
+                raise InputError(source, problem, f"a part of [{widest.lower:g}, {widest.upper:g}] {widest.unit}")
+    ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
+    corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
+    for point in points if ends else ():
+        try:
+            stage_networks([encounter(point, corner).scenario for corner in corners])
+        except InputError as error:
+            raise InputError(source, f"scenario.search: {error.problem}", error.legal or "narrower domains") from None
+
+
+def encounter(point: Point, values: Mapping[str, Any]) -> Point:
+    """A point at other values of parameters, numbers, or arrays for N vehicles."""
+    of_weather = {name: value for name, value in values.items() if name in SEARCHABLE["weather"]}
+    of_scenario = {name: value for name, value in values.items() if name not in of_weather}
+    return point._replace(
+        scenario=_with_fields(point.scenario, of_scenario), weather=_with_fields(point.weather, of_weather)
+    )
+
+
+def _with_fields(record: Any, values: Mapping[str, Any]) -> Any:
+    changed = copy.copy(record)
+    for name, value in values.items():
+        force_setattr(changed, name, value)
+    return changed
+
+
+def scenes_of_encounters(recording: Recording, scenario: Scenario, n: int) -> Recording:
+    """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
+    samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
+    layout = scenario.layout(_RecordedRoads(recording), recording.step_length, samples)
+    frame, track = layout.frame, recording.tracks[layout.target]
+    (x, y), (dir_x, dir_y) = frame.origin, frame.direction
+    left = layout.left
+    if layout.along is None:  # on a footpath, whose place along the lane SUMO knows where it crosses the lane
+        at_lane = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
+        along = frame.along(track.motion[[at_lane], :2])
+    else:
+        along = layout.along
+    sign = np.where(layout.backwards, -1.0, 1.0)
+    first = track.motion[0]
+    columns = (
+        x + along * dir_x - left * dir_y,
+        y + along * dir_y + left * dir_x,
+        sign * first[2],
+        sign * first[3],
+        layout.speeds,
+    )
+    motion = np.empty((len(columns), samples, n))
+    for values, column in zip(motion, columns, strict=True):
+        values[:] = column
+    return replace(
+        recording,
+        start=np.broadcast_to(recording.start if layout.front is None else layout.front, n),
+        speed=np.broadcast_to(recording.speed if layout.speed is None else layout.speed, n),
+        tracks={
+            **{name: _extended(other, samples) for name, other in recording.tracks.items()},
+            layout.target: track._replace(motion=np.moveaxis(motion, 0, -1)),
+        },
+    )
+
+
+def _extended(track: Track, samples: int) -> Track:
+    """The track of an actor who stands, for at least this number of samples."""
+    missing = max(samples - len(track.motion), 0)
+    return track._replace(motion=np.pad(track.motion, ((0, missing), (0, 0)), mode="edge"))
+
+
+class _RecordedRoads:
+    """The lanes of a recorded scene."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    def lane(self, lane: str) -> Lane:
+        return lane_through(lane, self._recording.lanes[lane])

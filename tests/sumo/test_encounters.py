@@ -1,0 +1,249 @@
+"""Studies that search vehicle and scenario together: scenes of their encounters, the row's own original, and what is
+refused.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import ROUNDING
+from safevar_sumo.results import load_runs
+from safevar_sumo.scenarios.euro_ncap import KMH
+from safevar_sumo.search.genetic import Individual, fitness_class, select_survivors
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
+from tests.in_process import searched
+from tests.made_up import drawn
+from tests.sumo.planted import BRAKING, GAP
+
+MARGIN = 4.0
+"""Distance that the original vehicle has to keep in the planted study [m]."""
+
+
+def domain(lower: float, upper: float, unit: str, original: float | None = None) -> dict[str, Any]:
+    return {"lower": lower, "upper": upper, "unit": unit, "original": lower if original is None else original}
+
+
+SPEED, PLACE = domain(30, 60, "km/h"), domain(20, 80, "%", 50)
+WEATHER = {
+    "road_friction": domain(0.6, 1, "-", 1),
+    "visibility": domain(0.5, 1, "-", 1),
+    "recognition_delay": domain(0, 0.3, "s"),
+}
+CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "walker": (
+        "sun",
+        {"model": "pedestrian_crossing"},
+        {"distance": domain(8, 20, "m"), "walking_speed": domain(1, 2.4, "m/s"), "lateral_start": domain(4, 8, "m")},
+    ),
+    "parked": ("lgsvl", {"model": "lead_vehicle_stopped"}, {"distance": domain(40, 70, "m")}),
+    "far": ("wear", {"model": "crossing", "parameters": {"test": "CPFA"}}, {"speed": SPEED, "impact_location": PLACE}),
+    "child": (
+        "wear",
+        {"model": "crossing", "parameters": {"test": "CPNCO"}},
+        {"speed": SPEED, "target_speed": domain(4, 7, "km/h")},
+    ),
+    "cyclist": (
+        "wear",
+        {"model": "crossing", "parameters": {"test": "CBNA"}},
+        {"impact_location": PLACE, "target_speed": domain(10, 20, "km/h")},
+    ),
+    "car": (
+        "wear",
+        {"model": "crossing", "parameters": {"test": "CCCscp", "heading": 10.0}},
+        {"speed": SPEED, "target_speed": domain(20, 50, "km/h")},
+    ),
+    "ahead": (
+        "wear",
+        {"model": "along"},
+        {"speed": SPEED, "impact_location": PLACE, "target_speed": domain(3, 8, "km/h")},
+    ),
+    "stopped": (
+        "wear",
+        {"model": "car_to_car"},
+        {"speed": SPEED, "headway": domain(3, 5, "s"), "impact_location": PLACE},
+    ),
+    "brakes": (
+        "wear",
+        {"model": "car_to_car", "parameters": {"test": "CCRb"}},
+        {"speed": SPEED, "headway": domain(1, 2, "s"), "target_deceleration": domain(3, 6, "m/s^2")},
+    ),
+}
+
+
+def searched_study(case: str) -> Study:
+    base, scenario, search = CASES[case]
+    return load_study(base, matrix=None, scenario={**scenario, "search": {**search, **WEATHER}}, name=case, title=case)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> None:
+    """Its scene is one that SUMO has played, and its original vehicle drives there."""
+    joint = searched_study(case)
+    system = assemble(joint)
+    settings = drawn(system, 4, 3)
+    evaluations = evaluate(system, settings)
+    names, of_vehicle = system.characteristics.scenario.names, system.characteristics.of_vehicle
+    for row, setting in enumerate(settings):
+        values = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))
+        weather = {name: values.pop(name) for name in WEATHER}
+        base, scenario, _ = CASES[case]
+        parameters = {**scenario.get("parameters", {}), **values}
+        plain = load_study(
+            base,
+            matrix=None,
+            scenario={"model": scenario["model"], "parameters": parameters},
+            weather={"name": "own", "wet": base == "wear", **weather},
+        )
+        other = assemble(plain)
+        both = np.stack([setting[of_vehicle], other.characteristics.original])
+        alone = evaluate(other, both)
+        assert alone.outcome[0] == evaluations.outcome[row]
+        np.testing.assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(
+            evaluations.metrics["original_safety_degree"][row], alone.f_safe[1], rtol=0, atol=ROUNDING
+        )
+    assert not verify_in_sumo(system, settings)
+
+
+def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
+    system = assemble(load_study("sun_joint"))
+    settings = drawn(system, 30, 1)
+    together = evaluate(system, settings)
+    for row in (0, 7, 29):
+        alone = evaluate(system, settings[[row]])
+        for name, values in together.results.items():
+            np.testing.assert_array_equal(alone.results[name], values[[row]])
+    in_sumo = evaluate(system, settings, Engine.LIBSUMO)
+    assert in_sumo.outcome.tolist() == together.outcome.tolist()
+    np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
+    assert settings_per_batch(system, Engine.RECORDED) > len(settings)
+
+
+def planted(**changes: Any) -> Study:
+    tables = {
+        "name": "planted",
+        "title": "A standing car",
+        "weather": "clear",
+        "step_length": 0.02,
+        "scenario": {
+            "model": "car_to_car",
+            "parameters": {"headway": 2.0},
+            "search": {"speed": domain(50, 70, "km/h"), "road_friction": domain(0.5, 1, "-", 1)},
+        },
+        "vehicle": {
+            "model": "tests.sumo.planted:Block",
+            "characteristics": {"brakes": {"unit": "-", "original": 1, "lower": 0.2, "upper": 1}},
+        },
+        "ads": {"model": "tests.sumo.planted:AtGap"},
+        "metrics": {"ttc_threshold": 1.5},
+        "search": {
+            "algorithms": ["nsga2", "rs", "safe_fuzzer"],
+            "population": 30,
+            "evaluations": 300,
+            "runs": 1,
+            "seed": 1,
+        },
+        "model_error": {"safety_degree": MARGIN},
+        **changes,
+    }
+    return load_study(tables)
+
+
+def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) -> None:
+    """The original stops s = v^2 / (2 a mu) after it brakes and keeps the margin if s <= gap - margin; a share b of its
+    brakes collides if s / b > gap. So the least wear that ever collides leaves b = 1 - margin / gap of the brakes.
+    """
+    search = {"algorithms": ["nsga2"], "population": 40, "evaluations": 1200, "runs": 1, "seed": 1}
+    results = load_runs(searched(planted(step_length=0.01, search=search), tmp_path / "out"))
+    solutions = results.solutions
+    collisions = solutions[solutions["outcome"] == "collision"]
+    assert collisions["brakes"].max() == pytest.approx(1 - MARGIN / GAP, rel=0.01)
+    everything = results.evaluations
+    stops = (everything["speed"] * KMH) ** 2 / (2 * BRAKING * everything["road_friction"])
+    ratio = stops / everything["brakes"] / GAP
+    collided = everything["outcome"] == "collision"
+    assert ratio[collided].min() > 0.99
+    assert ratio[~collided].max() < 1.01
+    degrees = everything["original_safety_degree"]
+    np.testing.assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
+
+
+def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Path) -> None:
+    """In half of the encounters here the original collides; all algorithms simulate them and report none."""
+    search = {"speed": domain(50, 90, "km/h"), "road_friction": domain(0.5, 1, "-", 1)}
+    study = planted(scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "search": search})
+    results = load_runs(searched(study, tmp_path / "out"))
+    for algorithm, rows in results.evaluations.groupby("algorithm"):
+        assert (rows["original_safety_degree"] < MARGIN).mean() > 0.1, algorithm
+    assert (results.solutions["original_safety_degree"] >= MARGIN).all()
+    assert set(results.solutions["algorithm"]) == {"nsga2", "rs", "safe_fuzzer"}
+    assert (results.solutions["outcome"] == "collision").any()
+
+
+def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> None:
+    def individual(objectives: tuple[float, ...], violation: float) -> Individual:
+        one = Individual([0.0])
+        one.fitness, one.violation = fitness_class(2)(objectives), violation
+        return one
+
+    worst_feasible, best = individual((9.0, 9.0), 0.0), individual((0.0, 1.0), 0.0)
+    slightly, badly = individual((-9.0, 0.0), 0.1), individual((-99.0, 0.0), 5.0)
+    assert select_survivors([badly, slightly, worst_feasible, best], 4) == [best, worst_feasible, slightly, badly]
+    assert select_survivors([badly, slightly], 1) == [slightly]
+    assert slightly.standing < badly.standing
+    assert slightly.standing[0] > 0, "no solution of a run"
+
+
+@pytest.mark.parametrize("name", ["sun_joint", "wear_joint"])
+def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tmp_path: Path) -> None:
+    """`searched` also verifies all solutions in SUMO."""
+    study = load_study(name, search={"runs": 1, "evaluations": 150, "algorithms": ["nsga2", "rs"]})
+    solutions = load_runs(searched(study, tmp_path / "out")).solutions
+    limit = assemble(study).measuring.scoring.safe_original
+    assert limit is not None
+    assert (solutions["original_safety_degree"] >= limit).all()
+    assert (solutions["outcome"] == "collision").any()
+
+
+TOO_WIDE = {**SPEED, "upper": 500}
+MISTAKES = {
+    "unknown": ({"headway": domain(1, 2, "s")}, r"scenario\.search\.headway: .* no such parameter"),
+    "nearest": ({"speeed": SPEED}, r"did you mean 'speed'"),
+    "reversed": ({"speed": {**SPEED, "lower": 60, "upper": 30}}, r"scenario\.search\.speed: lower = 60"),
+    "empty": ({"speed": {**SPEED, "upper": 30}}, "lower < upper"),
+    "unit": ({"speed": {**SPEED, "unit": "m/s"}}, r"scenario\.search\.speed\.unit = 'm/s'"),
+    "wide": ({"speed": TOO_WIDE}, r"a part of \[10, 80\] km/h"),
+    "fixed": ({"impact_location": PLACE}, r"scenario\.parameters\.impact_location = 25\.0 fixes it"),
+    "impossible": ({"target_speed": domain(3, 8, "km/h")}, "needs .* s to the impact"),
+    "vehicle": ({"payload": domain(3, 8, "kg")}, "a characteristic of the vehicle"),
+    "key": ({"speed": {**SPEED, "weight": 2}}, "there is no such key"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_of_a_search_are_refused(mistake: str) -> None:
+    search, message = MISTAKES[mistake]
+    parameters = {"test": "CPFA", "impact_location": 25.0, "time_to_impact": 3.5}
+    with pytest.raises(InputError, match=message) as caught:
+        assemble(
+            load_study("wear", matrix=None, scenario={"model": "crossing", "parameters": parameters, "search": search})
+        )
+    assert str(caught.value).count("\n") <= 1
+
+
+def test_a_matrix_and_a_search_over_one_parameter_are_refused() -> None:
+    with pytest.raises(InputError, match=r"scenario\.search\.speed: test 'CPFA' of the matrix sets speed, too"):
+        load_study("wear", scenario={"search": {"speed": SPEED}})
+    with pytest.raises(InputError, match=r"ads: there is no such key|ads.search"):
+        load_study("wear", ads={"search": {"speed": SPEED}})
+    with pytest.raises(InputError, match="the cells of euro_ncap_2026 are fixed"):
+        load_study("euro_ncap_rating", scenario={"search": {"speed": SPEED}})
