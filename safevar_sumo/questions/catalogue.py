@@ -13,13 +13,14 @@ from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
+from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear, searchable_in
 from safevar_sumo.search import DESCRIPTIONS
-from safevar_sumo.study import load_study, study_names
+from safevar_sumo.study import load_study, study_names, unit_text
 from safevar_sumo.vehicles import CHANGES, CharacteristicSet
 
 NAME = {"name": Column("", "name in a study")}
 DESCRIBED = NAME | {"description": Column("", "what it is")}
+SCENARIO = DESCRIBED | {"search": Column("", "what [scenario.search] may vary, and its widest domain")}
 STUDIES = NAME | {key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")}
 VEHICLES = {
     "vehicle": Column("", "vehicle"),
@@ -61,7 +62,7 @@ def list_models(kind: str | None = None) -> Answer:
         "studies": tabulate("Studies", STUDIES, _studies()),
         "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
         "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
-        "scenarios": tabulate("Scenarios", DESCRIBED, _described(SCENARIOS)),
+        "scenarios": tabulate("Scenarios", SCENARIO, _scenarios()),
         "weathers": tabulate("Weathers", WEATHER, _weathers()),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
         "metrics": tabulate(
@@ -87,13 +88,20 @@ def _studies() -> Iterator[tuple[str, ...]]:
 def _characteristics() -> Iterator[tuple[Any, ...]]:
     studies = {study.vehicle.model: study for study in reversed([*map(load_study, study_names())])}
     for vehicle, study in sorted(studies.items()):
-        for row in CharacteristicSet.of(study):
+        for row in CharacteristicSet.of(study).vehicle:
             yield vehicle, *(getattr(row, name) for name in list(VEHICLES)[1:])
 
 
 def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """The first paragraph of each model's docstring."""
     return ((name, " ".join((model.__doc__ or "").partition("\n\n")[0].split())) for name, model in models.items())
+
+
+def _scenarios() -> Iterator[tuple[str, ...]]:
+    for name, description in _described(SCENARIOS):
+        parameters = searchable_in(SCENARIOS[name]).items()
+        domains = (f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in parameters)
+        yield name, description, "; ".join(domains)
 
 
 def _weathers() -> pd.DataFrame:

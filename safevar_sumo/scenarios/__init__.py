@@ -22,7 +22,7 @@ from safevar_sumo.scenarios.base import (
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.stop import Stop
-from safevar_sumo.study import Weather
+from safevar_sumo.study import FreeParameter, Weather
 
 SCENARIOS: Mapping[str, type] = {
     "pedestrian_crossing": PedestrianCrossing,
@@ -36,6 +36,21 @@ SCENARIOS: Mapping[str, type] = {
 _TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
 WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
 """Weathers by name."""
+
+
+SEARCHABLE = msgspec.convert(
+    tomllib.loads(Path(__file__).with_name("searchable.toml").read_text(encoding="utf-8")),
+    dict[str, dict[str, FreeParameter]],
+)
+"""Parameters that a study may search, by shipped scenario, or `weather`, and name: searchable.toml beside this module."""
+
+
+def searchable_in(scenario: type) -> Mapping[str, FreeParameter]:
+    """Parameters of a scenario and its weather that a study may search; none of a user's scenario, or without an
+    encounter.
+    """
+    name = next((name for name, shipped in SCENARIOS.items() if scenario is shipped), "")
+    return {**SEARCHABLE[name], **SEARCHABLE["weather"]} if name in SEARCHABLE else {}
 
 
 def weather_of(choice: str | Weather, source: object) -> Weather:

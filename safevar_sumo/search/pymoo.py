@@ -156,9 +156,10 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
 
 def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:
     """Give pymoo's individuals their objectives and violations."""
-    valid, values = problem.scoring.valid(evaluations), problem.scoring.values(evaluations)
-    values = np.where(valid[:, np.newaxis], values, FAILED)[:, : algorithm.problem.n_obj]
-    population.set("F", values, "G", np.where(valid, 0.0, FAILED)[:, np.newaxis])
+    scored, values = problem.scoring.scored(evaluations), problem.scoring.values(evaluations)
+    values = np.where(scored[:, np.newaxis], values, FAILED)[:, : algorithm.problem.n_obj]
+    violations = np.where(scored, np.minimum(problem.scoring.violation(evaluations), FAILED), FAILED)
+    population.set("F", values, "G", violations[:, np.newaxis])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
     algorithm.evaluator.n_eval += len(evaluations)
 

@@ -8,40 +8,21 @@ vehicle starts elsewhere and meets a target that moves otherwise (`Scenario.layo
 from __future__ import annotations
 
 import copy
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec.structs import force_setattr
 
-from safevar_sumo import scenarios
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.scenarios import SCENARIOS, Lane, Point, Scenario
+from safevar_sumo.scenarios import SEARCHABLE, Lane, Point, Scenario, searchable_in
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.study import Study
-from safevar_sumo.study.schema import FreeParameter
 from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.network import stage_networks
 from safevar_sumo.sumo.recording import Recording
-
-SEARCHABLE = msgspec.convert(
-    tomllib.loads(Path(str(scenarios.__file__)).with_name("searchable.toml").read_text(encoding="utf-8")),
-    dict[str, dict[str, FreeParameter]],
-)
-"""Parameters that a study may search, by shipped scenario, or `weather`, and name: scenarios/searchable.toml."""
-
-
-def searchable_in(scenario: type) -> Mapping[str, FreeParameter]:
-    """Parameters of a scenario and its weather that a study may search; none of a user's scenario, or without an
-    encounter.
-    """
-    name = next((name for name, shipped in SCENARIOS.items() if scenario is shipped), "")
-    return {**SEARCHABLE[name], **SEARCHABLE["weather"]} if name in SEARCHABLE else {}
 
 
 def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
