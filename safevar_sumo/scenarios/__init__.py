@@ -42,7 +42,7 @@ SEARCHABLE = msgspec.convert(
     tomllib.loads(Path(__file__).with_name("searchable.toml").read_text(encoding="utf-8")),
     dict[str, dict[str, FreeParameter]],
 )
-"""Parameters that a study may search, by shipped scenario, or `weather`, and name: searchable.toml beside this module."""
+"""Parameters that a study may search, by shipped scenario, or `weather`, and name: searchable.toml in this folder."""
 
 
 def searchable_in(scenario: type) -> Mapping[str, FreeParameter]:
