@@ -182,11 +182,8 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     def valid(self, evaluations: Evaluations) -> BoolArray:
         """Whether the simulation succeeded, every objective is defined and the setting is feasible; shape (M,)."""
-        return np.asarray(self.scored(evaluations) & (self.violation(evaluations) == 0))
-
-    def scored(self, evaluations: Evaluations) -> BoolArray:
-        """Whether the simulation succeeded and every objective is defined; shape (M,)."""
-        return np.asarray(evaluations.valid & np.isfinite(self.values(evaluations)).all(axis=1))
+        is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
+        return np.asarray(evaluations.valid & is_defined & (self.violation(evaluations) == 0))
 
     def metric(self, name: str) -> MetricFacts:
         """A metric by name."""

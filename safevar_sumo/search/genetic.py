@@ -162,7 +162,7 @@ def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> 
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     scoring, fitness = problem.scoring, fitness_class(len(problem.scoring.objectives))
     violations = scoring.violation(evaluated)
-    failed = ~(scoring.scored(evaluated) & np.isfinite(violations))
+    failed = ~np.where(violations > 0, np.isfinite(violations), scoring.valid(evaluated))
     columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
     for row, (individual, values, violation, has_failed) in enumerate(zip(individuals, *columns, strict=True)):
         individual.evaluation, individual.violation, individual.has_failed = (evaluated, row), violation, has_failed

@@ -156,9 +156,10 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
 
 def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:
     """Give pymoo's individuals their objectives and violations."""
-    scored, values = problem.scoring.scored(evaluations), problem.scoring.values(evaluations)
-    values = np.where(scored[:, np.newaxis], values, FAILED)[:, : algorithm.problem.n_obj]
-    violations = np.where(scored, np.minimum(problem.scoring.violation(evaluations), FAILED), FAILED)
+    scoring = problem.scoring
+    valid, violations = scoring.valid(evaluations), scoring.violation(evaluations)
+    values = np.where(valid[:, np.newaxis], scoring.values(evaluations), FAILED)[:, : algorithm.problem.n_obj]
+    violations = np.where(valid | (violations > 0), np.minimum(violations, FAILED), FAILED)
     population.set("F", values, "G", violations[:, np.newaxis])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
     algorithm.evaluator.n_eval += len(evaluations)

@@ -76,6 +76,9 @@ class StandardScoring:
     def valid(self, evaluations: Evaluations) -> FloatArray:
         return np.ones(len(evaluations), dtype=bool)
 
+    def violation(self, evaluations: Evaluations) -> FloatArray:
+        return np.zeros(len(evaluations))
+
 
 def standard_problem(
     standard: StandardProblem, evaluations: int = EVALUATIONS, population: int = POPULATION

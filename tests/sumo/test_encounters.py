@@ -7,6 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -101,7 +102,7 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
             base,
             matrix=None,
             scenario={"model": scenario["model"], "parameters": parameters},
-            weather={"name": "own", "wet": base == "wear", **weather},
+            weather={**msgspec.to_builtins(system.weather), **weather},
         )
         other = assemble(plain)
         both = np.stack([setting[of_vehicle], other.characteristics.original])
