@@ -106,4 +106,4 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     answer = run("explain", "part", "--jobs", "1")
     assert "0 of 0 different solutions of the search are unsafe" in answer.stdout
     assert "nan %" not in answer.stdout
-    assert "warning" not in answer.stderr
+    assert answer.stderr.count("warning") == 1, "the unfinished runs, and nothing of numpy"
