@@ -16,7 +16,8 @@ from safevar_sumo.terminal import WholeTable, printable_text
 LOW, HIGH = "_low", "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
 LONG_TEXT = 60
-"""Longer texts of a column stand below a table on the terminal [characters]."""
+"""Longer texts stand below a table on the terminal, unless a column of `LEAST_TEXT` has room [characters]."""
+LEAST_TEXT = 36
 LATEX_PREAMBLE = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
 )
@@ -184,13 +185,15 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     """The table; columns that do not fit stand in further tables, in which the first columns of text are repeated, and
     long texts in lines of their own.
     """
-    columns, long = list[_ReaderColumn](), list[_ReaderColumn]()
-    for column in reader_columns(frame):
-        (long if column.is_long else columns).append(column)
+    every = list(reader_columns(frame))
+    long = [column for column in every if column.is_long]
+    columns = [column for column in every if not column.is_long]
     if long and len(columns) < 2:  # lines say it all
         yield frame.attrs.get("title", "")
         yield from (": ".join(texts) for texts in zip(*(column.texts for column in (*columns, *long)), strict=True))
         return
+    if 1 + sum(max(_least_width(column), LEAST_TEXT * column.is_long) for column in every) <= width:
+        columns, long = every, []
     labels = list(takewhile(lambda column: not column.is_number, columns))
     blocks = [[*labels]]
     for column in columns[len(labels) :]:
