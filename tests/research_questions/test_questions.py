@@ -280,10 +280,8 @@ def test_a_reader_chooses_the_level_of_significance() -> None:
 
 def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
     case = three_algorithms()
-    counts = [
-        (case.name, name, run, 9, 5, 7 if name == "nsga2" else run % 3) for name in case.algorithms for run in range(8)
-    ]
-    frame = pd.DataFrame(counts, columns=["setting", "algorithm", "run", "failures", "examined", "causes"])
+    counts = [(name, run, 9, 5, 7 if name == "nsga2" else run % 3) for name in case.algorithms for run in range(8)]
+    frame = pd.DataFrame(counts, columns=["algorithm", "run", "failures", "examined", "causes"])
     choices = Choices(causes={case.name: frame})
     found = only(rq2_runs(case, choices), metric="causes", baseline="rs")
     assert (found["effect_size"], found["n1"], found["significant"]) == (1, 8, True)
@@ -363,7 +361,7 @@ def test_the_footer_of_rq33() -> None:
 
 def test_collisions_and_their_share() -> None:
     frame = count_collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
-    assert frame.to_numpy().tolist() == [["made-up", "nsga2", 3, 2, pytest.approx(2 / 3)], ["made-up", "rs", 1, 0, 0]]
+    assert frame.to_numpy().tolist() == [["nsga2", 3, 2, pytest.approx(2 / 3)], ["rs", 1, 0, 0]]
 
 
 def test_weather_compares_cases_that_differ_in_it_alone() -> None:

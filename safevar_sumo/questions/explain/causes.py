@@ -155,7 +155,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     Returns
     -------
     pandas.DataFrame
-        Columns setting, algorithm, run, failures (different unsafe solutions), examined, causes.
+        Columns algorithm, run, failures (different unsafe solutions), examined, causes.
     """
     names, keys = list(evaluator.characteristics.names), ["algorithm", "run"]
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
@@ -167,11 +167,8 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     for run, group in zip(examined[keys].itertuples(index=False, name=None), kinds, strict=True):
         by_run[run].update(group)
     counts = [frame.groupby(keys).size().to_dict() for frame in (failures, examined)]
-    rows = [
-        (case.name, *run, *(count.get(run, 0) for count in counts), len(kinds_of_run))
-        for run, kinds_of_run in by_run.items()
-    ]
-    return pd.DataFrame(rows, columns=["setting", *keys, "failures", "examined", "causes"])
+    rows = [(*run, *(count.get(run, 0) for count in counts), len(kinds_of_run)) for run, kinds_of_run in by_run.items()]
+    return pd.DataFrame(rows, columns=[*keys, "failures", "examined", "causes"])
 
 
 LINE_SETTINGS = 32

@@ -107,7 +107,7 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
                 errors.append(error)
                 remarks.append((name, f"{error.source}: {error.problem}."))
             else:
-                parts.append(part)
+                parts.append(part if name == WEATHER else part.assign(setting=group[0].name))
                 remarks += [(name, note) for case in group for note in _remarks(name, case, part, choices.alpha)]
         shown = {
             key: column._replace(is_shown=len(cases) > 1) if key == "setting" else column

@@ -1,8 +1,8 @@
 """RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun
 against rain.
 
-In the frames, the columns `setting` and `other` hold the names of cases. Functions of a case raise `UnanswerableError`
-as `critical_solutions` does; `rq31` also raises it if solutions belong to no run.
+Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if solutions belong to
+no run.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from safevar_sumo.results import changed_values, evaluation_keys
 from safevar_sumo.study import SAFETY_DEGREE, tables_of
 
 ANY = "any"
-WEATHER_VALUES = ["percent", "percent_other", "difference", "rank", "rank_other"]
-WEATHER_VALUES += ["increase", "increase_other", "decrease", "decrease_other"]
 WEATHER_PARAMETERS = (*REACTION_PARAMETERS, "brake_place")
 """Parameters of an ADS by which it reacts to a weather: its delays, and where World On Rails sees the pedestrian."""
 COMBINATION_SIZE = 4
@@ -70,34 +68,30 @@ def _means_by_change_count(
 ) -> pd.DataFrame:
     """Mean values of the critical solutions with j characteristics changed, for each key and j.
 
-    `values` holds keys, each with one value per critical solution; NaN does not count. Columns: setting, the `labels`
-    of the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of values).
+    `values` holds keys, each with one value per critical solution; NaN does not count. Columns: the `labels` of
+    the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of values).
     """
     change_counts = count_changes(case)
     rows = []
     for (key, column), j in product(values, (*change_numbers(case), ANY)):
         sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
-        rows.append((case.name, *key, j, np.mean(sample) if sample.size else np.nan, sample.size))
-    return pd.DataFrame(rows, columns=["setting", *labels, "j", name, "n"])
+        rows.append((*key, j, np.mean(sample) if sample.size else np.nan, sample.size))
+    return pd.DataFrame(rows, columns=[*labels, "j", name, "n"])
 
 
 def rq31(case: Case) -> pd.DataFrame:
-    """Number of critical solutions of each run with exactly j characteristics changed; columns setting, run, j,
-    count.
-    """
+    """Number of critical solutions of each run with exactly j characteristics changed; columns run, j, count."""
     solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
     counts = solutions.groupby([solutions["run"], count_changes(case)]).size()
     index = pd.MultiIndex.from_product([runs, change_numbers(case)], names=["run", "j"])
-    frame = counts.reindex(index, fill_value=0).reset_index(name="count")
-    frame.insert(0, "setting", case.name)
-    return frame
+    return counts.reindex(index, fill_value=0).reset_index(name="count")
 
 
 def rq32(case: Case) -> pd.DataFrame:
     """For each characteristic and j: the share of the critical solutions with j changes that change this
     characteristic.
 
-    Columns setting, characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank (only for
+    Columns characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
     shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
@@ -111,7 +105,7 @@ def rq32(case: Case) -> pd.DataFrame:
 def rq33(case: Case) -> pd.DataFrame:
     """Size of increases and of decreases in the critical solutions with j characteristics changed.
 
-    Columns setting, characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean change
+    Columns characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean change
     relative to the original value, without sign), delta (mean signed change in the characteristic's unit), n (number of
     changes); pc and delta are undefined where n is 0.
     """
@@ -124,13 +118,13 @@ def rq33(case: Case) -> pd.DataFrame:
     }
     frame = _means_by_change_count(case, ["characteristic", "direction"], "delta", values.items())
     frame["pc"] = (frame["delta"] / frame["characteristic"].map(originals)).abs()
-    return frame[["setting", "characteristic", "direction", "j", "pc", "delta", "n"]]
+    return frame
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
     """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
 
-    Columns setting, quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value
+    Columns quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value
     is undefined where n is 0. Quantities:
 
     - avgSD_mD: mean reduction of the distance over solutions without collision [m];
@@ -151,11 +145,11 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
     scale = frame["quantity"].map(SAFETY_SCALES).map(case.original).abs().replace(0.0, np.nan)
     frame["percent"] = 100 * frame["value"] / scale
-    return frame[["setting", "quantity", "j", "value", "percent", "n"]]
+    return frame
 
 
 def count_collisions(case: Case) -> pd.DataFrame:
-    """Number of collisions among each algorithm's solutions; columns setting, algorithm, solutions, collisions, share
+    """Number of collisions among each algorithm's solutions; columns algorithm, solutions, collisions, share
     [fraction].
 
     Raises
@@ -166,14 +160,14 @@ def count_collisions(case: Case) -> pd.DataFrame:
     case.require_solutions()
     collisions = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
     counts = collisions.agg(solutions="size", collisions="sum").reindex(list(case.algorithms), fill_value=0)
-    counts = counts.assign(share=counts["collisions"] / counts["solutions"]).rename_axis("algorithm").reset_index()
-    return pd.DataFrame({"setting": case.name, **counts})
+    shares = counts.assign(share=counts["collisions"] / counts["solutions"])
+    return pd.DataFrame(shares.rename_axis("algorithm").reset_index())
 
 
 def frequent_combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
-    Columns setting, rank (ties share the better one), characteristics (a list), percent (of the solutions with exactly
+    Columns rank (ties share the better one), characteristics (a list), percent (of the solutions with exactly
     four changes); no row where there is no such solution. Of combinations that are equally frequent, those with the
     earlier characteristics in the study come first.
     """
@@ -184,8 +178,8 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     rows = []
     for indices, number in most_frequent:
         rank = 1 + sum(other > number for other in counts.values())
-        rows.append((case.name, rank, [case.characteristics.names[i] for i in indices], 100 * number / len(masks)))
-    return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
+        rows.append((rank, [case.characteristics.names[i] for i in indices], 100 * number / len(masks)))
+    return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])
 
 
 def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
@@ -226,17 +220,16 @@ def compare_weathers(*cases: Case) -> pd.DataFrame:
     tables = [
         _overall_changes(clearer)
         .merge(_overall_changes(other), "left", "characteristic", suffixes=("", "_other"))
-        .rename(columns={"setting_other": "other"})
+        .assign(setting=clearer.name, other=other.name)
         for clearer, other in find_weather_pairs(cases)
     ]
     table = pd.concat(tables, ignore_index=True)
-    table["difference"] = table["percent_other"] - table["percent"]
-    return table[["setting", "other", "characteristic", *WEATHER_VALUES]]
+    return table.assign(difference=table["percent_other"] - table["percent"])
 
 
 def _overall_changes(case: Case) -> pd.DataFrame:
-    """How often and how far the critical solutions change each characteristic; columns setting, characteristic,
-    percent, rank, increase, decrease.
+    """How often and how far the critical solutions change each characteristic; columns characteristic, percent, rank,
+    increase, decrease.
     """
     shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
     deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")

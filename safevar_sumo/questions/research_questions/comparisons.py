@@ -4,8 +4,8 @@ The paper pools the solutions of all runs and compares them with a second sample
 once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
 small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests.
 
-In the frames, the column `setting` holds the case's name, `method` the name of the test, and `enough_runs` whether a
-test with so many runs can be significant; undefined values are NaN. Functions of a case raise `UnanswerableError` if no
+In the frames, `method` holds the name of the test, and `enough_runs` whether a test with so many runs can be
+significant; undefined values are NaN. Functions of a case raise `UnanswerableError` if no
 run is finished, if an algorithm that they compare is missing, and over runs if the solutions belong to no run.
 """
 
@@ -49,7 +49,7 @@ Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 
 class Choices(NamedTuple):
     """What a reader chooses: the algorithm that is compared with all others, the level of significance, and, by a
-    case's name, the minimal causes of its runs, if they were counted: columns setting, algorithm, run, causes.
+    case's name, the minimal causes of its runs, if they were counted: columns algorithm, run, causes.
     """
 
     algorithm: str = ""
@@ -134,22 +134,22 @@ def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
 
 
 def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """The median over the runs of each algorithm, of every indicator and metric; columns setting, algorithm, metric,
-    runs, median, median_low, median_high.
+    """The median over the runs of each algorithm, of every indicator and metric; columns algorithm, metric, runs,
+    median, median_low, median_high.
     """
     case.require_solutions()
     samples = _samples(case, choices, over_runs=True)
     rows = [
-        (case.name, algorithm, metric, len(values), values.median(), *median_interval(values, choices.alpha))
+        (algorithm, metric, len(values), values.median(), *median_interval(values, choices.alpha))
         for (algorithm, metric), values in samples.items()
     ]
-    return pd.DataFrame(rows, columns=["setting", "algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN])
+    return pd.DataFrame(rows, columns=["algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN])
 
 
 def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """How many evaluations a run needs to find a collision; a run without any has needed more than it requested.
 
-    Columns setting, algorithm, runs, collided (runs with a collision), median with its interval, and against the
+    Columns algorithm, runs, collided (runs with a collision), median with its interval, and against the
     algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the other algorithms.
     """
     ends = count_evaluations(case).set_index(["algorithm", "run"])["requested"]
@@ -163,8 +163,8 @@ def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
         median, interval = survival_median(times, found, choices.alpha)
         is_other = algorithm != reference and reference in samples
         p_value = log_rank_test((times, found), samples[reference]) if is_other else math.nan
-        rows.append((case.name, algorithm, len(times), int(found.sum()), median, *interval, p_value))
-    names = ["setting", "algorithm", "runs", "collided", *INTERVAL_OF_MEDIAN, "p_value"]
+        rows.append((algorithm, len(times), int(found.sum()), median, *interval, p_value))
+    names = ["algorithm", "runs", "collided", *INTERVAL_OF_MEDIAN, "p_value"]
     frame = pd.DataFrame(rows, columns=names)
     return frame.assign(p_holm=correct_by_holm(frame["p_value"]))
 
@@ -214,7 +214,7 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
         if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
             test = test.reversed()
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
-        row = {"setting": case.name, "algorithm": algorithm, "metric": metric.name, "runs": runs}
+        row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
         row |= {"mean": values.mean(), "original": original, "enough_runs": runs >= fewest}
         rows.append({**row, **test._asdict()})
     return rows
@@ -232,7 +232,7 @@ def _test_opponents(case: Case, choices: Choices, *, over_runs: bool = False) ->
         if not more_is_better:  # so that above 0.5 the first algorithm is better
             test = test.reversed()
         runs = min((test.n1, test.n2) if over_runs else (_finished_runs(case, name) for name in (first, baseline)))
-        row = {"setting": case.name, "algorithm": first, "baseline": baseline, "metric": metric}
+        row = {"algorithm": first, "baseline": baseline, "metric": metric}
         rows.append({**row, **test._asdict(), "runs": runs, "enough_runs": runs >= fewest})
     return rows
 

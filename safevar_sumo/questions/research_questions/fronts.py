@@ -98,7 +98,7 @@ def _frames_of_runs(case: Case, frame: pd.DataFrame) -> Iterator[tuple[tuple[str
 
 
 def count_evaluations(case: Case) -> pd.DataFrame:
-    """The evaluations of every finished run; columns setting, algorithm, run, requested, simulated, budget.
+    """The evaluations of every finished run; columns algorithm, run, requested, simulated, budget.
 
     Equal settings are simulated once, so `simulated` counts different settings. A run has requested its whole budget if
     a new setting is in its last generation; else it ended with its last new setting.
@@ -112,10 +112,10 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
         last = int(group["evaluation"].max()) + 1
         requested = search.evaluations if last > search.evaluations - search.population else last
-        rows.append((case.name, algorithm, run, requested, len(group), search.evaluations))
+        rows.append((algorithm, run, requested, len(group), search.evaluations))
     if not rows:
         raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
-    return pd.DataFrame(rows, columns=["setting", "algorithm", "run", "requested", "simulated", "budget"])
+    return pd.DataFrame(rows, columns=["algorithm", "run", "requested", "simulated", "budget"])
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
