@@ -87,6 +87,18 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
     assert pd.read_csv(io.StringIO(text))["length"][0] == 1.234
 
 
+def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
+    other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
+    rows = [("parts", "one is old"), ("others", "none is"), ("all", "they are made up")]
+    remarks = tabulate("Remarks", {"table": Column("", "table"), "remark": Column("", "remark")}, rows)
+    answer = replace(ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}).only("parts")
+    assert list(answer.tables) == ["parts", "remarks"]
+    assert [*answer.tables["remarks"]["remark"]] == ["one is old", "they are made up"]
+    assert "Others" not in ANSWER.render("latex", "parts")
+    with pytest.raises(sv.InputError, match="did you mean 'parts'"):
+        ANSWER.only("part")
+
+
 @pytest.mark.parametrize(
     ("key", "values"),
     [("probability", [0.25]), ("interval.0", [0.1]), ("interval.1", [np.nan]), ("parts.length", [1.234, None])],
