@@ -105,8 +105,7 @@ def judge_causes(
     system, vehicle = assemble_both_systems(study)
     second_system, characteristics = replace(system, vehicle=vehicle), system.characteristics
     original, contact = characteristics.original, contact_degree(system)
-    changed = [characteristics.setting(changes, "cause", beyond=True) for changes in causes["changes"]]
-    settings = np.stack([original, *changed])
+    settings = np.stack([original, *(characteristics.setting(one, "cause", beyond=True) for one in causes["changes"])])
     progress(STAGE, 0, len(settings))
     # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))

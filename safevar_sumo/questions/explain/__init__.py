@@ -15,17 +15,9 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_fits import Ranges, are_causes, ranges_across_fits
-from safevar_sumo.questions.explain.causes import (
-    Cause,
-    count_distinct_causes,
-    count_needed,
-    find_limits,
-    find_minimal_causes,
-    settings_of,
-)
+from safevar_sumo.questions.explain.across_fits import Ranges, conclusions_across_fits
+from safevar_sumo.questions.explain.causes import Cause, count_distinct_causes, count_needed, find_limits, settings_of
 from safevar_sumo.questions.explain.failures import (
-    REQUESTED,
     Population,
     Reasons,
     choose_failures,
@@ -35,7 +27,6 @@ from safevar_sumo.questions.explain.failures import (
     time_step,
 )
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
-from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -133,27 +124,18 @@ def explain(
         Number of vehicle models that fit the published data about as well (sets of [spread]) with which each conclusion
         is drawn again; 0 leaves this out.
     """
-    study, reasons = evaluator.study, Reasons()
-    population = find_failures(subject, evaluator, solution, unsafe)
-    rows, runs = population.rows, population.evaluations
-    if solution:
-        reasons, sample = dict.fromkeys(rows, REQUESTED), rows
-        causes = dict(zip(rows, find_minimal_causes(evaluator, runs.settings[rows], population.unsafe), strict=True))
-    else:  # an evaluation simulates a setting at every point
-        points = len(assemble(study).points)
-        reasons, sample, causes = choose_failures(population, evaluator, limit // points, top)
+    study, population = evaluator.study, find_failures(subject, evaluator, solution, unsafe)
+    runs = population.evaluations
+    reasons, sample, causes = choose_failures(population, evaluator, limit, top)
     changed = evaluator.characteristics.changed(runs.settings[sample])
-    needed = count_needed(evaluator.characteristics, changed, [causes[row] for row in sample], len(rows))
+    needed = count_needed(evaluator.characteristics, changed, [causes[row] for row in sample], len(population.rows))
     # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
     verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
     of_chosen = [causes[row] for row in reasons]
     holding, ranges = list[BoolArray](), Ranges()
     if fits and study.spread and len(runs):
-        chosen = [cause for group in of_chosen for cause in group]
-        unverified = evaluator.for_study(study, verified=0)
-        holding = across(unverified, fits, lambda each: are_causes(each, chosen, population.unsafe))
         shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-        ranges = ranges_across_fits(unverified, fits, runs, population.unsafe, *shares)
+        holding, ranges = conclusions_across_fits(evaluator, fits, runs, population.unsafe, of_chosen, *shares)
     solutions = _solutions_frame(population, evaluator, reasons)
     tables = {
         "causes": _causes_table(population, evaluator, holding, solutions, of_chosen),

@@ -92,6 +92,22 @@ def ranges_across_fits(
     return dict(zip(shares.index, zip(lows, highs, strict=True), strict=True))
 
 
+def conclusions_across_fits(
+    evaluator: Evaluator,
+    fits: int,
+    evaluations: Evaluations,
+    unsafe: Unsafe,
+    causes: Sequence[Sequence[Cause]],
+    needed: pd.Series[float],
+    avoided: pd.Series[float],
+) -> tuple[list[BoolArray], Ranges]:
+    """Whether each cause is one, with each of the first `fits` sets, and the result of `ranges_across_fits`."""
+    evaluator = evaluator.for_study(evaluator.study, verified=0)  # as those of the sets
+    flat = [cause for group in causes for cause in group]
+    holding = across(evaluator, fits, lambda each: are_causes(each, flat, unsafe))
+    return holding, ranges_across_fits(evaluator, fits, evaluations, unsafe, needed, avoided)
+
+
 def _shares_by_kind(is_unsafe: BoolArray, needed: pd.Series[float], avoided: pd.Series[float]) -> pd.Series[float]:
     kinds = {"unsafe": {"": is_unsafe.mean()}, "needed": needed, "avoided": avoided}
     shares: pd.Series[float] = pd.concat({kind: pd.Series(values, dtype=float) for kind, values in kinds.items()})

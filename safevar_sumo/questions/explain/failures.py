@@ -56,7 +56,7 @@ class Population(NamedTuple):
         The handle of each row; `drawn:N` if the setting is no solution.
     unsafe
         The criterion.
-    rows
+    rows, is_named
         The unsafe rows, or those that the user names.
     otherwise
         Number of rows with another outcome than in the results.
@@ -67,6 +67,7 @@ class Population(NamedTuple):
     names: Sequence[str]
     unsafe: Unsafe
     rows: list[int]
+    is_named: bool
     otherwise: int
 
 
@@ -101,18 +102,23 @@ def find_failures(
     unsafe = unsafe or Unsafe.default_among(evaluations, original)
     rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
     otherwise = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
-    return Population(original, evaluations, names, unsafe, rows, int(otherwise))
+    return Population(original, evaluations, names, unsafe, rows, bool(named), int(otherwise))
 
 
 def choose_failures(
     population: Population, evaluator: Evaluator, limit: int, top: int
 ) -> tuple[Reasons, list[int], dict[int, list[Cause]]]:
-    """At most `top` failures that matter, the rows of a sample of all failures, and the minimal causes of both by row.
+    """At most `top` failures that matter, the rows of a sample of all failures, and the minimal causes of both by row;
+    of named rows these alone.
 
     The sample are all failures, if that takes at most about `limit` simulations. What matters: the smallest robust
     failure, a failure for each of `REASONS`, and the simplest failure with each minimal cause that these do not have.
     """
     rows, settings = population.rows, population.evaluations.settings
+    if population.is_named:
+        found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
+        return dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True))
+    limit //= len(assemble(evaluator.study).points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
     reasons = _failures_that_matter(population, evaluator, limit)
     analysed = sorted({*sample, *reasons})
