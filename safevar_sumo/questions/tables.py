@@ -195,6 +195,8 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     if 1 + sum(max(_least_width(column), LEAST_TEXT * column.is_long) for column in every) <= width:
         columns, long = every, []
     labels = list(takewhile(lambda column: not column.is_number, columns))
+    if 1 + sum(map(_least_width, labels)) > width:
+        labels = labels[:1]
     blocks = [[*labels]]
     for column in columns[len(labels) :]:
         if len(blocks[-1]) > len(labels) and 1 + sum(map(_least_width, [*blocks[-1], column])) > width:

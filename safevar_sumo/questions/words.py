@@ -39,14 +39,14 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 
 
 def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2
-    %)`.
+    %)`, without a share of an original that is 0.
     """
     texts = []
     for item in characteristics:
         original, value = item.original, values.get(item.name, item.original)
         if value != original:
-            share = 100 * (value - original) / abs(original)
-            texts.append(f"{item.name} {original:g} -> {item.text(value)}{item.suffix} ({share:+.1f} %)")
+            share = f" ({100 * (value - original) / abs(original):+.1f} %)" if original else ""
+            texts.append(f"{item.name} {original:g} -> {item.text(value)}{item.suffix}{share}")
     return texts
 
 

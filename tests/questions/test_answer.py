@@ -20,6 +20,7 @@ import safevar_sumo as sv
 from safevar_sumo.cli.program import COMMANDS, commands, first_sentence
 from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
+from safevar_sumo.questions.words import list_of_changes
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, files_of, refused, run
@@ -179,6 +180,12 @@ def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
     ):
         one, two = (run(question, str(slippery), *flags, "--json", "--jobs", jobs).stdout for jobs in ("1", "2"))
         assert one == two
+
+
+def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
+    changes = {"recognition_delay": 0.1, "mass": 2644.4}
+    text = list_of_changes(CharacteristicSet.of(load_study("sun_joint")), changes)
+    assert text == "mass 2404 -> 2644 kg (+10.0 %), recognition_delay 0 -> 0.100 s"
 
 
 def test_limits_are_rounded_to_the_safe_side() -> None:
