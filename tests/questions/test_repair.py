@@ -50,8 +50,11 @@ class State(NamedTuple):
 class Sled:
     UNITS = {"grip": "m/s^2", "paint": "-"}
 
+    def __init__(self, wear=1.0):
+        self.wear = wear
+
     def prepare(self, characteristics, road_friction, step):
-        return {**characteristics, "step": step}
+        return {"grip": self.wear * characteristics["grip"], "step": step}
 
     def sumo_type(self, prepared):
         n = np.ones_like(prepared["grip"])
@@ -99,6 +102,7 @@ parameters = { test = "CCRs", speed = 72.0, headway = 2.5, time_after = 3.5 }
 
 [vehicle]
 model = "models:Sled"
+parameters = { wear = 1.0 }
 
 [vehicle.characteristics]
 grip = { unit = "m/s^2", original = 8, lower = 3.6, upper = 9 }
@@ -125,6 +129,9 @@ colour = { lower = 0.0, upper = 2.0, unit = "-", meaning = "colour of its box" }
 
 [repair.promise]
 grip = { at_least = 5 }
+
+[spread]
+"vehicle.parameters.wear" = [1.0, 0.9, 1.1]
 """
 
 
@@ -153,6 +160,10 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Pat
     found = sv.repair(planted, change=["gap", "colour"], jobs=2)
     (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
     assert repair["parameters"] == {"gap": pytest.approx(gap_for(5), rel=0.01)}
+    (low, high), step = repair["over_fits"]["gap"], (repair["parameters"]["gap"] - GAP_TODAY) / 8
+    assert 0 <= low - gap_for(5 * 1.1) < 1.1 * step
+    assert 0 <= high - gap_for(5 * 0.9) < 1.1 * step
+    assert f"3 of 3 fits of the vehicle need gap {low:g} to {high:g}" in found.verdict
     assert [repair["metres_earlier"]] == found.values("repairs.metres_earlier_mean")
     assert repair["metres_earlier"] == pytest.approx(gap_for(5) - GAP_TODAY, rel=0.01)
     assert len(str(repair["parameters"]["gap"])) <= 5  # four digits: what is printed is what was tried

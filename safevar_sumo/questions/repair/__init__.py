@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,9 +23,10 @@ from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, tabulate
-from safevar_sumo.questions.ask import Margin, question
+from safevar_sumo.questions.ask import Margin, Range, question
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
+from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.repair.attack import Proof, find_failures, prove
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
@@ -45,10 +47,14 @@ MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
 CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
+SIZES, SIZED_VEHICLES = tuple(k / 8 for k in range(17)), 16
+"""Shares of a repair's change that are tried with each fit of the vehicle, and the number of counterexamples for it."""
 REPAIRS = {
     "parameters": Column("", "the parameters that change, with their new values", ".10g", is_shown=False),
     "change": Column("", "what changes, in words"),
     "changed": Column("-", "number of parameters that change", is_shown=False),
+    "over_fits": Column("", "least and largest value that the fits of the vehicle need, by parameter", is_shown=False),
+    "fits": Column("-", "number of fits with which up to twice the change suffices", is_shown=False),
     "largest_change": Column("-", "largest change of a parameter, as a share of its range"),
     "metres_earlier": Column("m", "how much earlier a new vehicle brakes, at most over all points", ".2f"),
     "metres_earlier_mean": Column("m", "how much earlier it brakes on average over all points", ".2f", is_shown=False),
@@ -72,6 +78,7 @@ def repair(
     promise: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
     margin: Margin = None,
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
+    fits: Annotated[int, Range(0, 1000)] = 12,
     out: Annotated[str | None, "FILE.toml"] = None,
 ) -> Answer:
     """Find the smallest change of the driving system that survives promised wear, and its price.
@@ -89,6 +96,8 @@ def repair(
     change
         Parameter of the driving system that may change; may be repeated. By default those under [repair], else those
         that come with a shipped driving system.
+    fits
+        Number of fitted parameter sets of the vehicle over which a repair gets a range; 0 without.
     out
         Study file to write with the first repair; it extends the study.
     """
@@ -111,9 +120,11 @@ def repair(
     # What no driving system survives needs another part, not a parameter; the rest is repaired.
     is_repairable = degrees >= problem.margin
     is_repairable[~is_repairable] = problem.repairable(vehicles[~is_repairable])
-    survivors = _find_survivors(problem, vehicles[is_repairable]) if is_repairable.any() else []
+    worst_vehicles = vehicles[is_repairable]
+    survivors, worst_vehicles = _find_survivors(problem, worst_vehicles) if len(worst_vehicles) else ([], vehicles)
+    sizes = [_sizes_over_fits(problem, change, worst_vehicles[:SIZED_VEHICLES], fits) for change, _ in survivors]
     worst = float(degrees[is_repairable][0] if is_repairable.any() else degrees[0])
-    answer = _answer_of(problem, survivors, worst, _not_repairable(problem, vehicles[~is_repairable]))
+    answer = _answer_of(problem, survivors, sizes, worst, _not_repairable(problem, vehicles[~is_repairable]))
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
@@ -131,14 +142,16 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
     return rows[promise.holds(rows)]
 
 
-def _find_survivors(problem: RepairProblem, vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
-    """Search, attack and prove in turns until the smallest changes survive everything; none if no change does."""
+def _find_survivors(problem: RepairProblem, vehicles: FloatArray) -> tuple[list[tuple[FloatArray, Proof]], FloatArray]:
+    """Search, attack and prove in turns until the smallest changes survive everything, none if no change does; and all
+    vehicles that they survived, counterexamples first.
+    """
     search, proofs, attacks, failed_proofs = Search(problem, vehicles), dict[bytes, Proof](), 0, 0
     for _ in range(MAX_ROUNDS):
         changes = search.smallest_changes()
         unproved = [change for change in changes if change.tobytes() not in proofs]
         if not unproved:
-            return [(change, proofs[change.tobytes()]) for change in changes]
+            return [(change, proofs[change.tobytes()]) for change in changes], search.settings
         for change in unproved:
             attacks += 1
             failures = find_failures(problem, change, search.settings, attacks)
@@ -149,7 +162,22 @@ def _find_survivors(problem: RepairProblem, vehicles: FloatArray) -> list[tuple[
                 else:
                     proofs[change.tobytes()] = proof
             search.add(failures)
-    return []
+    return [], search.settings
+
+
+def _sizes_over_fits(problem: RepairProblem, change: FloatArray, vehicles: FloatArray, fits: int) -> FloatArray:
+    """With each fit of the vehicle, the smallest of `SIZES` with which this share of a change keeps vehicles safe;
+    infinite if none does.
+    """
+    sizes = np.array(SIZES) if problem.changed_values(change) else np.zeros(1)
+    changes = np.clip(problem.today + sizes[:, np.newaxis] * (change - problem.today), 0.0, 1.0)
+
+    def smallest(each: Evaluator) -> float:
+        degrees, _ = replace(problem, evaluator=each).degrees(changes, vehicles, "fits of the vehicle")
+        is_safe = (degrees >= problem.margin).all(axis=1)
+        return float(sizes[np.argmax(is_safe)]) if is_safe.any() else np.inf
+
+    return np.array(across(problem.evaluator, fits, smallest))
 
 
 def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:
@@ -168,16 +196,18 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
 def _answer_of(
     problem: RepairProblem,
     survivors: Sequence[tuple[FloatArray, Proof]],
+    sizes: Sequence[FloatArray],
     worst_today: float,
     not_repairable: list[dict[str, float]],
 ) -> Answer:
-    """The answer from the changes that survive, each with its proof: today's parameters alone if they do.
+    """The answer from the changes that survive, each with its proof and its sizes over the fits of the vehicle: today's
+    parameters alone if they do.
 
     `worst_today` is the safety degree of today's driving system with the worst vehicle of the promise that was tried
     and that a driving system can keep safe [m]; below 0, minus the speed of the impact [m/s].
     """
     kept_today = bool(survivors) and not problem.changed_values(survivors[0][0])
-    repairs = [] if kept_today else [_row(problem, *pair) for pair in survivors]
+    repairs = [] if kept_today else [_row(problem, *pair, each) for pair, each in zip(survivors, sizes, strict=True)]
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
         "margin": problem.unsafe.keep,
@@ -196,8 +226,15 @@ def _answer_of(
             f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried has a safety "
             f"degree of {degree}, and {_proof_in_words(survivors[0][1])}."
         )
+        if len(sizes[0]) > 1:
+            verdict += f" It keeps it with {np.isfinite(sizes[0]).sum()} of {len(sizes[0])} fits of the vehicle."
     elif repairs:
         verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors[0][1])}."
+        if len(sizes[0]) > 1:
+            ranges = join_phrases(
+                f"{name} {low:g} to {high:g}" for name, (low, high) in repairs[0]["over_fits"].items()
+            )
+            verdict += f" {repairs[0]['fits']} of {len(sizes[0])} fits of the vehicle need {ranges}."
     else:
         names = join_phrases(parameter.name for parameter in problem.parameters)
         verdict = f"No change of one or two of {names} was found that survives this wear {wear}."
@@ -207,8 +244,8 @@ def _answer_of(
     return Answer(question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables)
 
 
-def _row(problem: RepairProblem, change: FloatArray, proof: Proof) -> JsonObject:
-    """A repair, its price and its proof, by the names of columns."""
+def _row(problem: RepairProblem, change: FloatArray, proof: Proof, sizes: FloatArray) -> JsonObject:
+    """A repair, its range, its price and its proof, by the names of columns."""
     values = problem.changed_values(change)
     texts = [
         f"{name} {today:.6g} -> {values[name]:.10g}{unit_text(row.unit)} ({row.meaning})"
@@ -216,7 +253,15 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof) -> JsonObject
         if name in values
     ]
     size = float(np.max(np.abs(change - problem.today)))
+    enough = sizes[np.isfinite(sizes)]
+    ends = [problem.today + each * (change - problem.today) for each in (enough.min(), enough.max())]
+    over_fits = {
+        parameter.name: sorted(end)
+        for parameter, end in zip(problem.parameters, problem.values(np.clip(ends, 0, 1)).T.tolist(), strict=True)
+        if parameter.name in values
+    }
     row = {"parameters": values, "change": ", ".join(texts), "changed": len(values), "largest_change": size}
+    row |= {"over_fits": over_fits, "fits": len(enough)}
     return {**row, **price_of(problem.study, values), **proof._asdict()}
 
 
