@@ -99,6 +99,12 @@ TYPED = [
     ("report folder", "folder: is not a results directory"),
     ("report folder --out it.pdf", "it.pdf"),
     ("verify none.zip", "none.zip: cannot be read: No such file or directory"),
+    ("export file --to carla --out x", "Missing option '--solution'"),
+    ("import sun --nsga2 mine.csv", "Missing option '--out'"),
+    ("import sun --out out --nsga2 mine.csv --original sd=abc", "sd=NUMBER"),
+    ("list wether", "did you mean 'weathers'?"),
+    ("tables results/smoke --table rq9", "results/smoke"),
+    ("check", "Missing argument 'NAME'"),
     ("export file --solution nsga2:0:0 --to carla --out x", "file: is a study and has no solutions"),
     ("simulate euro_ncap_pedestrian --point CPNA", "72 points, such as CPNA, speed 10"),
 ]

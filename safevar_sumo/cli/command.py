@@ -110,11 +110,10 @@ def _flag(option: Option) -> click.Option:
         type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if is_path else option.kind,
         is_flag=option.kind is bool,
         multiple=option.is_repeated,
-        required=option.default is inspect.Parameter.empty,
-        default=None if option.default is inspect.Parameter.empty else option.default,
         show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
         metavar=option.metavar or ("PATH" if is_path else None),
         help=option.meaning + (f"  [{option.limits}]" if option.limits else ""),
+        **({"required": True} if option.default is inspect.Parameter.empty else {"default": option.default}),
     )
 
 

@@ -63,10 +63,12 @@ Criterion = Annotated[str | None, "collision|below=X|points=X"]
 """What is unsafe: a collision, a safety degree below X [m], or at most X points of a rating; by default a collision if
 any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost.
 """
+PointName = Annotated[str | None, "NAME"]
+"""A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, 1024)]
 """A number of worker processes."""
 COMMON_OPTIONS = (
-    ("point", str | None, None, "Only this point of the study's matrix."),
+    ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
     ("pool", Any, None, "Pool that simulates; by default new worker processes."),
     (

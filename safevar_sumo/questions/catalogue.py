@@ -109,23 +109,23 @@ def _weathers() -> pd.DataFrame:
     return pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
 
 
-def check(subject: str) -> Answer:
+def check(name: str) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep the promises that
     results rest on.
 
-    SUBJECT is the name or path of a study, all of whose code is checked, or a driving system, by its name or
-    package.module:Name, which then drives in the study smoke. The exit code is 0 if SUBJECT passes, 1 with findings, 2
+    NAME is the name or path of a study, all of whose code is checked, or a driving system, by its name or
+    package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME passes, 1 with findings, 2
     if it cannot be loaded.
     """
     from safevar_sumo.plugins.check import CHECKS, check as find, study_to_check  # loads SUMO
 
-    study = study_to_check(subject)
+    study = study_to_check(name)
     findings = find(study)
     rows = [(one.finding, one.where, one.input, one.expected, one.check, CHECKS[one.check]) for one in findings]
     return Answer(
         question="check",
         study=study,
-        verdict=f"{subject}: {number_of(len(findings), 'finding') if findings else 'passed'}.",
+        verdict=f"{name}: {number_of(len(findings), 'finding') if findings else 'passed'}.",
         numbers={"passed": not findings},
         tables={"findings": tabulate("Findings", FINDINGS, rows)},
     )

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import EnvironmentFault, InputError
+from safevar_sumo.questions.ask import PointName
 from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
 from safevar_sumo.replay.comparison import Comparison, compare_setting
@@ -190,7 +191,7 @@ def export(
     solution: Annotated[str, "ALG:RUN:N"],
     to: Literal["carla", "openscenario"],
     out: Path,
-    point: str | None = None,
+    point: PointName = None,
     as_it_is_now: bool = False,
 ) -> str:
     """Write a solution's simulation for CARLA (a script and the vehicle's values), or as OpenSCENARIO and OpenDRIVE.

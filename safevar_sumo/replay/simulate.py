@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, tabulate
-from safevar_sumo.questions.ask import Range
+from safevar_sumo.questions.ask import PointName, Range
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
@@ -109,7 +109,7 @@ def simulate(
     gui: bool = False,
     slower: Annotated[float, Range(0.01, 1000)] = 1.0,
     spread: bool = False,
-    point: str | None = None,
+    point: PointName = None,
     as_it_is_now: bool = False,
 ) -> Answer:
     """Simulate a study once, or a solution of results with the study as recorded there, beside the original vehicle.
