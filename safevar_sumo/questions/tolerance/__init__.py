@@ -89,7 +89,7 @@ def tolerance(
     characteristics: Annotated[tuple[str, ...], "A,B"] = (),
     margin: Margin = None,
     unsafe: Criterion = None,
-    fits: Annotated[int, Range(0, 1000)] = 8,
+    fits: Annotated[int, Range(0, 1000)] = 12,
 ) -> Answer:
     """Find how far each characteristic may go: alone, and all together.
 
@@ -124,7 +124,9 @@ def tolerance(
     bounds = evaluator.characteristics.lower, evaluator.characteristics.upper
     if is_sought:  # drawing a setting raises the error if hardly any is feasible, before the long scans
         random_settings(evaluator, columns, *bounds, 1, np.random.default_rng(study.search.seed))
-    scans, *others = across(evaluator, fits if is_sought else 0, lambda each: scan(each, columns, criterion))
+    scans, *others = across(
+        evaluator, fits if is_sought else 0, lambda each: scan(each, columns, criterion, coarse=each is not evaluator)
+    )
     box = None
     if is_sought and not criterion.of(original)[0]:
         known = [_unsafe_alone(evaluator.characteristics, scans), _unsafe_solutions(subject, columns, criterion)]

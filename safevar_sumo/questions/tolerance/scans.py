@@ -18,6 +18,8 @@ from safevar_sumo.vehicles import Characteristic
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
 """Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
+COARSE_SCAN_VALUES = 26
+"""Their number with each further fit of the vehicle, which only moves the ends that the first scan found."""
 PARTS_PER_ROUND = 8
 """Number of parts into which a round divides each interval with a change of state."""
 ROUNDS, RATED_ROUNDS = 4, 1
@@ -77,10 +79,13 @@ class OneAtATimeScan(NamedTuple):
         return min(values, key=lambda value: abs(value - original), default=math.nan)
 
 
-def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, one at a time."""
+def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, *, coarse: bool = False) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, one at a time; `coarse` with fewer values, and as fine where the state
+    changes.
+    """
     scanned = [evaluator.characteristics.members[column] for column in columns]
     number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    number = COARSE_SCAN_VALUES if coarse else number
     values = [np.union1d(np.linspace(item.lower, item.upper, number), item.original) for item in scanned]
     profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
