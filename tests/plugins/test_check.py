@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.plugins.check import check, study_to_check
-from safevar_sumo.study import load_study, study_names
+from safevar_sumo.study import load_study
 from tests.in_process import files_of, json_of, run
 
 SCALAR = """import random
@@ -216,40 +216,11 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     ]
 
 
-RIGHT = {
-    "ads": SCALAR.replace("BODY", "self.far = seen.gap"),
-    "ads arrays": ARRAYS.replace("BODY", "memory = memory + 0 * seen.gap.shape[0]"),
-    "vehicle": VEHICLE,
-    "scenario": SCENARIO,
-    "metric": METRIC,
-    "objective": OBJECTIVE,
-    "algorithm": ALGORITHM,
-    "traci": CONTROLLER.replace("BODY", "calls.append(speed)"),
-    "traci class": "class Mine:\n    def start(self, traci, vehicle_id):\n        self.speeds = []\n\n"
-    "    def step(self, traci, vehicle_id):\n        self.speeds.append(traci.vehicle.getSpeed(vehicle_id))\n",
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in RIGHT if name != "ads"])
-def test_what_is_right_passes(name: str, in_tmp: Path) -> None:
-    (in_tmp / "mine.py").write_text(RIGHT[name])
-    (in_tmp / "mine.toml").write_text(STUDY_OF[name.partition(" ")[0]])
-    assert not [finding for finding in check(study_to_check("mine.toml")) if finding.check != "reaction"]
-
-
-SHIPPED = {
-    (study.vehicle.model, study.ads.model, study.scenario.model, *study.metrics.also): study.name
-    for study in map(load_study, (*study_names(), "smoke"))
-    if study.name != "euro_ncap_rating"  # checked in some of its cells: tests/rating/test_questions.py
-}
-"""A study of each combination of shipped models and metrics."""
-
-
 @pytest.mark.parametrize(
-    "study", [pytest.param(name, marks=[] if name == "smoke" else pytest.mark.slow) for name in SHIPPED.values()]
+    "study", ["smoke", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lgsvl", "native", "wear"))]
 )
 def test_what_is_shipped_passes(study: str) -> None:
+    """What is right of users is in the tutorials, whose studies begin with these checks."""
     assert not check(load_study(study))
 
 
@@ -263,6 +234,6 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     text = run("check", "mine:Mine", "--format", "csv", expect=1).stdout
     assert "ads.model = 'mine:Mine' returned brake = 100.0 from drive" in text
     assert "mine.py:11" in text
-    (in_tmp / "mine.py").write_text(RIGHT["ads"])
+    (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "self.far = seen.gap"))
     passed = json_of("check", "mine.toml")
     assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (True, [])
