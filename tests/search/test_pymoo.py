@@ -17,12 +17,13 @@ import pytest
 
 from safevar_sumo.campaign.runs import algorithm_of
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import load_runs, read_manifest
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.search import Algorithm, Problem
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study
 from tests.campaign.formulas import FormulaPool, carried_out, solutions
 from tests.search.test_algorithms import SUN, sphere
 from tests.search.test_standard_problems import PROBLEMS, result_of, standard_problem
@@ -56,11 +57,17 @@ def failing(settings: FloatArray) -> Evaluations:
 
 
 def begun(
-    algorithm: Algorithm, seed: int, evaluations: int = 130, formula: Callable[[FloatArray], Evaluations] = failing
+    algorithm: Algorithm,
+    seed: int,
+    evaluations: int = 130,
+    formula: Callable[[FloatArray], Evaluations] = failing,
+    scoring: Scoring = PUBLISHED_SCORING,
 ) -> Iterator[Any]:
     """A run; yields each request, then the result."""
     original = sphere(SUN, SUN.original[np.newaxis])
-    problem = Problem(characteristics=SUN, original=original, evaluations=evaluations, population=POPULATION)
+    problem = Problem(
+        characteristics=SUN, original=original, evaluations=evaluations, population=POPULATION, scoring=scoring
+    )
     search, answer = algorithm.search(problem, np.random.default_rng(seed)), None
     try:
         while True:
@@ -148,6 +155,21 @@ def test_an_algorithm_for_one_objective_minimises_the_first_alone(name: str) -> 
     *_, result = begun(built(name), 1, 3000, formula=lambda settings: sphere(SUN, settings))
     assert len(result) == 1
     assert result.f_safe[0] < 0.05 < sphere(SUN, SUN.original[np.newaxis]).f_safe[0]
+
+
+@pytest.mark.parametrize("name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA", "pymoo:NSGA2", "pymoo:MOEAD"])
+def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str) -> None:
+    """The original vehicle is safe in the upper half of the first domain: there the sphere is 1/4 or more."""
+
+    def formula(settings: FloatArray) -> Evaluations:
+        evaluations, share = sphere(SUN, settings), (settings[:, 0] - SUN.lower[0]) / (SUN.upper[0] - SUN.lower[0])
+        return dataclasses.replace(evaluations, metrics={**evaluations.metrics, ORIGINAL_DEGREE: share})
+
+    scoring = msgspec.structs.replace(PUBLISHED_SCORING, safe_original=0.5)
+    *_, result = begun(built(name), 1, 3000, formula, scoring)
+    assert (result.column(ORIGINAL_DEGREE) >= 0.5).all()
+    if PYMOO_ALGORITHMS[name].startswith("soo."):
+        assert 0.25 <= result.f_safe[0] < 0.3
 
 
 @pytest.mark.parametrize("name", ["NSGA2", "NSGA3", "RVEA", "SMSEMOA", "SPEA2"])

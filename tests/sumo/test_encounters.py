@@ -207,7 +207,9 @@ def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation
 @pytest.mark.parametrize("name", ["sun_joint", "wear_joint"])
 def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tmp_path: Path) -> None:
     """`searched` also verifies all solutions in SUMO."""
-    study = load_study(name, search={"runs": 1, "evaluations": 150, "algorithms": ["nsga2", "rs"]})
+    study = load_study(
+        name, search={"runs": 1, "evaluations": 150, "algorithms": ["nsga2", "rs", "pymoo:NSGA3", "pymoo:DE"]}
+    )
     solutions = load_runs(searched(study, tmp_path / "out")).solutions
     limit = assemble(study).measuring.scoring.safe_original
     assert limit is not None
