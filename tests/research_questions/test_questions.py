@@ -37,7 +37,7 @@ from safevar_sumo.questions.research_questions.comparisons import (
     rq2,
     rq2_runs,
 )
-from safevar_sumo.questions.research_questions.fronts import count_evaluations
+from safevar_sumo.questions.research_questions.fronts import compute_convergence, count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import CharacteristicTable, MetricsTable, Study, load_study
@@ -259,6 +259,28 @@ def test_runs_without_a_collision_have_needed_more_evaluations_than_they_request
     # At the collisions 3 of 6 and 2 of 5 runs at risk are of the algorithm.
     chi_squared = (2 - (3 / 6 + 2 / 5)) ** 2 / (3 * 3 / 6**2 + 2 * 3 / 5**2)
     assert theirs["p_value"] == theirs["p_holm"] == pytest.approx(scipy.stats.chi2.sf(chi_squared, 1))
+
+
+def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -> None:
+    """The first collision of each run is in such an encounter, the second, in its fifth evaluation, is not."""
+    seen = [
+        {**row(name, sd=-1.0 if i in (1, 4) else 1.0, f_diff=0.5), "evaluation": i}
+        for name in ("nsga2", "rs")
+        for i in range(100)
+    ]
+    case = made_up(row(sd=-1.0, f_diff=0.5), row("rs", sd=1.0, f_diff=0.5), evaluations=seen)
+    degrees = np.where(case.evaluations["evaluation"] == 1, 0.1, 2.0)
+    joint = dataclasses.replace(
+        case,
+        evaluations=case.evaluations.assign(original_safety_degree=degrees),
+        scoring=msgspec.structs.replace(case.scoring, safe_original=0.5),
+    )
+    for one, median in ((case, 2), (joint, 5)):
+        assert first_collisions(one)["median"].tolist() == [median] * 2
+    none = dataclasses.replace(joint, evaluations=joint.evaluations.assign(original_safety_degree=0.1))
+    assert first_collisions(none)["collided"].tolist() == [0, 0]
+    assert (compute_convergence(none)["hypervolume"] == 0).all()
+    assert (compute_convergence(joint)["hypervolume"] > 0).any()
 
 
 def test_a_reader_chooses_the_level_of_significance() -> None:

@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.questions.case import Case, UnanswerableError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import ORIGINAL_DEGREE
 
 MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
 INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
@@ -45,6 +46,12 @@ def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     """The objectives' values, smaller being better, shape (rows, objectives); NaN where undefined."""
     signs = [objective.sign for objective in case.scoring.objectives]
     return frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs
+
+
+def feasible_rows(case: Case, frame: pd.DataFrame) -> BoolArray:
+    """In which rows the original vehicle is safe in the same encounter: all, unless the study searches its scenario."""
+    limit = case.scoring.safe_original
+    return np.ones(len(frame), dtype=bool) if limit is None else (frame[ORIGINAL_DEGREE] >= limit).to_numpy()
 
 
 def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
@@ -135,7 +142,8 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     ends = count_evaluations(case).groupby("algorithm")["requested"].max()
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
         points = normalised(minimised_values(case, group), reference)
-        is_defined, numbers = np.isfinite(points).all(axis=1), group["evaluation"].to_numpy()
+        is_defined = np.isfinite(points).all(axis=1) & feasible_rows(case, group)
+        numbers = group["evaluation"].to_numpy()
         counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
         front, volumes = points[:0], []
         for start, end in pairwise([0, *counts_of_run]):

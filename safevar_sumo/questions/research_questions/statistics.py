@@ -158,12 +158,13 @@ def survival_median(times: ArrayLike, has_ended: ArrayLike, alpha: float = ALPHA
 
 
 def log_rank_test(first: tuple[ArrayLike, ArrayLike], second: tuple[ArrayLike, ArrayLike]) -> float:
-    """The p-value of the log-rank test of two samples, each of times and of whether they have ended; NaN without an
-    event.
+    """The p-value of the log-rank test of two samples, each of times and of whether they have ended; NaN where it is
+    undefined, as without an event.
     """
     if not (np.any(first[1]) or np.any(second[1])):
         return math.nan
-    return float(scipy.stats.logrank(_censored(*first), _censored(*second)).pvalue)
+    with np.errstate(invalid="ignore"):  # undefined where all have an event at once
+        return float(scipy.stats.logrank(_censored(*first), _censored(*second)).pvalue)
 
 
 def _censored(times: ArrayLike, has_ended: ArrayLike) -> scipy.stats.CensoredData:
