@@ -29,7 +29,7 @@ COMMANDS_BY_GROUP = {
         "explain": "questions.explain:explain",
         "tolerance": "questions.tolerance:tolerance",
         "risk": "questions.risk:risk",
-        "report": "cli.handover:report",
+        "report": "report.page:report",
     },
     "Further questions": {
         "rules": "questions.rules:rules",
@@ -39,8 +39,8 @@ COMMANDS_BY_GROUP = {
         "opinion": "questions.opinion:opinion",
     },
     "Hand over": {
-        "evidence": "cli.handover:evidence",
-        "verify": "cli.handover:verify",
+        "evidence": "report.evidence:evidence",
+        "verify": "report.evidence:verify",
         "export": "replay.export:export",
     },
     "Your own code": {"check": "questions.catalogue:check", "list": "questions.catalogue:list_models"},

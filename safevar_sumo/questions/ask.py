@@ -14,13 +14,13 @@ from functools import cached_property, update_wrapper
 from importlib import import_module
 from numbers import Integral, Real
 from pathlib import Path
-from shlex import quote
+from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import InputError, unknown_name, warn
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
 from safevar_sumo.records import JsonObject
-from safevar_sumo.shipped import PROGRAM_COMMAND
+from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.terminal import Progress, open_progress
 
@@ -99,6 +99,10 @@ class Option(NamedTuple):
     default: Any
     meaning: str
 
+    @property
+    def flag(self) -> str:
+        return f"--{self.name.replace('_', '-')}"
+
     def check(self, value: Any) -> Any:
         """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has another type or is
         outside the range.
@@ -121,7 +125,8 @@ class Question:
 
     def __init__(self, compute: Callable[..., Answer]) -> None:
         update_wrapper(self, compute)
-        self.compute, self.name = compute, compute.__name__
+        is_own = compute.__module__.partition(".")[0] == PACKAGE.name
+        self.compute, self.name = compute, f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
         parameters = list(inspect.signature(compute).parameters.values())
         self.takes_results_only = str(parameters[0].annotation) == "Case"
         self.others = {
@@ -199,11 +204,11 @@ class Question:
         """The command that asks this question; it has a flag for each option that is not at its default."""
         words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
         for option in self.options:
-            value, flag = values.get(option.name, option.default), f"--{option.name.replace('_', '-')}"
+            value = values.get(option.name, option.default)
             if value == option.default:
                 continue
             texts = [""] if option.kind is bool else value if option.is_repeated else [value]
-            words += [f"{flag} {quote(str(text))}".strip() if text != "" else flag for text in texts]
+            words += [f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag for text in texts]
         return " ".join([*words, *([f"--point {quote(point)}"] if point else [])])
 
 
@@ -249,6 +254,33 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
             meaning = " ".join(texts.get(parameter.name, "").split())
             options.append(_option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning))
     return options
+
+
+def parse_question(text: str) -> tuple[Question, JsonObject]:
+    """A question and values of its options, from its command without subjects: `risk --samples 4000`.
+
+    Raises
+    ------
+    InputError
+        If there is no such question or option, or a value is not allowed.
+    """
+    try:
+        name, *words = split(text)
+    except ValueError:  # nothing, or a quotation mark without its second one
+        raise InputError("ask", repr(text), 'a question with its options, such as "risk --samples 4000"') from None
+    asked, values, waiting = find_question(name), dict[str, Any](), iter(words)
+    options = {option.flag: option for option in asked.options}
+    for flag in waiting:
+        if flag not in options:
+            raise unknown_name("ask", f"{name} has no option {flag!r}", flag, options)
+        option = options[flag]
+        value: Any = option.kind is bool or next(waiting, None)
+        try:
+            value = value if option.kind is bool else option.kind(value)
+        except (TypeError, ValueError):
+            raise InputError(f"ask: {name} {flag}", repr(value), option.kind.__name__) from None
+        values[option.name] = option.check((*values.get(option.name, ()), value) if option.is_repeated else value)
+    return asked, values
 
 
 def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:

@@ -124,11 +124,6 @@ class Comparison:
         return ", ".join([ending, *texts])
 
 
-def format_number(value: float) -> str:
-    """A number with four significant digits; from 10,000 on, with all digits before the point."""
-    return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
-
-
 def compare_with_original(
     study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
 ) -> Comparison:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from types import ModuleType
 
-from safevar_sumo.report.page import SECTIONS as SECTIONS, report as report
+from safevar_sumo.report.page import report as report
 
 
 class _CallableModule(ModuleType):

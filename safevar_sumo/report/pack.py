@@ -7,19 +7,18 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
+from hashlib import file_digest
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, NoReturn
 
 import msgspec
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
-from safevar_sumo.results import RESULTS
 from safevar_sumo.results.manifest import PACKAGES, SIMULATORS
 
-FORMAT = 2
 DESCRIPTION = "pack.json"
 MAX_BYTES = 1_000_000_000
 """Largest size of a pack's files together, unpacked."""
@@ -30,17 +29,14 @@ UNIX_MODE_SHIFT = 16
 PACK = "a file that the command `evidence` has written, unchanged"
 """What an error about a pack expects."""
 
-Question = Literal["explain", "tolerance", "risk", "repair", "rating"]
-"""The questions whose answers a pack may hold."""
-
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
-    """One results directory in a pack: its folder there, the questions that its answers answer, its finished runs, and
-    the number of their evaluations by outcome.
+    """One results directory in a pack: its folder there, the questions that its answers answer, as typed, its finished
+    runs, and the number of their evaluations by outcome.
     """
 
     folder: str
-    questions: list[Question]
+    questions: list[str]
     runs: list[tuple[str, int]]
     outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_EVALUATIONS)]]
 
@@ -48,8 +44,6 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
 class Description(Struct, frozen=True, forbid_unknown_fields=True):
     """The file `pack.json`."""
 
-    format: int
-    results: int
     versions: dict[str, str]
     studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
@@ -58,13 +52,19 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
     """Write a pack; equal contents give equal bytes."""
     packages = (*PACKAGES, "matplotlib")  # which draws the pictures of the page
     versions = {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
-    described = msgspec.json.encode(Description(FORMAT, RESULTS, versions, studies))
+    described = msgspec.json.encode(Description(versions, studies))
     texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
             entry = zipfile.ZipInfo(name)  # with the same date on every day, in 1980
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << UNIX_MODE_SHIFT
             archive.writestr(entry, texts[name])
+
+
+def digest_of(path: Path) -> str:
+    """The sha256 of a pack, to quote it by."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
@@ -91,12 +91,9 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
     here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
     other = [f"{name} {described.versions.get(name)}" for name in here if described.versions.get(name) != here[name]]
-    if other or (described.format, described.results) != (FORMAT, RESULTS):
-        raise InputError(
-            path,
-            f"was made with {', '.join(other) or f'format {described.format} and results {described.results}'}",
-            f"a pack of this version: {', '.join(f'{name} {number}' for name, number in here.items())}",
-        )
+    if other:
+        expected = f"a pack of this version: {', '.join(f'{name} {number}' for name, number in here.items())}"
+        raise InputError(path, f"was made with {', '.join(other)}", expected)
     return described, files
 
 

@@ -1,158 +1,45 @@
-"""The sections of a page: the verdict and its causes, with second opinions and replays; what was tested; and how far
-the findings hold and agree with published data.
-"""
+"""What stands on a page beside the answers: what was tested, how far to trust it, replays, and commands."""
 
 from __future__ import annotations
 
+import json
 import math
+import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, robustness_in_words
+from safevar_sumo.errors import warn
+from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.model_spread import compute_model_spreads
-from safevar_sumo.questions.opinion import assemble_both_systems, judge_causes
-from safevar_sumo.questions.words import number_of, points_in_words, question_command
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.questions.words import change_texts, number_of, question_command
+from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
-from safevar_sumo.replay.comparison import format_number, list_differences
-from safevar_sumo.report.input import ReportInput
+from safevar_sumo.replay.animation import player_data
+from safevar_sumo.replay.comparison import compare_setting, list_differences, why_different
+from safevar_sumo.replay.scene import lay_out_scene
+from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
+from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES
 
+FIRST_CHOICES = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
+"""Choices that select the solutions to replay, as the flags of `simulate` do, in words."""
 MAX_CAUSES = 6
-"""Maximum number of minimal causes in a report."""
-FIRST_CHOICES = ("fewest", "smallest", "most_severe")
-"""Choices that select the first solutions on the page, as the flags of `simulate` do."""
-
-
-def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> JsonObject:
-    """A frame as the template's table: its index as labels, and the outer level of its columns, if there are two, as
-    headings over several columns.
-    """
-    columns, labels = frame.columns, frame.index.nlevels
-    blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
-    return {
-        "title": title,
-        "heads": [] if frame.empty else [*frame.index.names, *columns.get_level_values(-1)],
-        "rows": [[*map(_cell_text, row)] for row in frame.reset_index().to_numpy(dtype=object).tolist()],
-        "labels": labels,
-        "spans": [("", labels), *blocks.items()] if blocks else [],
-        "notes": list(notes),
-    }
-
-
-def _cell_text(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(f"{format_number(low)} to {format_number(high)}" for low, high in value)
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return ""
-    return format_number(value) if isinstance(value, float) else str(value)
-
-
-def make_verdict(data: ReportInput, explained: Answer | None) -> JsonObject:
-    """The verdict: the sentences of `explain`, and the commands that repeat the study and the failure."""
-    commands = [question_command(name, str(data.directory), data.point) for name in ("explain", "tolerance")]
-    if explained is None:
-        return {"sentences": ["No solution was found."], "is_bad": False, "commands": commands}
-    for handle in explained.tables["solutions"]["solution"].head(1):
-        simulate = question_command("simulate", str(data.directory), data.point)
-        commands.append(f"{simulate} --solution {handle} --plot it.png")
-    return {"sentences": [explained.verdict], "is_bad": explained.numbers["failures"] > 0, "commands": commands}
-
-
-def describe_failure(data: ReportInput, failure: JsonObject) -> JsonObject:
-    """A failure of the table `solutions` of `explain`: its size and changes."""
-    setting, matrix = data.setting_of(failure["solution"]), data.system.matrix
-    return {
-        "failure": failure,
-        "size": f"{failure['changed']} of {len(setting)} characteristics changed, by at most "
-        f"{100 * failure['largest_change']:.0f} %",
-        "robust": robustness_in_words(failure["robust_share"]),
-        "anchor": data.anchor("replay", failure["solution"]),
-        "changes": data.list_changes(setting),
-        "points": points_in_words(failure["points"], len(matrix)) if matrix and not data.point else "",
-    }
-
-
-def make_cause_sections(data: ReportInput, explained: Answer) -> list[JsonObject]:
-    """A section for one minimal cause of each set of characteristics; the first is the one that the verdict names."""
-    causes = explained.tables["causes"]
-    causes = causes[causes["size"] > 0]
-    selection = causes[~causes["changes"].map(tuple).duplicated()].head(MAX_CAUSES).reset_index(drop=True)
-    opinions: list[Any] = [None] * len(selection)
-    if len(selection) and not reason_without_opinion(data):
-        unsafe = Unsafe.parse(explained.numbers["unsafe"])
-        opinions = [*judge_causes(data.case.study, selection, unsafe)[0].itertuples()]
-    ends = dict(explained.tables["solutions"][["solution", "ends"]].to_numpy())
-    return [
-        _make_cause_section(data, rank, cause, ends[cause["solution"]], opinion)
-        for rank, (cause, opinion) in enumerate(zip(selection.to_dict("records"), opinions, strict=True), 1)
-    ]
-
-
-def _make_cause_section(data: ReportInput, rank: int, cause: Mapping[Any, Any], ends: str, opinion: Any) -> JsonObject:
-    comparison, player = data.play(data.case.characteristics.setting(cause["changes"], "cause", beyond=True))
-    title, rows = f"Cause {rank}: {', '.join(cause['changes'])}", {}
-    for item in data.case.characteristics:
-        if item.name in cause["changes"]:
-            values = (item.original, cause["changes"][item.name], cause["boundary"][item.name])
-            rows[f"{item.name} ({item.short_name})"] = [f"{format_number(value)}{item.suffix}" for value in values]
-    frame = pd.DataFrame.from_dict(rows, "index", columns=["original", "here", "limit (all scaled)"])
-    return {
-        "title": title,
-        "anchor": data.anchor("cause", rank),
-        "cause": cause,
-        "robust": robustness_in_words(cause["robust_share"]),
-        "table": table_data(frame.rename_axis("characteristic"), f"Changes of {title}"),
-        "end": comparison.verdict(comparison.rows[-1]),
-        "opinion": opinion,
-        "reason": ends,
-        "player_data": player,
-        "replay_anchor": data.anchor("replay", cause["solution"]),
-    }
-
-
-def reason_without_opinion(data: ReportInput) -> str:
-    """Why there is no second opinion on causes, in a sentence; empty if there is one."""
-    try:
-        assemble_both_systems(data.case.study)
-    except InputError as error:
-        return f"No second opinion on these causes: {error.problem}; expected: {error.legal}."
-    return ""
-
-
-def replay_solutions(data: ReportInput, explained: Answer | None, progress: Progress) -> list[JsonObject]:
-    """Replay the solutions that `FIRST_CHOICES` select and the explained ones."""
-    failures = explained.tables["solutions"]["solution"].tolist() if explained else []
-    handles, entries = list(dict.fromkeys([*data.select_handles(*FIRST_CHOICES), *failures])), []
-    for index, handle in enumerate(handles):
-        progress("replays", index, len(handles))
-        row, setting = data.solutions[handle], data.setting_of(handle)
-        comparison, player = data.play(setting)
-        entries.append(
-            {
-                **row,
-                "anchor": data.anchor("replay", handle),
-                "changes": data.list_changes(setting),
-                "player_data": player,
-                "differences": list_differences(comparison.evaluations.take([-1]), row),
-                "is_open": not failures and index == 0,
-            }
-        )
-    return sorted(entries, key=lambda entry: (entry["f_safe"], entry["handle"]))
-
-
+"""Maximum number of replays of settings that answers name by their changes."""
+CHANGES = "changes"
+"""A table's column of settings to replay: values by characteristic, all others as in the original vehicle."""
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated; no result contains them",
     Outcome.INVALID_TEST: "left the tolerance of a test's speed before the driving system acted: they are neither "
@@ -165,47 +52,144 @@ GENERAL_LIMITS = (
     "no sensor noise, no traffic beyond the scenario's own, unless the study says otherwise.",
     "Driving system and vehicle are models: how far they agree with published data is told where there is any.",
 )
+CHARACTERISTICS = {
+    "characteristic": Column("", "characteristic of the vehicle"),
+    "unit": Column("", "unit of its values"),
+    "original": Column("as in column unit", "value of the original vehicle"),
+    "lowest": Column("as in column unit", "lower end of its domain"),
+    "highest": Column("as in column unit", "upper end of its domain"),
+    "threshold": Column("as in column unit", "changes below it are put back to the original"),
+    "meaning": Column("", "what it is"),
+}
+AGREEMENT = {
+    "file": Column("", "published data"),
+    "rows": Column("", "vehicles"),
+    "spearman": Column("-", "Spearman's rank correlation of the safety degrees", ".2f"),
+    "mean_absolute_error": Column("m", "mean of |here - published| safety degrees", ".2f"),
+    "bias": Column("m", "mean of here - published safety degrees", ".2f"),
+    "collisions_here": Column("", "vehicles that collide here"),
+    "collisions_reference": Column("", "vehicles that collide in the published data"),
+    "collisions_both": Column("", "vehicles that collide in both"),
+}
+SPREAD = {
+    "vehicle": Column("", "the original, or a solution"),
+    **with_interval(
+        SAFETY_DEGREE,
+        Column("m or -m/s", "here, with 90 % of sets and repeats, and the error on the rows of the fit", ".2f"),
+    ),
+    "sets": Column("", "vehicle models that fit the published data about as well"),
+    "collisions": Column("", "sets with which it collides"),
+}
+PUBLISHED = {
+    "metric": Column("", "safety metric of the original vehicle"),
+    "published": Column("", "its published value"),
+    "here": Column("", "its value here"),
+    "difference": Column("%", "of the published value", ".1f"),
+}
 
 
-def describe_tested_system(data: ReportInput) -> JsonObject:
-    """Describe the tested vehicle, driving system and scenario, and the search, in sentences."""
-    case, study = data.case, data.case.study
-    heads = ["characteristic", "unit", "original", "from", "to", "filter threshold", "meaning"]
-    rows = pd.DataFrame(
-        [
-            (item.name, unit_text(item.unit, "{}"), item.original, item.lower, item.upper, item.threshold, item.words)
-            for item in case.characteristics
-        ],
-        columns=heads,
+@dataclass(frozen=True, kw_only=True)
+class ReportedStudy:
+    """One study of a page.
+
+    Attributes
+    ----------
+    directory
+        The results.
+    case
+        The results; at a point, with their solutions simulated again there.
+    versions
+        The packages that the results were computed with.
+    answers
+        Answers about the results.
+    point
+        The only point of the matrix that the page is about; "" for the whole study.
+    later_changes
+        The files and versions that have changed since.
+    """
+
+    directory: Path
+    case: Case
+    versions: Mapping[str, str]
+    answers: Sequence[Answer]
+    point: str = ""
+    later_changes: Sequence[str] = ()
+
+    @cached_property
+    def system(self) -> System:
+        return assemble(self.case.study, str(self.directory))
+
+    @cached_property
+    def choices(self) -> dict[str, str]:
+        """The handles of the solutions that `FIRST_CHOICES` select, and why; if none is unsafe, of the most severe."""
+        solutions, chosen = self.case.solutions, dict[str, list[str]]()
+        names = [] if solutions.empty else list(FIRST_CHOICES)
+        for name in names if self.case.unsafe.rows(solutions).any() else names[-1:]:
+            handle = choose_handle(solutions, self.case.unsafe, name, self.directory)
+            chosen.setdefault(str(handle), []).append(FIRST_CHOICES[name])
+        return {handle: ", ".join(reasons) for handle, reasons in chosen.items()}
+
+    @cached_property
+    def chosen_solutions(self) -> pd.DataFrame:
+        """The rows of these solutions."""
+        solutions = self.case.solutions.set_index(pd.Index(map(str, handles_of(self.case.solutions))))
+        return solutions.loc[list(self.choices)]
+
+    @property
+    def chosen_settings(self) -> FloatArray:
+        """Their settings, shape (M, n)."""
+        return self.chosen_solutions[list(self.case.characteristics.names)].to_numpy(float)
+
+
+def tested(study: ReportedStudy) -> Answer:
+    """The tested vehicle, driving system and scenario, and the search."""
+    case = study.case
+    models = [
+        f"{title}: {_name_and_sentence(known, table.model)}"
+        for title, known, table in (
+            ("Vehicle", VEHICLES, case.study.vehicle),
+            ("Driving system", ADS, case.study.ads),
+            ("Scenario", SCENARIOS, case.study.scenario),
+        )
+    ]
+    tags = pre_crash_sentence(study.system.points)
+    rows = [
+        (item.name, item.unit, item.original, item.lower, item.upper, item.threshold, item.words)
+        for item in case.characteristics
+    ]
+    remarks = [*case.remarks, *vehicle_remarks(study.system)]
+    return Answer(
+        question="what was tested",
+        study=case.study,
+        verdict=" ".join([f"{'. '.join(models)}; {_conditions(study)}. {_search(study)}", *([tags] if tags else [])]),
+        numbers={},
+        tables={
+            "characteristics": tabulate("Characteristics and their domains", CHARACTERISTICS, rows),
+            "remarks": _remarks(remarks),
+        },
     )
-    return {
-        "subject": f"Vehicle: {_name_and_sentence(VEHICLES, study.vehicle.model)}, "
-        f"{number_of(len(case.characteristics), 'varied characteristic')}. "
-        f"Driving system: {_name_and_sentence(ADS, study.ads.model)}. "
-        f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {describe_conditions(data)}.",
-        "tags": pre_crash_sentence(data.system.points),
-        "search": _describe_search(data),
-        "characteristics": table_data(rows.set_index("characteristic"), f"Characteristics of {case.name}"),
-        "remarks": [*case.remarks, *vehicle_remarks(data.system)],
-    }
 
 
-def describe_conditions(data: ReportInput) -> str:
-    """Describe the weather or, by test, the points of the matrix."""
-    points = data.system.matrix
-    if data.point:
-        return f"only at the point {data.point} of its matrix, at which all solutions are simulated again"
+def _remarks(texts: Sequence[str]) -> pd.DataFrame:
+    return tabulate("Remarks", {"remark": Column("", "what to bear in mind")}, [(text,) for text in texts])
+
+
+def _conditions(study: ReportedStudy) -> str:
+    """The weather or, by test, the points of the matrix."""
+    points = study.system.matrix
+    if study.point:
+        return f"only at the point {study.point} of its matrix, at which all solutions are simulated again"
     if not points:
         no_effect = " (no effect on road and sensors; a driving system may have other parameters in it)"
-        return f"weather: {data.case.weather.name}{no_effect if equals_clear(data.case.weather) else ''}"
+        return f"weather: {study.case.weather.name}{no_effect if equals_clear(study.case.weather) else ''}"
     tests = Counter(f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points)
     described = "; ".join(f"{test}: {number_of(count, 'point')}" for test, count in tests.items())
     return f"every vehicle at all {len(points)} points of a matrix ({described})"
 
 
-def _describe_search(data: ReportInput) -> str:
-    case, search = data.case, data.case.study.search
-    versions = ", ".join(f"{name} {value}" for name, value in data.versions.items())
+def _search(study: ReportedStudy) -> str:
+    case, search = study.case, study.case.study.search
+    versions = ", ".join(f"{name} {value}" for name, value in study.versions.items())
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
@@ -224,49 +208,94 @@ def _name_and_sentence(models: Mapping[str, type], name: str) -> str:
     return f"{name} ({first_line.rstrip('.')})"
 
 
-def describe_agreement(study: Study) -> JsonObject | None:
-    """How well a study agrees with each file of published data, as a table; None if there is no data."""
-    frame = shipped_agreement(study).drop(columns="study").set_index("file")
-    if frame.empty:
-        return None
-    frame = frame.sort_values("collisions_reference", ascending=False, kind="stable").round(2)
-    return table_data(
-        frame.rename(columns=lambda name: name.replace("_", " ")).rename_axis("published data"),
-        "Agreement with published data: safety degrees [m]",
+def trust(study: ReportedStudy) -> Answer:
+    """How far the results agree with published data and with other fitted vehicle models, and what they leave out."""
+    case, tables = study.case, dict[str, pd.DataFrame]()
+    verdict = (
+        "This study was not compared with published data: whether another simulator or a real vehicle behaves in the "
+        "same way is unknown."
     )
-
-
-def describe_limits(data: ReportInput, explained: Answer | None) -> JsonObject:
-    """How far the findings of one study hold: remarks, the vehicle model's own uncertainty, and the original vehicle's
-    published metrics beside those here.
-    """
-    case, tables, shares = data.case, [], explained.tables["solutions"]["robust_share"] if explained else pd.Series()
-    remarks = [
-        f"{count} of {len(case.evaluations)} settings {words}."
-        for outcome, words in NO_RESULT.items()
-        if (count := int((case.evaluations["outcome"] == str(outcome)).sum()))
-    ]
-    if len(shares):
-        remarks.append(
-            f"{(shares < MIN_ROBUST_SHARE).sum()} of {len(shares)} failures analysed are borderline: fewer than "
-            f"{100 * MIN_ROBUST_SHARE:.0f} % of their neighbours are unsafe too."
+    agreement = shipped_agreement(case.study)
+    if len(agreement):
+        tables["agreement"] = tabulate("Agreement with published data: safety degrees", AGREEMENT, agreement)
+        lowest, highest = agreement["spearman"].min(), agreement["spearman"].max()
+        verdict = (
+            f"Compared with {number_of(len(agreement), 'file')} of published simulations: the safety degrees have a "
+            f"rank correlation of {lowest:.2f}{'' if lowest == highest else f' to {highest:.2f}'} with them. Nothing "
+            "was compared with a real car."
         )
     if case.study.spread:
-        handles = data.select_handles(*FIRST_CHOICES) if data.any_unsafe else []
-        settings = [case.characteristics.original, *map(data.setting_of, handles)]
-        spreads = compute_model_spreads(case.study, np.stack(settings), data.point)
-        frame = pd.DataFrame(spreads, ["original vehicle", *handles]).rename_axis("vehicle")
-        degrees = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]
-        frame.insert(0, "safety degree here", degrees)
-        note = (
-            "Parameter sets that fit the published data as well, repeats of one simulation, and the model's error on "
-            "the rows of the fit; from lower to upper are 90 %. The band does not cover other data."
-        )
-        tables.append(table_data(frame, "The vehicle model's own uncertainty", [note]))
-    published = pd.DataFrame({"published": dict(case.study.published), "here": dict(case.original)}).dropna()
-    if published.empty:
-        remarks.append("There are no published values of the original vehicle to compare the study with.")
-    else:
-        published["difference [%]"] = (100 * (published["here"] / published["published"] - 1)).round(1)
-        tables.append(table_data(published.rename_axis("metric"), "The original vehicle, published and here"))
-    return {"remarks": remarks, "tables": tables}
+        settings = np.vstack([case.characteristics.original, study.chosen_settings])
+        spreads = compute_model_spreads(case.study, settings, study.point)
+        degrees = [case.original[SAFETY_DEGREE], *study.chosen_solutions["f_safe"]]
+        rows = [
+            (name, degree, spread.lower, spread.upper, spread.sets, spread.collisions)
+            for name, degree, spread in zip(["original", *study.choices], degrees, spreads, strict=True)
+        ]
+        tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
+    published = [
+        (name, value, here, 100 * (here / value - 1) if value else math.nan)
+        for name, value in case.study.published.items()
+        if not math.isnan(here := case.original.get(name, math.nan))
+    ]
+    tables["original"] = tabulate("The original vehicle, published and here", PUBLISHED, published)
+    counts = Counter(case.evaluations["outcome"])
+    missing = [
+        f"{counts[outcome]} of {len(case.evaluations)} settings {words}."
+        for outcome, words in NO_RESULT.items()
+        if counts[outcome]
+    ]
+    tables["remarks"] = _remarks([*missing, *GENERAL_LIMITS])
+    return Answer(question="limits and trust", study=case.study, verdict=verdict, numbers={}, tables=tables)
+
+
+def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
+    """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for each set of changed
+    characteristics.
+    """
+    characteristics, settings = study.case.characteristics, dict[str, FloatArray]()
+    for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
+        settings[handle] = setting
+    changes: dict[tuple[str, ...], Mapping[str, float]] = {}
+    for answer in study.answers:
+        for frame in answer.tables.values():
+            for row in frame.get(CHANGES, ()):
+                changes.setdefault(tuple(sorted(row)), row)
+    causes = [row for row in changes.values() if row][:MAX_CAUSES]
+    settings |= {f"Only {', '.join(row)}": characteristics.setting(row, "cause", beyond=True) for row in causes}
+    different = []
+    for number, (name, setting) in enumerate(settings.items()):
+        progress("replays", number, len(settings))
+        comparison = compare_setting(study.case.study, study.system, setting)
+        last = comparison.rows[-1]
+        differences = []
+        if name in study.choices:
+            recorded: dict[Any, Any] = study.chosen_solutions.loc[name].to_dict()
+            differences = list_differences(comparison.evaluations.take([last]), recorded)
+        different += [name] if differences else []
+        reason = f" ({study.choices[name]})" if name in study.choices else ""
+        yield {
+            "title": f"{name}{reason}: {comparison.verdict(last)}",
+            "point": comparison.point,
+            "changes": change_texts(characteristics, dict(zip(characteristics.names, setting.tolist(), strict=True))),
+            "differences": differences,
+            "player": player_data(lay_out_scene(comparison)),
+        }
+    if different:
+        why = why_different(is_imported=not study.case.has_runs)
+        warn(f"{study.directory}: simulated again with different results: {', '.join(different)}; {why}")
+
+
+def commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
+    """The commands that give the numbers of the page, each after what it gives."""
+    directory, flag = str(study.directory), " --as-it-is-now" if study.later_changes else ""
+    if study.case.has_runs:
+        out = json.dumps(f"{directory}-again")
+        script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out}, progress=True)"
+        what = f"The study {study.case.study.name}, as its manifest.json records it, into another directory"
+        yield what, f"python -c {shlex.quote(script)}"
+    for answer in study.answers:
+        yield f"The answer {answer.question}", answer.command + flag
+    for handle in study.choices:
+        simulate = f"{question_command('simulate', directory, study.point)} --solution {handle}"
+        yield f"The replay of {handle}", f"{simulate} --plot it.png --animate it.html{flag}"

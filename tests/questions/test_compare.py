@@ -122,10 +122,10 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
 @pytest.mark.slow
 def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Path) -> None:
     dry, wet = map(str, weathers)
-    page = run("report", dry, wet, "--only", "compare,reproduce", "--out", "it.html") and Path("it.html").read_text()
+    page = run("report", dry, wet, "--ask", "compare", "--out", "it.html") and Path("it.html").read_text()
     assert sv.compare(dry, wet, pool=POOL).render("html").replace("^2", "²") in page
     assert f"python -m safevar_sumo compare {dry} {wet}" in page
-    refused("report", dry, "--only", "compare", "--out", "it.html", message=("--only: compare needs two results",))
+    refused("report", dry, "--ask", "compare", "--out", "it.html", message=("--ask: compare cannot be asked about 1",))
     refused("report", dry, dry, "--out", "it.html", message=("twice",))
 
 

@@ -8,7 +8,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,14 +27,14 @@ from safevar_sumo.questions.multi_body import (
     load_bmw_parameters,
     tyre_forces,
 )
-from safevar_sumo.questions.opinion import Verdict, assemble_both_systems, judge_causes
+from safevar_sumo.questions.opinion import assemble_both_systems, judge_causes
 from safevar_sumo.questions.second_vehicle import MAPPINGS, OUTSIDE
 from safevar_sumo.records import GRAVITY
-from safevar_sumo.report import report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
 from tests.in_process import json_of
+from tests.report.conftest import page_of
 
 ONE = np.ones(1)
 
@@ -254,16 +254,12 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 
 
 @pytest.mark.slow
-def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(
-    slippery: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = report(slippery, only=["causes", "reproduce"], jobs=1)
-    verdicts = re.findall(r"second vehicle model: (\w+)", page)
-    assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0
-    assert set(verdicts) <= set(get_args(Verdict))
+def test_a_report_has_the_opinion_or_says_how_to_install(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = page_of(slippery, ask=["opinion"], jobs=1)
+    assert "multi-body vehicle confirms" in page
     assert f"opinion {slippery}" in page
     load_bmw_parameters.cache_clear()
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
-    without = report(slippery, only=["causes"], jobs=1)
-    assert "second vehicle model:" not in without
+    without = page_of(slippery, ask=["opinion"], jobs=1)
+    assert "No answer: " in without
     assert "pip install &#39;.[opinion]&#39;" in without

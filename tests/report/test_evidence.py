@@ -16,7 +16,7 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.subject import load
-from safevar_sumo.report import evidence, input as report_input
+from safevar_sumo.report import evidence
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, read_pack
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import json_of, refused, run
@@ -53,9 +53,9 @@ runs = 1
 
 @pytest.fixture(scope="module")
 def bare(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A pack without answers."""
+    """A pack with one answer."""
     out = tmp_path_factory.mktemp("bare") / "bare.zip"
-    run("evidence", str(slippery), "--out", str(out))
+    run("evidence", str(slippery), "--ask", "rules --samples 20", "--out", str(out))
     return out
 
 
@@ -103,40 +103,46 @@ def digit_of(pattern: str) -> Callable[[str], str]:
 def not_same(*arguments: str) -> list[dict[str, str]]:
     """The claims that `verify` does not find the same; it must end with exit code 1."""
     result = json.loads(run("verify", *arguments, "--json", expect=1).stdout)
-    assert result["same"] < result["claims"]
-    return [claim for claim in result["table"] if claim["verdict"] != "same"]
+    numbers, claims = result["numbers"], result["tables"]["claims"]["rows"]
+    assert numbers["same"] + numbers["differs"] + numbers["cannot"] == numbers["claims"] == len(claims)
+    return [claim for claim in claims if claim["verdict"] != "same"]
+
+
+def verified(*arguments: str) -> list[str]:
+    """The claims that `verify` finds the same, all of them."""
+    result = json_of("verify", *arguments)
+    claims = result["tables"]["claims"]["rows"]
+    assert result["numbers"]["passed"]
+    assert {claim["verdict"] for claim in claims} == {"same"}
+    return [claim["claim"] for claim in claims]
 
 
 @pytest.mark.slow
-def test_a_pack_holds_the_page_and_the_answers_and_verifies(
-    slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(report_input, "SAMPLES", {key: {"samples": 300} for key in ("risk", "rules")})
+def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_path: Path) -> None:
     pack = tmp_path / "pack.zip"
-    run("evidence", str(slippery), "--out", str(pack), "--explain", "--risk")
+    ask = ("--ask", "explain --limit 4000 --fits 0", "--ask", "risk --samples 300")
+    run("evidence", str(slippery), "--out", str(pack), *ask)
     _, files = read_pack(pack)
     assert {name.removeprefix("1-slippery/") for name in files} == {
         "manifest.json", "solutions.csv", "study.toml", "answers.json", "report.html",
     }  # fmt: skip
     answers, page = json.loads(files["1-slippery/answers.json"]), files["1-slippery/report.html"].decode()
-    assert set(answers) == {"explain", "risk"}
-    for answer in answers.values():
-        assert html.escape(answer["command"].removesuffix(" --json")) in page
-        *_, question, _, samples = re.sub("--(limit|samples)", "", answer["command"]).removesuffix("--json").split()
-        expected = json_of(question, str(slippery), "--limit" if question == "explain" else "--samples", samples)
-        assert answer["answer"] == expected, "the page's answer is the command's"
+    assert [answer["question"] for answer in answers] == ["explain", "risk"]
+    for answer in answers:
+        command = answer.pop("command")
+        assert html.escape(command) in page
+        words = [str(slippery) if word == "results/slippery" else word for word in command.split()[3:]]
+        assert answer == json_of(*words), "the page's answer is the command's"
     shares = re.search(r"(\d+) different vehicles in all", page)
     assert shares is not None
     assert int(shares[1]) == len(load(slippery).evaluations), "the page is about the whole search"
 
-    result = json_of("verify", str(pack))
-    assert result["same"] == result["claims"] == len(result["table"])
-    claims = ["inputs", "study", "original vehicle", "solutions", "answer explain", "answer risk", "report"]
-    assert [claim["claim"] for claim in result["table"]] == claims
+    claims = ["inputs", "study", "original vehicle", "solutions", *(f"answer {text}" for text in ask[1::2]), "report"]
+    assert verified(str(pack)) == claims
     (claim,) = not_same(changed(pack, tmp_path / "it.zip", "answers.json", digit_of(r'"probability": 0\.(\d+)')))
-    assert claim["claim"] == "answer risk"
-    assert claim["packed"].startswith("answer.numbers.probability = 0.")
-    assert claim["here"] == f"answer.numbers.probability = {answers['risk']['answer']['numbers']['probability']}"
+    assert claim["claim"] == "answer risk --samples 300"
+    assert claim["packed"].startswith('"probability": 0.')
+    assert claim["here"] == f'"probability": {answers[1]["numbers"]["probability"]},'
     (claim,) = not_same(
         changed(pack, tmp_path / "it.zip", "report.html", lambda text: text.replace("-&gt; ", "-&gt; 9", 1))
     )
@@ -144,8 +150,28 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(
 
 
 @pytest.mark.slow
+def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
+    slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The example of CONTRIBUTING."""
+    manual = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
+    (code,) = re.findall(r'```python title="my_questions.py"\n(.*?)```', manual, re.DOTALL)
+    Path("my_questions.py").write_text(code)
+    monkeypatch.syspath_prepend(str(in_tmp))
+    run("report", str(slippery), "--ask", "my_questions:ends --unsafe below=0.5", "--out", "it.html")
+    page = Path("it.html").read_text()
+    assert "Unsafe at an end of the domain: " in page
+    assert "<caption>Ends of the domains</caption>" in page
+    assert f"python -m safevar_sumo my_questions:ends {slippery} --unsafe below=0.5" in page
+    run("evidence", str(slippery), "--ask", "my_questions:ends", "--out", "it.zip")
+    Path("my_questions.py").unlink()
+    refused("verify", "it.zip", message=("would run code", "my_questions.py, my_questions:ends", "--run-code"))
+    assert verified("it.zip", "--run-code")[4] == "answer my_questions:ends"
+
+
+@pytest.mark.slow
 def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: Path) -> None:
-    run("evidence", str(slippery), "--out", str(tmp_path / "again.zip"))
+    run("evidence", str(slippery), "--ask", "rules --samples 20", "--out", str(tmp_path / "again.zip"))
     assert bare.read_bytes() == (tmp_path / "again.zip").read_bytes()
 
 
@@ -174,7 +200,7 @@ def test_what_is_missing_torn_or_too_much_is_damage(bare: Path, tmp_path: Path) 
         ("1-slippery/risk.json", b"{}", "risk.json belongs to no claim"),
         ("2-other/manifest.json", b"{}", "2-other/manifest.json belongs to no study"),
         ("1-slippery/solutions.csv", b"[" * 100_000, "1-slippery is damaged"),
-        ("1-slippery/answers.json", b'{"risk": 1}', "answers.json answers other questions"),
+        ("1-slippery/answers.json", b"[]", "answers.json answers other questions"),
         (DESCRIPTION, b"[" * 100_000, "pack.json is damaged"),
         (DESCRIPTION, texts[DESCRIPTION].replace(b"1-slippery", b"../slippery"), "is missing"),
         (DESCRIPTION, re.sub(rb'"libsumo": "', b'"libsumo": "0.', texts[DESCRIPTION]), "made with libsumo 0."),
@@ -220,12 +246,11 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
 
 @pytest.mark.slow
 def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(mine: Path, in_tmp: Path) -> None:
-    run("evidence", str(mine), "--out", "it.zip")
+    run("evidence", str(mine), "--ask", "rules --samples 20", "--out", "it.zip")
     shutil.rmtree(mine.parent)
     code = ("mine.py", "limits.txt", "roads/scenario.sumocfg")  # SUMO's options may name outputs
     refused("verify", "it.zip", message=("would run code", *code, "--run-code"))
-    result = json_of("verify", "it.zip", "--run-code")
-    assert result["same"] == result["claims"] > 4
+    assert len(verified("it.zip", "--run-code")) == 6
     path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
     claims = {claim["claim"]: claim["here"] for claim in not_same(path, "--run-code")}
     assert "limits.txt has changed since" in claims["inputs"]
@@ -239,10 +264,8 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     study = study.replace("at_least = 5", "at_least = 7.9").replace("step_length = 0.005", "step_length = 0.02")
     Path("planted.toml").write_text(re.sub(r"(always|colour) = \{ .*\n", "", study))  # which it keeps already
     run("study", "planted.toml", "--out", "results", "--quiet", "--jobs", "1")
-    run("evidence", "results", "--out", "it.zip", "--repair")
-    result = json_of("verify", "it.zip", "--run-code")
-    assert result["same"] == result["claims"]
-    assert "answer repair" in {claim["claim"] for claim in result["table"]}
+    run("evidence", "results", "--out", "it.zip", "--ask", "repair")
+    assert "answer repair" in verified("it.zip", "--run-code")
 
 
 @pytest.mark.slow
@@ -258,9 +281,7 @@ def test_a_study_that_names_code_outside_the_pack_is_user_code_too(bare: Path, t
 
 @pytest.mark.slow
 def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
-    result = json_of("verify", str(bare), "--search")
-    assert [claim["claim"] for claim in result["table"]][-2:] == ["search: outcomes", "search: solutions"]
-    assert result["same"] == result["claims"] == 7
+    assert verified(str(bare), "--search")[-2:] == ["search: outcomes", "search: solutions"]
     path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"collision": (\d)'))
     assert {claim["claim"] for claim in not_same(path, "--search")} == {"report", "search: outcomes"}
 

@@ -1,5 +1,5 @@
-"""The report: what it says is in the results, text of others stays text, the same results give the same page, and the
-commands of its last section make the study again.
+"""The page: what it says is in the results and in the answers, text of others stays text, and its commands make the
+study and every answer again.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import json
 import re
 import shlex
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -16,23 +17,25 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo.ads.reference_drivers import FullBraking
-from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import find_question
-from safevar_sumo.questions.case import Case
-from safevar_sumo.replay.comparison import format_number
-from safevar_sumo.report import SECTIONS, input as report_input, report
-from safevar_sumo.report.page import commands_to_reproduce, read_inputs
+from safevar_sumo.questions.ask import find_question, parse_question
+from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.report import sections
+from safevar_sumo.report.page import answer_to, usual_questions
+from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.results import handles_of
 from safevar_sumo.results.manifest import read_manifest, write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import searched
+from safevar_sumo.terminal import show_no_progress
+from tests.in_process import run, searched
+from tests.report.conftest import ASK, page_of
 
 
 def words_of(page: str) -> str:
@@ -83,62 +86,59 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(
-    page: str, case: Case, explained: Answer
-) -> None:
-    places = [page.index(f'<h2 id="{name}">') for name in SECTIONS if name not in ("compare", "repair")]
-    assert places == sorted(places)
-    worst = case.solutions["f_safe"].min()
-    words = words_of(page)
-    assert "^2" not in words
-    assert '<div class="card verdict bad">' in page
-    for expected in (
-        f"collision at {-worst:.1f} m/s",
-        f"{-3.6 * worst:.0f} km/h",
-        f"stops with {case.original['safety_degree']:.2f} m to spare",
-        "Unsafe alone, all others as in the original: tireFric.",
-        "beyond, with the other characteristics at their limits, the ",
-        "NSGA-II (1 run)",
-        "RQ3.2",
-    ):
-        assert expected in words
-    low, high, unsafe = re.findall(r"from ([\d.]+) to ([\d.]+) % with 95 % confidence, (\d+) of 400 vehicles", words)[0]
+def test_the_first_answer_leads_and_all_verdicts_stand_before_the_replays(page: str, case: Case) -> None:
+    front, _, details = page.partition('class="replays"')
+    headings = re.findall(r'<dt><a href="#(.*?)">(.*?)</a></dt>', front)
+    assert [heading for _, heading in headings] == ["Explain", "Risk", "Rules", "Limits and trust", "Tables"]
+    assert all(f'id="{anchor}"' in details for anchor, _ in headings)
+    lead = re.findall(r'<div class="first">\s*<p>(.*?)</p>\s*<div class="wide".*?<caption>(.*?)</caption>', front)
+    assert len(lead) == 1
+    assert lead[0][0] in re.findall(r"<h3>Tolerance</h3></summary>\s*<p>(.*?)</p>", details)
+    assert "^2" not in words_of(page)
+    low, high, unsafe = re.findall(r"from ([\d.]+) to ([\d.]+) % with 95 % confidence, (\d+) of 400 vehicles", front)[0]
     assert float(low) < 100 * 0.5 / 2.9 < float(high)
-    assert f"{int(unsafe) / 4:.2f} % of 400 vehicles" in words, "the share of unsafe vehicles is one"
-
-
-@pytest.mark.slow
-def test_every_figure_has_its_values_beside_it(page: str, explained: Answer) -> None:
-    tables = re.findall("<summary>Values of the figure</summary>(.*?)</details>", page, re.DOTALL)
-    cells = [[re.sub("<.*?>", "", cell) for cell in re.findall("<td.*?>(.*?)</td>", table)] for table in tables]
-    assert len(cells) == 2
-    necessity = explained.tables["characteristics"].iloc[0]
-    assert cells[0][:3] == [
-        necessity["characteristic"],
-        format_number(necessity["changed"]),
-        format_number(necessity["needed"]),
+    assert f"{int(unsafe) / 4:.2f} % of 400 vehicles" in front, "the share of unsafe vehicles is one"
+    order = [
+        "Tolerance",
+        "Explain",
+        "Risk",
+        "Rules",
+        "What was tested",
+        "Limits and trust",
+        "Tables",
+        "How to reproduce",
     ]
-    row = cells[1][cells[1].index("tireFric") :][:8]
-    assert row[:4] == ["tireFric", "-", "3.5", "1.5"]
-    assert row[-1] == "1 to 1.5"
-    assert page.count('<figure class="picture">') == 4, "the failure has its replay, the limits their sheet"
+    places = [details.index(f">{name}") for name in order]
+    assert places == sorted(places)
 
 
 @pytest.mark.slow
-def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, slippery: Path) -> None:
-    (data,) = read_inputs([slippery])
+def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(page: str, case: Case) -> None:
     players = re.findall(
-        r'<details class="replay" id="(.*?)".*?<script type="application/json">(.*?)</script>', page, re.DOTALL
+        r'<details class="replay".*?<summary>(.*?)</summary>.*?<script type="application/json">(.*?)</script>',
+        page,
+        re.DOTALL,
     )
-    by_anchor = {data.anchor("replay", handle): row for handle, row in data.solutions.items()}
-    assert len(players) >= 3
-    for anchor, data in players:
-        changed = json.loads(data)["drives"][1]
-        row = by_anchor[anchor]
+    rows = dict(zip(map(str, handles_of(case.solutions)), case.solutions.to_dict("records"), strict=True))
+    solutions = {title.partition(" (")[0]: json.loads(data) for title, data in players if " (" in title}
+    assert 1 <= len(solutions) <= 3
+    for handle, data in solutions.items():
+        changed, row = data["drives"][1], rows[handle]
         if row["outcome"] == "collision":
             assert changed["verdict"] == f"collides at {-row['f_safe']:.1f} m/s"
         else:
             assert changed["gap"][changed["nearest"]] == pytest.approx(row["f_safe"], abs=0.006)
+    assert sum(title.startswith("Only ") for title, _ in players) >= 1, "a replay of a minimal cause"
+
+
+def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(case: Case, slippery: Path) -> None:
+    changes = [{"tireFric": 1.2}, {"tireFric": 1.3}, {"mass": 2600.0, "tireFric": 1.4}, {}]
+    answer = SimpleNamespace(tables={"causes": pd.DataFrame({"changes": changes}), "others": pd.DataFrame()})
+    study = ReportedStudy(directory=slippery, case=case, versions={}, answers=[answer])  # type: ignore[list-item]
+    played = list(sections.replays(study, show_no_progress))
+    names = [entry["title"].partition(":")[0] for entry in played if entry["title"].startswith("Only ")]
+    assert names == ["Only tireFric", "Only mass, tireFric"]
+    assert played[len(study.choices)]["changes"][0].startswith("tireFric 3.5 -> 1.20 "), "the first of them"
 
 
 @pytest.mark.slow
@@ -147,26 +147,59 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 ) -> None:
     """Somebody's driving system was edited since: here another one drives."""
     assert "differs from the results" not in page
-    monkeypatch.setattr(report_input, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
+    monkeypatch.setattr(sections, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
     with pytest.warns(UserWarning, match="simulated again with different results: "):
-        other = report(slippery, only=["verdict", "causes"], jobs=1)
+        other = page_of(slippery, ask=["rules --samples 20"], jobs=1)
     assert re.search(r"the outcome was collision and is \w+ now", other)
     assert Outline(other).open == []
 
 
-def test_only_some_sections(slippery: Path) -> None:
-    page = report(slippery, only=["reproduce", "tested"])
-    assert re.findall(r'<h2 id="(.*?)">', page) == ["tested", "reproduce"]
-    assert '<th class="span"' not in page, "its table has one level of headings"
-    with pytest.raises(InputError, match="no section 'risks'"):
-        report(slippery, only=["risks"])
+def test_answers_stand_on_the_page_as_they_are_with_their_commands(slippery: Path) -> None:
+    page = html.unescape(page_of(slippery, ask=["risk --samples 40 --unsafe below=0.5", "rules --samples 40"], jobs=1))
+    for name, values in (("risk", {"samples": 40, "unsafe": "below=0.5"}), ("rules", {"samples": 40})):
+        answer = find_question(name)(str(slippery), **values)
+        assert html.unescape(answer.render("html")) in page.replace("²", "^2").replace("³", "^3")
+        assert answer.command in page
 
 
-def test_the_answers_of_risk_and_rules_stand_on_the_page_as_they_are(slippery: Path) -> None:
-    page = report(slippery, only=["risk", "rules"])
-    for name in ("risk", "rules"):
-        answer = find_question(name)(str(slippery), **report_input.SAMPLES[name])
-        assert answer.render("html") in page.replace("²", "^2").replace("³", "^3")
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("risks", "ask.*question: 'risks'|question: 'risks'"),
+        ("risk --sample 3", "risk has no option '--sample'.*did you mean"),
+        ("risk --samples many", "ask: risk --samples: 'many'"),
+        ("risk --samples", "ask: risk --samples: None"),
+        ("risk --samples 0", "a whole number from 1"),
+        ("'risk", 'such as "risk --samples 4000"'),
+        ("", 'such as "risk --samples 4000"'),
+        ("compare", "compare cannot be asked about 1"),
+    ],
+)
+def test_a_question_that_cannot_be_asked_is_refused(text: str, expected: str, slippery: Path) -> None:
+    with pytest.raises(InputError, match=expected):
+        page_of(slippery, ask=[text], jobs=1)
+
+
+@pytest.mark.parametrize("text", ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"])
+def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
+    question, values = parse_question(text)
+    assert question.command_line([], None, values) == f"python -m safevar_sumo {text}"
+
+
+def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path) -> None:
+    answer = answer_to("repair", [case], [slippery], None, 1, show_no_progress)
+    assert answer.verdict.startswith("No answer: ")
+    assert answer.command == f"python -m safevar_sumo repair {slippery}"
+
+
+def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
+    assert [text.partition(" ")[0] for text in usual_questions(case, Path())] == [one.partition(" ")[0] for one in ASK]
+    limited = replace(case, study=load_study("wear", limits={"treadDepth": {"at_least": 3.0}}))
+    assert usual_questions(limited, Path())[-1] == "repair"
+    rated = replace(case, study=load_study("euro_ncap_rating"))
+    none = rated.solutions.iloc[:0]
+    assert usual_questions(replace(rated, solutions=none), Path()) == ["rating"]
+    assert usual_questions(rated, Path(), "a point")[0] == "tolerance"
 
 
 @pytest.mark.slow
@@ -176,10 +209,10 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
     manifest = read_manifest(slippery)
     manifest["study"]["title"] = bad
     write_manifest(tmp_path / "copy", manifest)
-    page = report(tmp_path / "copy", only=["tested", "trust", "reproduce"])
+    page = page_of(tmp_path / "copy", ask=["rules --samples 20"], jobs=1)
     assert Outline(page).open == []
     assert "alert(1)</script>" not in page
-    assert "49" not in re.findall(r"<strong>(.*?)</strong>", page)[0]
+    assert "49" not in re.findall(r"<h2 id=.*?>(.*?)</h2>", page)[0]
 
 
 @pytest.mark.slow
@@ -187,19 +220,20 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
     shutil.copytree(
         slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv")
     )
-    page = report(tmp_path / "begun", only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1)
-    assert "No solution was found" in page
-    assert '<div class="card verdict">' in page, "nothing is unsafe"
+    page = page_of(tmp_path / "begun", ask=["explain", "rules --samples 20"], jobs=1, paper=True)
+    assert "There is no solution to replay" in page
+    assert "slippery: unfinished, nsga2 0 of " in page
+    assert '<section class="front" ' in page, "nothing is unsafe"
     assert Outline(page).open == []
 
 
 def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest.MonkeyPatch) -> None:
     study = load_study("smoke", name="pilot", step_length=0.02)
-    case: Any = SimpleNamespace(study=study, has_runs=True)
-    one = report_input.ReportInput(
-        study_number=1, directory=Path("its results"), case=case, system=assemble(study), versions={}, margin=0.5
-    )
-    python, option, script = shlex.split(commands_to_reproduce([one], ["questions"])[0][1])
+    case: Any = SimpleNamespace(study=study, has_runs=True, solutions=np.empty(0))
+    one = ReportedStudy(directory=Path("its results"), case=case, versions={}, answers=[])
+    monkeypatch.setattr(ReportedStudy, "choices", {})
+    ((_, command),) = sections.commands(one)
+    python, option, script = shlex.split(command)
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
     monkeypatch.setattr(safevar_sumo, "load", lambda place: SimpleNamespace(study=(place, study)))
@@ -207,40 +241,27 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     exec(script, {})
     assert asked["study"] == ("its results", study)
     assert asked["out"] == "its results-again"
-    _, *others, _ = commands_to_reproduce([one], ["tolerance", "repair"])
-    questions = [f"python -m safevar_sumo {name} 'its results' --margin 0.5" for name in ("tolerance", "repair")]
-    assert [command for _, command in others] == questions
 
 
 @pytest.mark.slow
-def test_every_printed_command_gives_the_numbers_of_the_page(
-    slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What the printed commands print stands on the page, word for word; the tables' numbers are those of `tables`."""
-    monkeypatch.setattr(report_input, "SAMPLES", {key: {"samples": 300} for key in ("risk", "rules")})
+def test_every_printed_command_gives_the_answer_of_the_page(slippery: Path, tmp_path: Path) -> None:
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
-    page = report(place, paper=True, jobs=2)
-    commands_of_page = [shlex.split(html.unescape(line)) for line in re.findall("<code>(python -m .*?)</code>", page)]
-    printed = {typed[3]: typed[3:] for typed in commands_of_page}
-    assert {"explain", "tolerance", "risk", "rules", "simulate", "tables"} <= set(printed)
-
-    text = words_of(page)
-    for question in ("explain", "tolerance", "risk", "rules"):
-        lines = [line for line in output_of(printed[question]).splitlines() if re.match(r"[A-Z0-9-].*[.]$", line)]
-        said = [line for line in lines if " ".join(line.replace("^2", "²").replace("^3", "³").split()) in text]
-        assert said, (question, lines)
-        if question in (
-            "tolerance",
-            "rules",
-        ):  # the page says the other lines in other words, beside what they belong to
-            assert said == lines
+    page = html.unescape(page_of(place, ask=ASK, jobs=2))
+    printed = list(commands_of(page))
+    assert [words[0] for words in printed] == ["tolerance", "explain", "risk", "rules", *["simulate"] * 3][
+        : len(printed)
+    ]
+    for words in printed[: len(ASK)]:
+        answer = html.unescape(run(*words, "--format", "html").stdout).strip()
+        assert answer.replace("^2", "²").replace("^3", "³") in page, words
+    assert run(*[word.replace("it.", f"{tmp_path}/it.") for word in printed[-1]]).stdout
 
 
-def output_of(typed: list[str]) -> str:
-    done = CliRunner().invoke(commands, typed, env={"COLUMNS": "400"})
-    assert done.exit_code == 0, done.output
-    return done.stdout
+def commands_of(page: str) -> Iterator[list[str]]:
+    """The words of the commands that a page prints, without those that start the program."""
+    for line in re.findall("<code>(python -m .*?)</code>", page):
+        yield shlex.split(line)[3:]
 
 
 DAY, RAIN = "crossing, clear", "crossing, hard_rain"
@@ -258,11 +279,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_all_of_it_is_of_the_point(results: Path) -> None:
-    (whole,), (there,) = read_inputs([results]), read_inputs([results], DAY)
-    assert [point.name for point in there.system.points] == [DAY]
-    assert (there.case.solutions["f_safe"] >= whole.case.solutions["f_safe"]).all(), "elsewhere is the worst"
-    assert (there.case.solutions["f_safe"] > whole.case.solutions["f_safe"]).any()
-    page = report(results, only=["tested", "verdict", "reproduce"], jobs=1, point=DAY)
-    worst = there.case.solutions["f_safe"].min()
-    assert (f"a collision at {-worst:.1f} m/s" if worst < 0 else f"; the worst stops {worst:.2f} m short") in page
+    page = page_of(results, ask=["rules --samples 20"], jobs=1, point=DAY)
     assert f"only at the point {DAY} of its matrix" in page
+    (whole,) = load_cases([results])
+    assert f" --point &#39;{DAY}&#39;" in page
+    worst = re.findall(
+        r"\(.*most severe\): collides at ([\d.]+) m/s|\(.*most severe\): \w+ with ([\d.]+) m to spare", page
+    )
+    speed, gap = worst[0]
+    assert (-float(speed) if speed else float(gap)) > whole.solutions["f_safe"].min(), "elsewhere is the worst"
