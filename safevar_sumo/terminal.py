@@ -5,13 +5,12 @@ progress of long work, as a bar or elsewhere a line every half minute, with the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from threading import Event, Thread
-from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress as Bar, ProgressColumn, Task, TextColumn
 from rich.table import Table
@@ -31,22 +30,18 @@ UNLIMITED_WIDTH = 1_000_000
 class WholeTable(Table):
     """A table of plain text that cuts nothing off.
 
-    In a narrow terminal it breaks lines between words; then it goes without padding; only then it breaks words.
-
-    Columns under `text_heads` hold text, those under `right` numbers. Text is shown as it is, without markup.
+    In a narrow terminal it breaks lines between words; then it goes without padding; only then it breaks words. Each
+    column has a head, whether it holds numbers, and its cells.
     """
 
-    def __init__(self, *text_heads: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(self, title: str, columns: Iterable[tuple[str, bool, Sequence[str]]]) -> None:
+        super().__init__()
         self._title_line = printable_text(title, "italic")
-        for head in text_heads:
-            self.add_column(Text(head))
-        for head in right:
-            self.add_column(Text(head), justify="right")
-
-    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        """Add a row of texts, or of cells with their own style."""
-        super().add_row(*(printable_text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+        heads, are_numbers, cells = zip(*columns, strict=True)
+        for head, is_number in zip(heads, are_numbers, strict=True):
+            self.add_column(printable_text(head), justify="right" if is_number else "left")
+        for row in zip(*cells, strict=True):
+            self.add_row(*map(printable_text, row))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self._title_line:
@@ -57,7 +52,7 @@ class WholeTable(Table):
             measures = [Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell) for cell in cells]
             sizes.append((max(one.minimum for one in measures), max(one.maximum for one in measures)))
             column.overflow = "fold"
-        words, whole = (sum(size) for size in zip(*sizes, strict=True)) if sizes else (0, 0)
+        words, whole = (sum(size) for size in zip(*sizes, strict=True))
         space = options.max_width - count - 1  # beside the lines
         if whole + 2 * count > space:
             if words + 2 * count > space:

@@ -1,3 +1,3 @@
-"""The commands: parse, call, print; one module for each kind of command, loaded when one of its commands is called."""
+"""The command line: names and groups of the commands, and a command for any function of the library."""
 
 from safevar_sumo.cli.program import main as main

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import faulthandler
 import importlib
-import json
 import os
 import re
 import signal
@@ -73,8 +72,6 @@ class LazyCommands(click.Group):
                 function = getattr(importlib.import_module(f"safevar_sumo.{module}"), attribute)
             else:
                 return None
-            if isinstance(function, click.Command):
-                return function
             from safevar_sumo.cli.command import command_of
 
             return command_of(name, function)
@@ -141,7 +138,8 @@ def main() -> None:
     Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a limit is not kept) or
     130 (interrupted).
     """
-    warnings.showwarning = lambda message, *_, **__: print_warning(message)  # without its file and line
+    # Without its file and line.
+    warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file
         faulthandler.enable()  # if compiled code crashes, its line is printed
     try:
@@ -194,13 +192,3 @@ def _exit_with_error(message: str, code: int) -> NoReturn:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
     click.echo(f"{PROGRAM}: {message}", err=True)
     sys.exit(code)
-
-
-def print_json(value: Any) -> None:
-    """Print a value as JSON."""
-    click.echo(json.dumps(value, indent=2, allow_nan=False))
-
-
-def print_warning(message: object) -> None:
-    """Print a warning to standard error."""
-    click.echo(f"warning: {message}", err=True)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.terminal import WholeTable, printable_text
+from safevar_sumo.terminal import WholeTable
 
 LOW, HIGH = "_low", "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
@@ -202,13 +202,9 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         if len(blocks[-1]) > len(labels) and 1 + sum(map(_least_width, [*blocks[-1], column])) > width:
             blocks.append([*labels])
         blocks[-1].append(column)
-    for number, block in enumerate(blocks):
-        table = WholeTable(title="" if number else frame.attrs.get("title", ""))
-        for column in block:
-            table.add_column(printable_text(column.head), justify="right" if column.is_number else "left")
-        for cells in zip(*(column.texts for column in block), strict=True):
-            table.add_row(*cells)
-        yield table
+    for number, block in enumerate(filter(None, blocks)):
+        title = "" if number else frame.attrs.get("title", "")
+        yield WholeTable(title, [(column.head, column.is_number, column.texts) for column in block])
     for column in long:
         yield from (f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True))
 

@@ -148,8 +148,10 @@ def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypa
 
 def test_a_printed_command_asks_the_same() -> None:
     """The command, parsed by its own flags, has the values that printed it, and no flag for a default."""
-    values = {"unsafe": "collision", "characteristics": ("mass", "tireFric"), "margin": 0.5, "fits": 8}
-    typed = shlex.split(find_question("tolerance").command_line(["its results"], "CPNA, night", values))
+    ask = find_question("tolerance")
+    (fits,) = (option.default for option in ask.options if option.name == "fits")
+    values = {"unsafe": "collision", "characteristics": ("mass", "tireFric"), "margin": 0.5, "fits": fits}
+    typed = shlex.split(ask.command_line(["its results"], "CPNA, night", values))
     assert typed[:5] == ["python", "-m", "safevar_sumo", "tolerance", "its results"]
     assert "--fits" not in typed
     command: Any = commands.get_command(None, "tolerance")  # type: ignore[arg-type]
