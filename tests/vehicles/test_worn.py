@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import subprocess
 import sys
 import tomllib
@@ -16,14 +15,19 @@ from hypothesis import given, strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import spearmanr
 
+from calibration import wet_friction as fit
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
+from tests.in_process import InlinePool
 
 CAR = WornVehicle()
 HEALTHY = {
@@ -82,16 +86,13 @@ def test_sumo_is_told_what_the_worn_car_can_do() -> None:
     assert dry.actuator_lag[0] == pytest.approx(0.1 + 0.05)
 
 
-ROWS = list(csv.DictReader((Path("calibration") / "wet_braking.csv").open(encoding="utf-8")))
-HANDBOOK = list(csv.DictReader((Path("calibration") / "wet_friction.csv").open(encoding="utf-8")))
-SOURCES = {  # the fitted grip and water of each source, and the tread of its new tyres [mm]
-    "AutoBild 2019": ("AutoBild", "AutoBild", 8.0),
-    "MIRA for RoadSafe 2005": ("MIRA", "", 8.0),
-    "MIRA for BRMA": ("", "BRMA", 6.7),
-    "AAA 2018": ("", "AAA and etyres", 8.0),
-    "Tire Rack 2007": ("Tire Rack", "", 8.0),
-    "etyres": ("", "AAA and etyres", 8.0),
+FITTED = {
+    "lift": CAR.water_lift,
+    "texture": CAR.road_texture,
+    "film": WET_FRICTION["handbook"]["water_factor"],
+    **{f"{kind} {name}": value for kind in ("grip", "water") for name, value in WET_FRICTION[kind].items()},
 }
+"""The constants by their names in the script of the fit."""
 PAGE = Path("docs/trust_wear.md").read_text(encoding="utf-8")
 
 
@@ -108,27 +109,20 @@ def stopping_distances(speed: float, water: float, grip: float, *treads: float) 
     return evaluate(system, settings).metrics["stopping_distance"]
 
 
-def published_and_simulated(row: dict[str, str]) -> tuple[str, float, float]:
-    """A row's source; its distance [m], or ratio to new tyres, as published and as simulated."""
-    source = row["source"].partition(" (")[0]
-    grip, water, new_tread = SOURCES[source]
-    worn, new = stopping_distances(
-        float(row["speed_kmh"]),
-        float(row["water_mm"] or WET_FRICTION["water"].get(water, 0)),
-        WET_FRICTION["grip"].get(grip, CAR.tyre_friction),
-        float(row["tread_mm"]),
-        new_tread,
-    )
-    if row["distance_m"]:
-        return source, float(row["distance_m"]), worn
-    return source, float(row["ratio_to_new"]), worn / new
+def simulated_stop(row: dict[str, str]) -> float:
+    """The distance of a published row [m], or its ratio to new tyres."""
+    source = fit.source_of(row)
+    grip, new = fit.GRIPS.get(source), fit.NEW_TREADS.get(source, fit.NEW_TREAD)
+    road = fit.water_of(row, FITTED), FITTED[f"grip {grip}"] if grip else CAR.tyre_friction
+    worn, as_new = stopping_distances(float(row["speed_kmh"]), *road, float(row["tread_mm"]), new)
+    return float(worn if row["distance_m"] else worn / as_new)
 
 
 def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
     """Targets: a median error of at most 6 %, none above 25 %; the page has the row of every stop."""
     errors = []
-    for row in ROWS:
-        source, published, here = published_and_simulated(row)
+    for row in fit.STOPS:
+        source, published, here = fit.source_of(row), fit.published_stop(row), simulated_stop(row)
         errors.append(abs(here / published - 1))
         unit, digits = ("m", 1) if row["distance_m"] else ("times new", 2)
         values = f"{published:.{digits}f} {unit}|{here:.{digits}f}|{here - published:+.{digits}f}"
@@ -141,14 +135,8 @@ def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
 
 def test_the_handbooks_wet_rows_have_its_order() -> None:
     """Targets: a rank correlation of at least 0.95, a mean error of at most 0.08."""
-    wet = [row for row in HANDBOOK if float(row["water_mm"])]
-    published = np.array([float(row["friction"]) for row in wet])
-    tread, water, speed = (
-        np.array([float(row[name] or 8) for row in wet]) for name in ("tread_mm", "water_mm", "speed_kmh")
-    )
-    water = water * WET_FRICTION["handbook"]["water_factor"]
-    lift = lift_of(water, tread, CAR.water_lift, CAR.road_texture)
-    here = lifted_friction(WET_FRICTION["grip"]["handbook"], lift, speed / KMH_PER_MS)
+    wet = [row for row in fit.HANDBOOK if float(row["water_mm"])]
+    published, here = np.array([(float(row["friction"]), fit.model_friction(row, FITTED)) for row in wet]).T
     rank, error = spearmanr(published, here).statistic, np.abs(here - published).mean()
     assert rank >= 0.95
     assert error <= 0.08
@@ -176,15 +164,15 @@ def test_a_wet_stop_is_the_integral_of_speed_over_friction(speed: float) -> None
 
 
 def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at_all() -> None:
-    speeds, ones = np.linspace(0, 60, 13), np.ones(13)
-    waters = [lift_of(water, 4.0 * ones, CAR.water_lift, CAR.road_texture) for water in (0.0, 0.5, 2.0)]
-    dry, damp, wet = (lifted_friction(1.0, lift, speeds) for lift in waters)
+    speeds, treads = np.linspace(1, 60, 13)[:, np.newaxis], np.linspace(0, 9, 91)
+    dry, damp, wet = (
+        lifted_friction(1.0, lift_of(water, treads, CAR.water_lift, CAR.road_texture), speeds)
+        for water in (0.0, 0.5, 2.0)
+    )
     assert (dry == 1).all()
-    assert (np.diff(damp) < 0).all()
-    assert (wet[1:] < damp[1:]).all()
-    treads = lifted_friction(1.0, lift_of(1.0, np.linspace(0, 9, 91), CAR.water_lift, CAR.road_texture), ones[:1] * 20)
-    assert (np.diff(treads) > 0).all()
-    assert treads[0] > 0
+    assert (wet < damp).all()
+    assert (np.diff(wet, axis=0) < 0).all()
+    assert (np.diff(wet, axis=1) > 0).all()
 
 
 WET_ROAD = {"name": "wet", "road_friction": 0.71, "visibility": 1.0, "water": 1.0}
@@ -203,31 +191,16 @@ LIMITED = {"treadDepth": 2, "brakeTorque": 2, "brakeResponse": 3, "sensorRange":
 """Characteristics of the headline, each with the decimals on the page."""
 
 
-def limit_alone(system: System, name: str) -> float:
-    """The value up to which the vehicle keeps 0.3 m at all points, all else as new; NaN if it does everywhere."""
-    domains = system.characteristics
-    column = list(domains.names).index(name)
-    original, worst = domains.original[column], [domains.lower, domains.upper][name in LATE][column]
-    values = np.linspace(original, worst, 65)
-    for _ in range(2):
-        settings = np.tile(domains.original, (len(values), 1))
-        settings[:, column] = values
-        is_unsafe = ~(evaluate(system, settings).f_safe >= 0.3)
-        if not is_unsafe.any():
-            return float("nan")
-        first = int(np.argmax(is_unsafe))
-        if not first:
-            return float(original)
-        values = np.linspace(values[first - 1], values[first], 65)
-    return float(values[0])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("assumption", ASSUMPTIONS)
 def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumption: str) -> None:
-    system = assemble(load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}))
-    limits = {name: limit_alone(system, name) for name in LIMITED}
-    cells = ["whole" if np.isnan(limits[name]) else f"{limits[name]:.{LIMITED[name]}f}" for name in LIMITED]
+    evaluator = Evaluator(load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}), InlinePool())
+    columns = [list(evaluator.characteristics.names).index(name) for name in LIMITED]
+    cells = []
+    for found in scan(evaluator, columns, Unsafe(keep=0.3), coarse=True):
+        item = found.characteristic
+        end, worst = (ends[item.name in LATE] for ends in (found.safe or (0.0, 0.0), (item.lower, item.upper)))
+        cells.append("whole" if end == worst else f"{end:.{LIMITED[item.name]}f}")
     assert f"|{assumption}|{'|'.join(cells)}|" in PAGE
 
 
