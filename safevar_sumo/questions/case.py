@@ -18,7 +18,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Origin, Study, Weather
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
@@ -89,6 +89,13 @@ class Case:
         """Algorithms that have solutions or a finished run, in the study's order."""
         names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished_runs)}
         return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(names)]) if name in names)
+
+    def original_degrees(self, solutions: pd.DataFrame) -> pd.Series[float]:
+        """The original vehicle's safety degree beside each solution: in the solution's own encounter, if the study
+        searches its scenario.
+        """
+        own = solutions.get(ORIGINAL_DEGREE)
+        return pd.Series(self.original[SAFETY_DEGREE], index=solutions.index) if own is None else own
 
     def require_solutions(self) -> None:
         """Raise `UnanswerableError` if no run is finished."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 
 import msgspec
@@ -26,7 +27,7 @@ from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.questions.case import Case
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
-from safevar_sumo.study import Study
+from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
@@ -40,6 +41,12 @@ Interval = tuple[float, float]
 CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
 a safety degree.
+"""
+
+
+ENCOUNTERS, CANDIDATES = 16, 512
+"""Number of encounters in which a vehicle is tried, in a study that searches its scenario; they are chosen from so many
+over its domain.
 """
 
 
@@ -64,7 +71,8 @@ class Evaluator:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
 
         Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
-        `ignore_constraints` is true.
+        `ignore_constraints` is true. So do settings in whose encounter the original vehicle is not safe, in a study
+        that searches its scenario.
         """
         is_feasible = self.region.feasible(settings) | ignore_constraints
         if is_feasible.all():
@@ -105,7 +113,41 @@ class Evaluator:
 
         evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection)
         self.simulated += total
-        return evaluations
+        return self._without_unsafe_originals(evaluations)
+
+    def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
+        """Evaluations whose results are undefined where the original vehicle is not safe in the same encounter."""
+        if not len(self.characteristics.scenario):
+            return evaluations
+        is_left_out = assemble(self.study).measuring.scoring.violation(evaluations) > 0
+        metrics = {name: np.where(is_left_out, np.nan, values) for name, values in evaluations.metrics.items()}
+        return replace(
+            evaluations,
+            outcome=np.where(is_left_out & ~evaluations.failed, Outcome.INFEASIBLE.value, evaluations.outcome),
+            metrics={**metrics, ORIGINAL_DEGREE: evaluations.column(ORIGINAL_DEGREE)},
+        )
+
+    def evaluate_over_encounters(self, settings: FloatArray, stage: str) -> Evaluations:
+        """Evaluate M settings, shape (M, n); in a study that searches its scenario, at the worst of its critical encounters
+        and of the original encounter.
+        """
+        if not len(self.characteristics.scenario):
+            return self.evaluate(settings, stage)
+        of_vehicle = self.characteristics.of_vehicle
+        encounters = np.concatenate([self.characteristics.original[np.newaxis], self.critical_encounters])
+        pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(-1, settings.shape[1])
+        evaluations = self.evaluate(pairs, stage)
+        degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
+        worst = np.argmin(degrees.reshape(len(settings), -1), axis=1)
+        return evaluations.take(worst + np.arange(len(settings)) * len(encounters))
+
+    @cached_property
+    def critical_encounters(self) -> FloatArray:
+        """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe, shape (k, n)."""
+        drawn = sobol_settings(self.characteristics, CANDIDATES)
+        originals = self.evaluate(self.characteristics.with_original_vehicle(drawn), "encounters of the original")
+        order = np.argsort(originals.f_safe, kind="stable")  # NaN is last
+        return originals.settings[order[originals.valid[order]][:ENCOUNTERS]]
 
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly.

@@ -129,6 +129,8 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
 def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> FloatArray:
     """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
     approach, verdicts = approach_parameters(system), dict[str, FloatArray]()
+    if approach and len(system.characteristics.scenario):  # from rest, he would approach another encounter
+        return np.full((len(settings), len(DRIVERS)), np.nan)
     with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
     is_led = system.points[0].scenario.pre_crash == PreCrash.LEAD_DECELERATING
     for driver, (model, parameters) in DRIVERS.items():

@@ -74,7 +74,7 @@ def risk(
     if not total:
         raise SimulationError(f"study {study.name!r}: none of {samples} vehicles could be simulated")
     low, high = clopper_pearson(failures, total, confidence)
-    if model.is_correlated or model.region:
+    if model.is_correlated or model.region or study.scenario.search:
         table = given_data_indices(evaluator, simulated, criterion, confidence)
     else:
         table = sobol_indices(evaluator, model, criterion, confidence)
@@ -90,8 +90,10 @@ def risk(
         f"{_probability_in_words(study, failures / total)} ({criterion.description}; from {100 * low:.3g} to "
         f"{100 * high:.3g} % with {100 * confidence:g} % confidence, {failures:,} of {total:,} vehicles)."
     )
-    if total < samples:
-        verdict += f" {samples - total:,} vehicles could not be simulated and are left out."
+    if left_out := int(drawn.infeasible.sum()):
+        verdict += f" Left out are {left_out:,} encounters in which the original vehicle is not safe."
+    if total + left_out < samples:
+        verdict += f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
     if len(table):
         verdict += f" {table.iloc[0]['characteristic']} decides most of the safety degree's variance."
     verdict = " ".join([verdict, *constraints_in_words(study)])
@@ -107,7 +109,7 @@ def _probability_in_words(study: Study, probability: float) -> str:
         for name, distribution in study.variation.items()
         if distribution != Uniform()
     ]
-    rest = ["the others uniform"] if len(variation) < len(study.vehicle.characteristics) else []
+    rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
     return f"The probability of an unsafe vehicle is {100 * probability:.3g} % if vehicles vary as specified, {manner}"
 

@@ -12,6 +12,10 @@ import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import explain
+from safevar_sumo.questions.repair import repair
+from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios.euro_ncap import KMH
@@ -21,7 +25,7 @@ from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.in_process import searched
+from tests.in_process import InlinePool, searched
 from tests.made_up import drawn
 from tests.sumo.planted import BRAKING, GAP
 
@@ -215,6 +219,37 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tm
     assert limit is not None
     assert (solutions["original_safety_degree"] >= limit).all()
     assert (solutions["outcome"] == "collision").any()
+
+
+def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
+    """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap of the brakes."""
+    study = planted(step_length=0.01)
+    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0)
+    (limit,) = answer.tables["limits"].to_dict("records")
+    border = 1 - MARGIN / GAP
+    assert limit["together_low"] == pytest.approx(border, rel=0.01)
+    assert limit["alone_low"] == pytest.approx(border, rel=0.02)
+    assert answer.numbers["failures"] == 0
+
+
+def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounter_shows_it() -> None:
+    study = planted()
+    answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=500, top=2)
+    for cause in answer.tables["causes"].to_dict("records"):
+        assert [*cause["changes"]] == ["brakes"]
+        speed, friction = cause["encounter"]["speed"] * KMH, cause["encounter"]["road_friction"]
+        stop = speed**2 / (2 * BRAKING * friction)
+        assert stop <= GAP - MARGIN + 0.5, "the original is safe there"
+        assert cause["boundary"]["brakes"] == pytest.approx(stop / GAP, rel=0.03)
+    at_original = (50 * KMH) ** 2 / (2 * BRAKING) / GAP
+    assert [*answer.tables["causes"]["elsewhere"]] == [
+        changes["brakes"] < at_original for changes in answer.tables["causes"]["changes"]
+    ]
+
+
+def test_a_repair_has_no_meaning_there() -> None:
+    with pytest.raises(InputError, match="a repair is proved at fixed encounters"):
+        repair.compute(planted(), Evaluator(planted(), InlinePool()))
 
 
 TOO_WIDE = {**SPEED, "upper": 500}

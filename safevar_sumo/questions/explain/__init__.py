@@ -56,17 +56,21 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the
 CAUSE_COLUMNS = {
     "solution": Column("", "handle of the failure"),
     "changes": Column("", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False),
+    "encounter": Column("", "the encounter, of which the original vehicle is safe", ".5g"),
     "boundary": Column("", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"),
     "single_boundary": Column("", "of each, the value if this change alone is scaled back", ".5g", is_shown=False),
     "fraction": Column("-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False),
     "end": Column("", "what lies just below the boundary", is_shown=False),
     "size": Column("", "number of changes", is_shown=False),
+    "elsewhere": Column("", "whether these changes are unsafe in the original encounter, too"),
     "outcome": Column("", "outcome with these changes only", is_shown=False),
     "safety_degree": Column("m", "safety degree with these changes only; -m/s on a collision", is_shown=False),
     "robust_share": Column("-", "share of the neighbours of these changes that are unsafe, too", ".2f"),
     "fits_holding": Column("", "number of fitted vehicle models in which these changes are a cause, too"),
     "avoided_by": Column("", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False),
 }
+OF_ENCOUNTER = ("encounter", "elsewhere")
+"""Columns of a study that searches its scenario."""
 SOLUTION_COLUMNS = {
     "solution": Column("", "handle"),
     "reason": Column("", "why it is explained"),
@@ -224,14 +228,36 @@ def _causes_table(
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, time_step(study), unsafe).mean(axis=1)
     shrunk, fits_holding = find_limits(evaluator, causes, unsafe), np.sum(holding, axis=0)
+    elsewhere = np.zeros(len(causes), dtype=bool)
+    if causes and study.scenario.search:
+        at_original = [cause._replace(encounter={}) for cause in causes]
+        there = evaluator.evaluate(
+            settings_of(evaluator.characteristics, at_original), "causes in the original encounter"
+        )
+        elsewhere = unsafe.of(there)
     numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), list[tuple[Any, ...]]()
     for index in np.lexsort([-robust, numbers]).tolist():
         cause, failure = causes[index], solutions.iloc[numbers[index]]
-        own = (len(cause.changes), cause.outcome, cause.safety_degree, robust[index])
+        own = (cause.outcome, cause.safety_degree, robust[index])
         holds = int(fits_holding[index]) if holding else None
-        rows.append((failure["solution"], cause.changes, *shrunk[index], *own, holds, failure["avoided_by"]))
+        limits = shrunk[index]
+        rows.append(
+            (
+                failure["solution"],
+                cause.changes,
+                cause.encounter,
+                *limits,
+                len(cause.changes),
+                bool(elsewhere[index]),
+                *own,
+                holds,
+                failure["avoided_by"],
+            )
+        )
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
-    return tabulate("Minimal causes, all else as in the original", CAUSE_COLUMNS, frame)
+    omitted = () if study.scenario.search else OF_ENCOUNTER
+    columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
+    return tabulate("Minimal causes, all else as in the original", columns, frame)
 
 
 def _statistics(
@@ -281,11 +307,16 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
         for item in evaluator.characteristics
         if (value := leading["boundary"].get(item.name)) is not None
     ]
+    encounter = [
+        f"{item.short_name} {item.text(leading['encounter'][item.name])}{item.suffix}"
+        for item in evaluator.characteristics.scenario
+    ]
+    where = f" in an encounter with {join_phrases(encounter)}, where the original is safe," if encounter else ""
     sure = [robustness_in_words(leading["robust_share"])]
     sure += [f"in {leading['fits_holding']} of {fits} fitted vehicle models"] if fits else []
     notes = f" ({'; '.join(filter(None, sure))})" if any(sure) else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
-    return f"With {join_phrases(limits)} the vehicle {verb}{notes}. {counts}"
+    return f"With {join_phrases(limits)}{where} the vehicle {verb}{notes}. {counts}"
 
 
 def _avoided_in_words(verdicts: pd.DataFrame) -> str:

@@ -43,7 +43,7 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
         return np.zeros(0, dtype=bool)
     characteristics, groups = evaluator.characteristics, []
     for setting in settings_of(characteristics, causes):
-        is_changed = setting != characteristics.original
+        is_changed = (setting != characteristics.original) & characteristics.of_vehicle
         is_left_out = np.diag(is_changed)[is_changed]
         groups.append(np.vstack([setting, np.where(is_left_out, characteristics.original, setting)]))
     starts = np.cumsum([0, *map(len, groups[:-1])])

@@ -30,12 +30,13 @@ MAX_SUBSETS = 20_000
 class Cause(NamedTuple):
     """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle: the
     values of these characteristics in their units; outcome and safety degree [m, or -m/s] of a vehicle with these
-    changes only.
+    changes only. `encounter` are the failure's parameters of the scenario, in a study that searches them.
     """
 
     changes: dict[str, float]
     outcome: str
     safety_degree: float
+    encounter: dict[str, float]
 
 
 def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[Cause]]:
@@ -45,7 +46,10 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
     characteristics = evaluator.characteristics
-    changed = [np.flatnonzero(flags).tolist() for flags in characteristics.changed(settings)]
+    changed = [
+        np.flatnonzero(flags).tolist() for flags in characteristics.changed(settings) & characteristics.of_vehicle
+    ]
+    originals = characteristics.with_original_vehicle(settings)
     causes: list[list[Cause]] = [[] for _ in settings]
     for size in range(max(map(len, changed), default=0) + 1):
         subsets = (
@@ -55,7 +59,7 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
             for columns in combinations(columns_changed, size)
         )
         while chunk := list(islice(subsets, MAX_SUBSETS)):
-            partial_settings = np.tile(characteristics.original, (len(chunk), 1))
+            partial_settings = originals[[row for row, _ in chunk]]
             for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
                 partial[columns] = settings[row, columns]
             evaluations = evaluator.evaluate(partial_settings, f"subsets of {size} changes")
@@ -63,7 +67,11 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
                 row, columns = chunk[index]
                 changes = {characteristics.names[column]: float(settings[row, column]) for column in columns}
                 outcome, degree = str(evaluations.outcome[index]), float(evaluations.f_safe[index])
-                causes[row].append(Cause(changes, outcome, degree))
+                encounter = {
+                    item.name: float(settings[row, characteristics.names.index(item.name)])
+                    for item in characteristics.scenario
+                }
+                causes[row].append(Cause(changes, outcome, degree, encounter))
     return causes
 
 
@@ -108,7 +116,7 @@ def count_needed(
         sample is drawn without replacement from finitely many failures), the share itself if all failures were
         analysed. Ordered by needed, in_some, changed; no rows if there is no failure.
     """
-    names, number = characteristics.names, max(len(changed), 1)
+    names, number, changed = characteristics.vehicle.names, max(len(changed), 1), changed[:, characteristics.of_vehicle]
     in_causes = [np.array([[name in cause.changes for name in names] for cause in group]) for group in causes if group]
     needed, in_some = (
         sum((combine(rows, axis=0) for rows in in_causes), np.zeros(len(names))) for combine in (np.all, np.any)
@@ -217,12 +225,14 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
     if not causes:
         return []
     characteristics = evaluator.characteristics
-    settings, original = settings_of(characteristics, causes), characteristics.original
+    settings = settings_of(characteristics, causes)
+    original = characteristics.with_original_vehicle(settings)
     is_changed = settings != original
     # A cause has a line on which all its changes are scaled, then a line for each change by itself.
     groups = [np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]]) for flags in is_changed]
     line_counts = list(map(len, groups))
     is_scaled, ends = np.concatenate(groups), np.repeat(settings, line_counts, axis=0)
+    original = np.repeat(original, line_counts, axis=0)
     starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
         characteristics.threshold, np.abs(ends - original), out=np.zeros(ends.shape), where=is_scaled
@@ -243,8 +253,9 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
 
 
 def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> FloatArray:
-    """The original vehicle with the changes of each of M causes only, shape (M, n)."""
-    values = [[cause.changes.get(item.name, item.original) for item in characteristics] for cause in causes]
+    """The original vehicle with the changes of each of M causes only, in its encounter; shape (M, n)."""
+    of_causes = [cause.changes | cause.encounter for cause in causes]
+    values = [[values.get(item.name, item.original) for item in characteristics] for values in of_causes]
     return np.array(values).reshape(-1, len(characteristics))
 
 

@@ -176,7 +176,11 @@ def _endings_in_words(system: System, point: str, evaluations: Evaluations, row:
 def compare_at_points(
     system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe
 ) -> list[PointComparison]:
-    """Compare settings, shape (M, n), with the original, shape (1, n)."""
+    """Compare settings, shape (M, n), with the original, shape (1, n), each in its own encounter."""
+    if len(system.characteristics.scenario) and len(settings) > 1:
+        groups = (compare_at_points(system, original, settings[[row]], unsafe) for row in range(len(settings)))
+        return [comparison for group in groups for comparison in group]
+    original = system.characteristics.with_original_vehicle(settings[:1]) if len(settings) else original
     results = simulate_all_points(system, np.concatenate([original, settings]))
     at_points = [result.evaluations for result in results]
     is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)

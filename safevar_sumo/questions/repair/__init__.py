@@ -105,6 +105,9 @@ def repair(
     if is_rated(study):
         text = f"{study.name!r} is rated, and its repair would take a whole test matrix for every vehicle and change"
         raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
+    if study.scenario.search:
+        text = f"{study.name!r} searches its scenario, and a repair is proved at fixed encounters"
+        raise InputError(study.source, text, "a study with a [matrix] of these encounters, such as wear")
     if out is not None:
         _check_file(Path(out), study)
     problem = RepairProblem(

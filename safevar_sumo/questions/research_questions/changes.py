@@ -43,7 +43,7 @@ def critical_solutions(case: Case) -> pd.DataFrame:
     solutions = case.solutions_of(NSGA2)
     if np.isnan(case.original[SAFETY_DEGREE]):
         raise UnanswerableError(case.name, "lacks the original vehicle's safety degree", "results that have it")
-    return solutions[solutions[SAFETY_DEGREE] < case.original[SAFETY_DEGREE]]
+    return solutions[solutions[SAFETY_DEGREE] < case.original_degrees(solutions)]
 
 
 def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
@@ -136,7 +136,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     has_collided = are_collisions(solutions).to_numpy()
     safety_degree, tet, tit, deceleration = solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
     values = {
-        ("avgSD_mD",): np.where(has_collided, np.nan, case.original[SAFETY_DEGREE] - safety_degree),
+        ("avgSD_mD",): np.where(has_collided, np.nan, case.original_degrees(solutions) - safety_degree),
         ("avgSD_cS",): np.where(has_collided, -safety_degree, np.nan),
         ("TET",): np.where(has_collided, np.nan, tet - case.original["tet"]),
         ("TIT",): np.where(has_collided, np.nan, tit - case.original["tit"]),

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, solutions_for_metric
@@ -41,6 +42,7 @@ from safevar_sumo.questions.research_questions.statistics import (
     survival_median,
 )
 from safevar_sumo.records import JsonObject
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
 
 CAUSES = "causes"
 INTERVAL_OF_MEDIAN = ["median", "median_low", "median_high"]
@@ -208,11 +210,12 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
     case.require_solutions()
     rows, fewest = [], fewest_runs("RQ1", choices.alpha)
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
-        values, original = _values(case, algorithm, metric, over_runs), case.original[metric.name]
+        values, originals = _values(case, algorithm, metric, over_runs), _originals(case, algorithm, metric, over_runs)
+        original = originals.mean() if case.study.scenario.search else case.original[metric.name]
         if over_runs:
-            test = signed_rank_test(values, original)
+            test = signed_rank_test(values - originals, original - original)  # undefined without an original
         else:
-            test = compare_samples(values, np.full(0 if np.isnan(original) else len(values), original))
+            test = compare_samples(values, originals.dropna())
         if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
             test = test.reversed()
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
@@ -276,6 +279,18 @@ def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) ->
         return values
     case.runs_of(algorithm)  # raises if there are none
     return values.groupby(solutions["run"]).agg(lambda sample: np.mean(sample.to_numpy()))
+
+
+def _originals(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) -> pd.Series[float]:
+    """The original vehicle's metric beside each of `_values`; in a study that searches its scenario, the safety degree
+    in the same encounters, and undefined for other metrics.
+    """
+    values = _values(case, algorithm, metric, over_runs)
+    if not case.study.scenario.search:
+        return pd.Series(case.original[metric.name], index=values.index, dtype=float)
+    if metric.name != SAFETY_DEGREE:
+        return pd.Series(np.nan, index=values.index, dtype=float)
+    return _values(case, algorithm, replace(metric, name=ORIGINAL_DEGREE), over_runs)
 
 
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:

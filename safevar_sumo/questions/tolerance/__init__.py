@@ -93,7 +93,8 @@ def tolerance(
 ) -> Answer:
     """Find how far each characteristic may go: alone, and all together.
 
-    The limits together hold none of the unsafe solutions of results.
+    The limits together hold none of the unsafe solutions of results. In a study that searches its scenario they hold in
+    all encounters in which the original vehicle is safe, and end at contact unless a margin is stated.
 
     Parameters
     ----------
@@ -112,16 +113,21 @@ def tolerance(
         characteristic is scanned again; 0 leaves this out.
     """
     study, system = evaluator.study, assemble(evaluator.study)
-    columns = _columns_of(evaluator.characteristics.names, characteristics)
+    members = evaluator.characteristics
+    columns = _columns_of(members.vehicle.names, characteristics)
+    everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
+    all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
     criterion = evaluator.choose_criterion(unsafe, subject, original)
-    if criterion == Unsafe() and (unsafe is None or margin is not None):  # a collision that is asked for stands alone
+    # A collision that is asked for stands alone; and the original's margin is what wear may use up in an encounter.
+    has_margin = margin is not None or (unsafe is None and not everywhere)
+    if criterion == Unsafe() and has_margin:
         criterion = replace(criterion, keep=margin_of(study, margin))
     criterion = replace(criterion, contact=contact_degree(system))
     # A box of a rated study would take thousands of whole test matrices.
     is_sought = not is_rated(study)
-    bounds = evaluator.characteristics.lower, evaluator.characteristics.upper
+    bounds = members.lower, members.upper
     if is_sought:  # drawing a setting raises the error if hardly any is feasible, before the long scans
         random_settings(evaluator, columns, *bounds, 1, np.random.default_rng(study.search.seed))
     scans, *others = across(
@@ -129,8 +135,10 @@ def tolerance(
     )
     box = None
     if is_sought and not criterion.of(original)[0]:
-        known = [_unsafe_alone(evaluator.characteristics, scans), _unsafe_solutions(subject, columns, criterion)]
-        box = find_joint_limits(evaluator, columns, criterion, specified, scans, np.concatenate(known))
+        known = [_unsafe_solutions(subject, all_columns, criterion)]
+        known += [] if everywhere else [_unsafe_alone(members, scans)]
+        limits_of_box = {**specified, **everywhere}
+        box = find_joint_limits(evaluator, all_columns, criterion, limits_of_box, scans, np.concatenate(known))
     rows, broken = limit_rows(evaluator, scans, box, specified, criterion)
     numbers: JsonObject = {
         "unsafe": str(criterion),

@@ -108,7 +108,7 @@ def sample_box(
     evaluations = evaluator.evaluate(settings, stage)
     unsafe_settings = settings[unsafe.of(evaluations)]
     failed = int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
-    number, at_most = len(settings), 1.0
+    number, at_most = len(settings) - int(np.count_nonzero(evaluations.infeasible)), 1.0
     if safe := number - len(unsafe_settings) - failed:
         at_most = float(scipy.stats.beta.ppf(1 - error_probability, number - safe + 1, safe))
     return unsafe_settings, number, failed, at_most

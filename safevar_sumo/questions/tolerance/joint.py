@@ -302,7 +302,7 @@ def find_joint_limits(
     unverified = evaluator.for_study(evaluator.study, verified=0)  # many small batches; the test of the box is verified
     search = _BoxSearch(unverified, columns, unsafe, limits, unsafe_settings)
     start, corner = search.longest.copy(), np.zeros(len(search.original))
-    for column, scan in zip(columns, scans, strict=True):
+    for column, scan in zip(columns, scans, strict=False):  # parameters of the scenario, which come last, have no scan
         original = search.original[column]
         low, high = scan.safe or (original, original)
         safe_alone = np.minimum(start[:, column], (original - low, high - original))

@@ -14,6 +14,7 @@ from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.study import Limit
+from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic
 
@@ -48,7 +49,7 @@ def limit_rows(
             why = "kept alone, not together with all limits"
             if by:
                 end = end if one.nearest_unsafe(end) == end else nearest[name] or end
-                fails = _failures_alone(evaluator, {name: end}, unsafe)[name]
+                fails = _failures_alone(evaluator, {name: end}, unsafe).get(name, "the car fails in other encounters")
                 why = f"{fails} (outside by {by:.3g}{item.suffix})"
             broken.append(f"{name} {end:.5g}{item.suffix}: {why}")
         (alone_low, alone_high), (low, high) = _rounded(one) or NOWHERE, together or NOWHERE
@@ -101,13 +102,18 @@ def describe_failures(evaluator: Evaluator, settings: Mapping[str, FloatArray], 
     """How unsafe settings fail at their worst points, in words, by the same names."""
     if not settings:
         return {}
-    points = assemble(evaluator.study).points
+    points, members = assemble(evaluator.study).points, evaluator.characteristics
     runs = evaluator.evaluate(np.array(list(settings.values())), "what fails first")
     worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
-    return {
-        name: _failure_in_words(points[point].scenario, unsafe, bool(collided), degree)
-        for name, point, collided, degree in zip(settings, worst.tolist(), runs.collided, runs.f_safe, strict=True)
-    }
+    words, names = dict[str, str](), members.scenario.names
+    columns = (settings, worst.tolist(), runs.settings[:, ~members.of_vehicle].tolist(), runs.collided, runs.f_safe)
+    for is_unsafe, (name, point, values, collided, degree) in zip(
+        unsafe.of(runs), zip(*columns, strict=True), strict=True
+    ):
+        if is_unsafe or not names:
+            scenario = encounter(points[point], dict(zip(names, values, strict=True))).scenario
+            words[name] = _failure_in_words(scenario, unsafe, bool(collided), degree)
+    return words
 
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:

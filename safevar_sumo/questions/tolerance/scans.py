@@ -116,7 +116,7 @@ def _evaluate_profiles(
     ends = np.cumsum(sizes)[:-1]
     settings = np.tile(evaluator.characteristics.original, (sum(sizes), 1))
     settings[np.arange(len(settings)), np.repeat(columns, sizes)] = np.concatenate(values)
-    evaluations = evaluator.evaluate(settings, "one characteristic at a time")
+    evaluations = evaluator.evaluate_over_encounters(settings, "one characteristic at a time")
     state = np.select(
         [evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
         ["infeasible", "not_simulated", "unsafe"],
