@@ -128,8 +128,8 @@ class Evaluator:
         )
 
     def evaluate_over_encounters(self, settings: FloatArray, stage: str) -> Evaluations:
-        """Evaluate M settings, shape (M, n); in a study that searches its scenario, at the worst of its critical encounters
-        and of the original encounter.
+        """Evaluate M settings, shape (M, n); in a study that searches its scenario, at the worst of its critical
+        encounters and of the original one.
         """
         if not len(self.characteristics.scenario):
             return self.evaluate(settings, stage)
