@@ -19,7 +19,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import tolerance as room
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.tolerance import boxes, rows
+from safevar_sumo.questions.tolerance import boxes, joint, rows
 from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.records import BoolArray, FloatArray
@@ -36,7 +36,7 @@ from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_
 def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
-    for module in (room, rows):
+    for module in (room, rows, joint):
         monkeypatch.setattr(module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from safevar_sumo.questions.tolerance.boxes import corners_of, sample_box, sobol
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
+from safevar_sumo.sumo.system import assemble
 
 PARTS, ROUNDS = 8, 3
 """Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS` parts."""
@@ -28,19 +30,21 @@ SLAB_POINTS = 64
 """Number of Sobol points, and of corners, at which the room beside a box is searched."""
 MAX_ATTEMPTS = 40
 """Maximum number of boxes that are searched for something unsafe, and of tests."""
-DEVIATIONS = tuple(0.35 * 0.8**k for k in range(14))
+DEVIATIONS = tuple(0.35 * 0.7**k for k in range(9))
 """Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
 PROPOSALS = 4096
 """Number of boxes that a round of the random search proposes."""
-SIMULATED_CORNERS = 64
-"""Approximate number of corners that such a round simulates; each box is simulated at all known corners."""
+BATCH, LEAST_BATCH = 512, 64
+"""Simulations, at all points of a study's matrix, that cost hardly more than one; fewest settings of a batch."""
 LEAST_GAIN = 0.01
 """Least gain in the logarithm of the volume for which a proposed box is simulated."""
-CAUSES_PER_ROUND = 4
-"""Approximate number of unsafe settings of a search whose causes are sought."""
+UNDONE_AT_ONCE = 4
+"""Number of changes of a setting of which all combinations are undone in one batch, in search of its causes."""
 ROUNDING = 1e-9
 """Rounding errors of a setting, as a share of the domain."""
 STAGE = "limits together"
+Step = Sequence[int]
+"""A side of a box, below or above, and the column of its characteristic."""
 
 
 class JointLimits(NamedTuple):
@@ -94,6 +98,8 @@ class _BoxSearch:
     corners
         Corners that were unsafe in some box: for each characteristic -1, the lower end of the box, 0, the original, or
         1, the upper end.
+    batch
+        Number of settings that are simulated at once.
     """
 
     def __init__(
@@ -115,6 +121,7 @@ class _BoxSearch:
         self.longest = np.where(np.isnan(self.limits), self.domain, np.abs(self.limits - self.original))
         self.fixed = np.where(self.is_free, 0.0, self.longest)
         self.corners, self.search_count = list[FloatArray](), 0
+        self.batch = max(BATCH // len(assemble(evaluator.study).points), LEAST_BATCH)
 
     def ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.original - sides[0], self.original + sides[1]
@@ -133,27 +140,22 @@ class _BoxSearch:
         lower, upper = np.where(np.isnan(self.limits), ends, self.limits)
         return lower, upper
 
-    def hold(self, boxes: FloatArray, settings: FloatArray) -> BoolArray:
-        """Which of B boxes, shape (B, 2, n), hold which of K settings; shape (B, K)."""
+    def extents(self, settings: FloatArray) -> FloatArray:
+        """The sides that a box needs to hold each of K settings, shape (K, 2, n); below 0 where it needs none."""
         change = settings - self.original
-        extents = np.stack([-change, change], axis=1) - ROUNDING * self.width
-        holds = np.zeros((len(boxes), len(settings)), dtype=bool)
-        if len(boxes):  # no box holds what the smallest box around all of them does not hold
-            candidates = np.flatnonzero((extents <= boxes.max(axis=0)).all(axis=(1, 2)))
-            for row, sides in enumerate(boxes):
-                holds[row, candidates] = (extents[candidates] <= sides).all(axis=(1, 2))
-        return holds
+        return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
 
     def unsafe_inside(self, sides: FloatArray) -> FloatArray:
         """The known unsafe settings that a box holds."""
-        inside: FloatArray = self.unsafe_settings[self.hold(sides[np.newaxis], self.unsafe_settings)[0]]
+        inside: FloatArray = self.unsafe_settings[(self.extents(self.unsafe_settings) <= sides).all(axis=(1, 2))]
         return inside
 
-    def find_unsafe(self, settings: FloatArray) -> FloatArray:
-        """Simulate settings and return the unsafe ones; no later box holds one of them."""
-        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings, STAGE))
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, settings[is_unsafe]])
-        return settings[is_unsafe]
+    def are_unsafe(self, settings: FloatArray) -> BoolArray:
+        """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one of them."""
+        rows = settings.reshape(-1, len(self.original))
+        is_unsafe = self.unsafe.of(self.evaluator.evaluate(rows, STAGE))
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, rows[is_unsafe]])
+        return is_unsafe.reshape(settings.shape[:-1])
 
     def corner_settings(self, boxes: FloatArray) -> FloatArray:
         """Settings at the C known corners of B boxes, shape (B, C, n)."""
@@ -169,57 +171,70 @@ class _BoxSearch:
     def attack(self, sides: FloatArray) -> FloatArray:
         """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
         known = self.unsafe_inside(sides)
-        return known if len(known) else self.find_unsafe(self.points(sides, SEARCH_POINTS))
+        if len(known):
+            return known
+        points = self.points(sides, SEARCH_POINTS)
+        found: FloatArray = points[self.are_unsafe(points)]
+        return found
 
     def learn(self, settings: FloatArray) -> None:
         """Add corners that are unsafe, from some of these unsafe settings.
 
-        As many changes of a setting as possible are undone while it stays unsafe; the directions of the remaining
-        changes are the corner. Unsafe settings on the way become known, too.
+        One by one, as many changes of a setting as possible are undone while it stays unsafe; the directions of the
+        remaining changes are the corner. All combinations of the next few are simulated at once.
         """
-        causes = settings[:: max(len(settings) // CAUSES_PER_ROUND, 1)].copy()
-        for column in np.flatnonzero(self.is_free.any(axis=0)):
-            smaller = causes.copy()
-            smaller[:, column] = self.original[column]
-            is_unsafe = self.unsafe.of(self.evaluator.evaluate(smaller, STAGE))
-            self.unsafe_settings = np.concatenate([self.unsafe_settings, smaller[is_unsafe]])
-            causes[is_unsafe] = smaller[is_unsafe]
+        number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
+        causes, columns = settings[:: len(settings) // number][:number].copy(), np.flatnonzero(self.is_free.any(axis=0))
+        for start in range(0, len(columns), UNDONE_AT_ONCE):
+            group = columns[start : start + UNDONE_AT_ONCE]
+            bits = 1 << np.arange(len(group))
+            is_undone = np.zeros((2 ** len(group), len(self.original)), dtype=bool)
+            is_undone[:, group] = np.arange(2 ** len(group))[:, np.newaxis] & bits
+            variants = np.where(is_undone, self.original, causes[:, np.newaxis])
+            for cause, of_cause, is_unsafe in zip(causes, variants, self.are_unsafe(variants), strict=True):
+                chosen = 0
+                for bit in bits:
+                    chosen += bit * is_unsafe[chosen + bit]
+                cause[:] = of_cause[chosen]
         known = {corner.tobytes(): corner for corner in [*self.corners, *np.sign(causes - self.original)]}
         self.corners = list(known.values())
+        # A box that holds a setting with more than a cause's changes holds the cause.
+        needs = np.maximum(self.extents(self.unsafe_settings), 0.0)
+        for cause in np.maximum(self.extents(causes), 0.0):
+            needs, self.unsafe_settings = (
+                rows[~(needs >= cause).all(axis=(1, 2))] for rows in (needs, self.unsafe_settings)
+            )
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
 
     def are_safe(self, boxes: FloatArray) -> BoolArray:
-        """Which of B boxes, shape (B, 2, n), are safe at the known corners and hold no known unsafe setting."""
-        is_safe: BoolArray = ~np.any(self.hold(boxes, self.unsafe_settings), axis=1)
-        settings = self.corner_settings(boxes[is_safe])
-        is_unsafe = self.unsafe.of(self.evaluator.evaluate(settings.reshape(-1, len(self.original)), STAGE))
-        is_unsafe = is_unsafe.reshape(settings.shape[:2])
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, settings[is_unsafe]])
-        is_safe[is_safe] = ~is_unsafe.any(axis=1)
-        return is_safe
+        """Which of B boxes, shape (B, 2, n), are safe at the known corners."""
+        return np.asarray(~self.are_unsafe(self.corner_settings(boxes)).any(axis=1))
 
-    def largest(self, start: FloatArray) -> FloatArray:
-        """A box within `start` that is safe at the known corners, as large as a random search makes it.
+    def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
+        """A box within `start` that is safe at the known corners, and holds no known unsafe setting, as large as a
+        random search makes it.
 
-        `start` first shrinks as a whole until it is safe. Larger boxes nearby are then simulated at their corners.
+        `sides` first shrink as a whole until they are safe. Larger boxes nearby are then simulated at their corners.
         """
         rng = np.random.default_rng((self.evaluator.study.search.seed, 2))
         low, high = 0.0, 1.0
         for _ in range(ROUNDS):
             shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
-            boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * start, start)
-            safe_count = int(np.argmin([*self.are_safe(boxes), False]))  # the smallest ones, before the first unsafe
+            boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * sides, start)
+            is_safe = self.are_safe(boxes) & [not len(self.unsafe_inside(box)) for box in boxes]
+            safe_count = int(np.argmin([*is_safe, False]))  # the smallest ones, before the first unsafe
             low, high = shares[safe_count], shares[min(safe_count + 1, PARTS)]
-        best = np.where(self.is_free, low * start, start)
+        best = np.where(self.is_free, low * sides, start)
         for deviation in DEVIATIONS:
             shape = (PROPOSALS, *start.shape)
-            steps = rng.normal(0.0, deviation, shape) * (rng.random(shape) < 0.5)  # about half of the sides move
+            is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
+            steps = rng.normal(0.0, deviation, shape) * is_moved
             boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
             boxes = boxes[self._log_volume(boxes) > self._log_volume(best) + LEAST_GAIN]
-            boxes = boxes[~np.any(self.hold(boxes, self.unsafe_settings), axis=1)]
-            boxes = boxes[: max(SIMULATED_CORNERS // len(self.corners), 1)]
-            boxes = boxes[self.are_safe(boxes)]
-            if len(boxes):
-                best = boxes[int(np.argmax(self._log_volume(boxes)))]
+            possible = (box for box in boxes if not len(self.unsafe_inside(box)))
+            chosen = [*islice(possible, max(self.batch // len(self.corners), 1))]
+            if chosen and (is_safe := self.are_safe(boxes := np.array(chosen))).any():
+                best = max(boxes[is_safe], key=self._log_volume)
         return best
 
     def _log_volume(self, boxes: FloatArray) -> FloatArray:
@@ -228,53 +243,67 @@ class _BoxSearch:
         return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))  # finite for a width of 0, too
 
     def widened(self, sides: FloatArray) -> FloatArray:
-        """Move each free side of a box outwards in steps, until something unsafe is in the next step or the domain
-        ends.
+        """Move the free sides of a box outwards in steps, until something unsafe is in the next step of each or the
+        domain ends. Sides move together where their steps together are safe, too.
         """
-        for side, column in zip(*np.nonzero(self.is_free & (sides < self.longest)), strict=True):
-            while sides[side, column] < self.longest[side, column]:
-                wider = self.wider(sides, side, column, WIDENING)
-                if len(self.unsafe_inside(wider)) or len(self.attack_end(wider, side, column)):
-                    break
-                sides = wider
+        steps: list[Step] = [*np.argwhere(self.is_free & (sides < self.longest)).tolist()]
+        while steps := self.safe_steps(sides, [[step] for step in steps]):
+            sides = self.wider(sides, self.safe_steps(sides, [steps]) or steps[:1], WIDENING)
+            steps = [step for step in steps if sides[*step] < self.longest[*step]]
         return sides
 
-    def wider(self, sides: FloatArray, side: int, column: int, share: float) -> FloatArray:
-        """A box with one side moved outwards by a share of the domain, at most to its end."""
+    def safe_steps(self, sides: FloatArray, groups: Sequence[Sequence[Step]]) -> list[Step]:
+        """The steps outwards in which nothing unsafe is found; those of a group are made together."""
+
+        def is_open(box: FloatArray, step: Step) -> bool:
+            side, column = step
+            return not (self.extents(self.unsafe_inside(box))[:, side, column] > sides[side, column]).any()
+
+        boxes = [(self.wider(sides, group, WIDENING), group) for group in groups]
+        steps = [(box, step) for box, group in boxes for step in group if is_open(box, step)]
+        if steps:
+            self.are_unsafe(np.concatenate([self.settings_at_end(box, step) for box, step in steps]))
+        return [step for box, step in steps if is_open(box, step)]
+
+    def wider(self, sides: FloatArray, steps: Sequence[Step], share: float) -> FloatArray:
+        """A box with some sides moved outwards by a share of the domain, at most to its end."""
         wider = sides.copy()
-        wider[side, column] = min(sides[side, column] + share * self.width[column], self.domain[side, column])
+        for side, column in steps:
+            wider[side, column] = min(sides[side, column] + share * self.width[column], self.domain[side, column])
         return wider
 
-    def attack_end(self, sides: FloatArray, side: int, column: int) -> FloatArray:
-        """Unsafe settings at the end of one side of a box, all other values in the box."""
+    def settings_at_end(self, sides: FloatArray, step: Step) -> FloatArray:
+        """Settings at the end of one side of a box, all other values in the box."""
+        side, column = step
         settings = np.concatenate([self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)])
         settings[:, column] = self.ends(sides)[side][column]
-        return self.find_unsafe(settings)
+        return settings
 
     def best(self, start: FloatArray) -> FloatArray:
         """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be.
 
         If every search finds something, the box keeps all but the fixed sides at the original.
         """
+        sides = start
         for _ in range(MAX_ATTEMPTS):
-            sides = self.largest(start)
-            unsafe_inside = self.attack(sides)
-            if not len(unsafe_inside):
+            sides = self.largest(sides, start)
+            found = self.attack(sides)
+            if not len(found):
                 sides = self.widened(sides)
-                unsafe_inside = self.attack(sides)
-            if not len(unsafe_inside):
+                found = self.attack(sides)
+            if not len(found):
                 return sides
-            self.learn(unsafe_inside)
+            self.learn(found)
         return self.fixed
 
     def beyond(self, sides: FloatArray) -> dict[str, FloatArray]:
         """For each characteristic, an unsafe setting in which it alone is beyond a box, by at most `MAX_GAP`."""
         beyond = dict[str, FloatArray]()
-        for side, column in zip(*np.nonzero(sides < self.domain), strict=True):
-            wider = self.wider(sides, side, column, MAX_GAP)
-            if not self.is_free[side, column]:
-                self.attack_end(wider, side, column)
-            for setting in self.unsafe_inside(wider)[:1]:
+        boxes = [(self.wider(sides, [step], MAX_GAP), step) for step in np.argwhere(sides < self.domain).tolist()]
+        at_ends = [self.settings_at_end(box, step) for box, step in boxes if not self.is_free[*step]]
+        self.are_unsafe(np.array(at_ends).reshape(-1, len(self.original)))
+        for box, (_, column) in boxes:
+            for setting in self.unsafe_inside(box)[:1]:
                 beyond.setdefault(self.evaluator.characteristics.names[column], setting)
         return beyond
 
@@ -323,7 +352,7 @@ def find_joint_limits(
         if not kept or not len(unsafe_inside):
             break
         search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_inside])
-        search.learn(unsafe_inside[:1])
+        search.learn(unsafe_inside)
     else:
         kept = False
     lower, upper = (values.tolist() for values in ends)
