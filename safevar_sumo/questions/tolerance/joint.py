@@ -231,7 +231,8 @@ class _BoxSearch:
             steps = rng.normal(0.0, deviation, shape) * is_moved
             boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
             boxes = boxes[self._log_volume(boxes) > self._log_volume(best) + LEAST_GAIN]
-            possible = (box for box in boxes if not len(self.unsafe_inside(box)))
+            known = self.extents(self.unsafe_inside(boxes.max(axis=0, initial=0.0)))
+            possible = (box for box in boxes if not (known <= box).all(axis=(1, 2)).any())
             chosen = [*islice(possible, max(self.batch // len(self.corners), 1))]
             if chosen and (is_safe := self.are_safe(boxes := np.array(chosen))).any():
                 best = max(boxes[is_safe], key=self._log_volume)
