@@ -7,6 +7,8 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +26,7 @@ from safevar_sumo.api.running import run
 from safevar_sumo.errors import InputError, SafevarError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.output import check_writable
-from safevar_sumo.plugins import code_files, digests, file_by_name, is_shipped
+from safevar_sumo.plugins import code_files, file_by_name, is_shipped
 from safevar_sumo.plugins.lookup import add_import_folders
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Jobs
@@ -250,14 +252,17 @@ def _files_of_user(study: Study, named: Mapping[str, str], questions: Sequence[s
     without which SUMO does not start, by their names in a pack.
     """
     places = study.origin.places
-    modules = [text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]]
-    files = [*named, *digests(code_files(modules, places), places)]
-    names = [name for name in files if not (Path(name).is_absolute() or is_shipped(name))]
+    names = [name for name in named if not (Path(name).is_absolute() or is_shipped(name))]
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
         view = options_of(Path(file_by_name(name, places))).get("gui-settings-file", "")
         names += [str(Path(name).with_name(view))] if view else []
-    paths = {name: file_by_name(name, places) for name in names}
-    return {f"{CODE}/{name}": Path(path).read_bytes() for name, path in sorted(paths.items()) if path}
+    paths = {name: Path(found) for name in names if (found := file_by_name(name, places))}
+    modules = [text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]]
+    folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
+    for path in code_files(modules, places):
+        folder = max((folder for folder in folders if path.is_relative_to(folder)), key=len)
+        paths[path.relative_to(folder).as_posix()] = path
+    return {f"{CODE}/{name}": path.read_bytes() for name, path in sorted(paths.items())}
 
 
 def verify(

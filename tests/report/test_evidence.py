@@ -8,6 +8,8 @@ import os
 import re
 import shutil
 import stat
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -166,7 +168,9 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     run("evidence", str(slippery), "--ask", "my_questions:ends", "--out", "it.zip")
     Path("my_questions.py").unlink()
     refused("verify", "it.zip", message=("would run code", "my_questions.py, my_questions:ends", "--run-code"))
-    assert verified("it.zip", "--run-code")[4] == "answer my_questions:ends"
+    command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)  # in a process that never had the module
+    assert done.stdout.startswith("6 of 6 claims are the same")
 
 
 @pytest.mark.slow
