@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -103,6 +103,7 @@ def report(
     for path, changes in zip(paths, later_changes, strict=True):
         for change in changes:
             warn(f"{path}: {change}")
+    give = answer_to if ask else answer_or_reason
     subjects = cases if point is None else [at_point(case, point) for case in cases]
     with open_progress(progress) as show:
         studies = [
@@ -111,7 +112,7 @@ def report(
                 case=case,
                 versions=read_manifest(path)["versions"],
                 answers=[
-                    answer_to(text, [case], [path], point, jobs, show)
+                    give(text, [case], [path], point, jobs, show)
                     for text in alone or ([] if ask else usual_questions(case, path, point))
                 ],
                 point=point or "",
@@ -119,7 +120,7 @@ def report(
             )
             for path, case, changes in zip(paths, subjects, later_changes, strict=True)
         ]
-        shared = [answer_to(text, subjects, paths, point, jobs, show) for text in joint]
+        shared = [give(text, subjects, paths, point, jobs, show) for text in joint]
         pictures = list[JsonObject]()
         if paper:
             show("tables and figures", 0, 1)
@@ -154,23 +155,27 @@ def answer_to(
     jobs: int | None,
     progress: Progress,
 ) -> Answer:
-    """The answer to a question about results, or the reason why there is none.
+    """The answer to a question about results.
 
     Raises
     ------
     InputError
-        If there is no such question, or it is about another number of results.
+        If there is no such question, it has no answer, or it is about another number of results.
     """
     question, values = parse_question(text)
     if len(question.others) + 1 != len(cases):
         expected = f"{len(question.others) + 1} results directories"
         raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", expected)
     command = question.command_line([str(directory) for directory in directories], point, values)
+    return replace(question.answer(cases, values, jobs=jobs, progress=progress), command=command)
+
+
+def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any) -> Answer:
+    """As `answer_to`, but if a question that nobody asked for has no answer, the reason."""
     try:
-        answer = question.answer(cases, values, jobs=jobs, progress=progress)
+        return answer_to(text, cases, *arguments)
     except InputError as error:
-        answer = _no_answer(question.name, cases[0], error)
-    return replace(answer, command=command)
+        return _no_answer(text.partition(" ")[0], cases[0], error)
 
 
 def _no_answer(question: str, case: Case, error: InputError) -> Answer:

@@ -27,7 +27,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.ask import find_question, parse_question
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.report import sections
-from safevar_sumo.report.page import answer_to, usual_questions
+from safevar_sumo.report.page import answer_or_reason, answer_to, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.results import handles_of
 from safevar_sumo.results.manifest import read_manifest, write_manifest
@@ -187,9 +187,10 @@ def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
 
 
 def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path) -> None:
-    answer = answer_to("repair", [case], [slippery], None, 1, show_no_progress)
-    assert answer.verdict.startswith("No answer: ")
-    assert answer.command == f"python -m safevar_sumo repair {slippery}"
+    arguments = "repair", [case], [slippery], None, 1, show_no_progress
+    assert answer_or_reason(*arguments).verdict.startswith("No answer: ")
+    with pytest.raises(InputError):
+        answer_to(*arguments)
 
 
 def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
@@ -220,7 +221,7 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
     shutil.copytree(
         slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv")
     )
-    page = page_of(tmp_path / "begun", ask=["explain", "rules --samples 20"], jobs=1, paper=True)
+    page = page_of(tmp_path / "begun", ask=["rules --samples 20"], jobs=1, paper=True)
     assert "There is no solution to replay" in page
     assert "slippery: unfinished, nsga2 0 of " in page
     assert '<section class="front" ' in page, "nothing is unsafe"
