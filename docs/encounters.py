@@ -15,10 +15,10 @@ from safevar_sumo.questions.evaluator import sobol_settings
 from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.system import System, assemble
 
 FASTEST = 60.0
-"""The picture shows speeds beyond the study's domain [km/h]."""
+"""The fastest speed of the study [km/h]."""
 WORN = {"brakeTorque": 0.97, "brakeResponse": 0.25, "payload": 180.0, "sensorRange": 65.0, "sensorLatency": 0.12}
 IMPACT_LOCATION = 25.0
 GRID_SPEEDS = (10, 20, 30, 40)
@@ -28,9 +28,14 @@ VEHICLES, ENCOUNTERS = 150, 24
 LINES, PARTS, ENCOUNTERS_ON_LINES = 30, 25, 16
 
 
+def _up_to(fastest: float) -> System:
+    """The study wear_joint up to a speed [km/h]."""
+    return assemble(load_study("wear_joint", scenario={"search": {"speed": {"upper": fastest}}}))
+
+
 def main(path: str) -> None:
     """Simulate the worn car with every tread at every speed."""
-    system = assemble(load_study("wear_joint", scenario={"search": {"speed": {"upper": FASTEST}}}))
+    system = _up_to(FASTEST)
     members = system.characteristics
     speed, tread = members.names.index("speed"), members.names.index("treadDepth")
     speeds = np.linspace(members.lower[speed], FASTEST, SPEEDS)
@@ -54,9 +59,11 @@ def main(path: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def count_between() -> None:
-    """Print how many vehicles are safe at all points of wear, and how many of these collide in encounters between."""
-    grid, joint = (assemble(load_study(name)) for name in ("wear", "wear_joint"))
+def count_between(fastest: float) -> None:
+    """Print how many vehicles are safe at all points of wear, and how many of these collide in encounters up to a speed
+    [km/h].
+    """
+    grid, joint = assemble(load_study("wear")), _up_to(fastest)
     members, of_vehicle, rng = grid.characteristics, joint.characteristics.of_vehicle, np.random.default_rng(5)
     drawn = rng.uniform(members.lower, members.upper, (VEHICLES, len(members)))
     vehicles = members.original + (drawn - members.original) * rng.uniform(0.2, 0.8, (VEHICLES, 1))
@@ -70,9 +77,11 @@ def count_between() -> None:
     print(f"{len(safe)} of {VEHICLES} vehicles are safe in wear, {found} of these collide in wear_joint")
 
 
-def compare_lines() -> None:
-    """Print where on lines from the original to worn cars the first collision is, in wear and in wear_joint."""
-    grid, joint = (assemble(load_study(name)) for name in ("wear", "wear_joint"))
+def compare_lines(fastest: float) -> None:
+    """Print on how many lines from the original to worn cars the first collision is earlier in wear_joint than in
+    wear, and on how many later.
+    """
+    grid, joint = assemble(load_study("wear")), _up_to(fastest)
     members, of_vehicle, rng = grid.characteristics, joint.characteristics.of_vehicle, np.random.default_rng(7)
     ends, shares = rng.uniform(members.lower, members.upper, (LINES, len(members))), np.arange(1, PARTS + 1) / PARTS
     vehicles = members.original + (ends - members.original)[:, np.newaxis] * shares[:, np.newaxis]
@@ -92,5 +101,6 @@ def compare_lines() -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1])
-    count_between()
-    compare_lines()
+    for speed in (max(GRID_SPEEDS), FASTEST):
+        count_between(speed)
+        compare_lines(speed)
