@@ -106,26 +106,26 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     the result of setting i at its worst point. In a study that searches its scenario, row i also holds the safety
     degree of the original vehicle in the encounter of setting i.
     """
-    if not len(system.characteristics.scenario):
-        return _evaluate_in_batches(system, settings, engine)
-    originals = system.characteristics.with_original_vehicle(settings)
-    pairs = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])  # take turns: they share scenes
-    both, variants = _evaluate_in_batches(system, pairs, engine), np.arange(0, len(pairs), 2)
-    metrics = {name: values[variants] for name, values in both.metrics.items()}
-    return replace(both.take(variants), metrics={**metrics, ORIGINAL_DEGREE: both.f_safe[variants + 1]})
-
-
-def _evaluate_in_batches(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
-    size = batch_size(system, engine)
+    takes_pairs = len(system.characteristics.scenario) > 0
+    size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
     if len(settings) > size:
         batches = (settings[start : start + size] for start in range(0, len(settings), size))
-        return Evaluations.concatenate([_evaluate_in_batches(system, batch, engine) for batch in batches])
+        return Evaluations.concatenate([evaluate(system, batch, engine) for batch in batches])
+    vehicles = settings
+    if takes_pairs:  # a variant and the original take turns: they share scenes
+        originals = system.characteristics.with_original_vehicle(settings)
+        vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
     if system.rater is not None:
-        return rate_settings(system, settings, engine)[0]
-    if system.matrix:
-        results = simulate_all_points(system, settings, engine)
-        return evaluations_at_worst_points(system, [result.evaluations for result in results])
-    return score(system, settings, drive_all(system, settings, engine))
+        found = rate_settings(system, vehicles, engine)[0]
+    elif system.matrix:
+        results = simulate_all_points(system, vehicles, engine)
+        found = evaluations_at_worst_points(system, [result.evaluations for result in results])
+    else:
+        found = score(system, vehicles, drive_all(system, vehicles, engine))
+    if not takes_pairs:
+        return found
+    variants = found.take(np.arange(0, len(vehicles), 2))
+    return replace(variants, metrics={**variants.metrics, ORIGINAL_DEGREE: found.f_safe[1::2]})
 
 
 def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple[Evaluations, CellResults]:
