@@ -182,11 +182,12 @@ class DelayLine(NamedTuple):
         """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older, newer = past[0], past[1]
-        if np.any(self.fraction):
+        if np.ndim(self.fraction) or self.fraction:
             with np.errstate(invalid="ignore"):  # the difference of two infinities
                 mixture = newer + (older - newer) * self.fraction
-            is_defined, undelayed = np.isfinite(mixture), np.asarray(self.fraction) == 0
-            newer = mixture if is_defined.all() else np.where(is_defined, mixture, np.where(undelayed, newer, older))
+            if not (is_defined := np.isfinite(mixture)).all():
+                mixture = np.where(is_defined, mixture, np.where(np.equal(self.fraction, 0), newer, older))
+            newer = mixture
         return newer, DelayLine(self.steps, self.fraction, past)
 
 
