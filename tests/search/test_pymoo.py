@@ -157,7 +157,9 @@ def test_an_algorithm_for_one_objective_minimises_the_first_alone(name: str) -> 
     assert result.f_safe[0] < 0.05 < sphere(SUN, SUN.original[np.newaxis]).f_safe[0]
 
 
-@pytest.mark.parametrize("name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA", "pymoo:NSGA2", "pymoo:MOEAD"])
+@pytest.mark.parametrize(
+    "name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA", "pymoo:NSGA2", pytest.param("pymoo:MOEAD", marks=pytest.mark.slow)]
+)
 def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str) -> None:
     """The original vehicle is safe in the upper half of the first domain: there the sphere is 1/4 or more."""
 

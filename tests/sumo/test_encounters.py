@@ -163,6 +163,7 @@ def planted(**changes: Any) -> Study:
     return load_study(tables)
 
 
+@pytest.mark.slow
 def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) -> None:
     """The original stops s = v^2 / (2 a mu) after it brakes and keeps the margin if s <= gap - margin; a share b of its
     brakes collides if s / b > gap. So the least wear that ever collides leaves b = 1 - margin / gap of the brakes.
@@ -232,6 +233,7 @@ def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> 
     assert answer.numbers["failures"] == 0
 
 
+@pytest.mark.slow
 def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounter_shows_it() -> None:
     study = planted()
     answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=500, top=2)
