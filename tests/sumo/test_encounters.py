@@ -209,7 +209,7 @@ def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation
     assert slightly.standing[0] > 0, "no solution of a run"
 
 
-@pytest.mark.parametrize("name", ["sun_joint", "wear_joint"])
+@pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=pytest.mark.slow)])
 def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tmp_path: Path) -> None:
     """`searched` also verifies all solutions in SUMO."""
     study = load_study(
@@ -222,6 +222,7 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tm
     assert (solutions["outcome"] == "collision").any()
 
 
+@pytest.mark.slow
 def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
     """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap of the brakes."""
     study = planted(step_length=0.01)
