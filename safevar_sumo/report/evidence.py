@@ -350,15 +350,7 @@ def _unpack(
         if len(json.loads(own_files[ANSWERS])) != len(described.questions):
             raise ValueError(f"{ANSWERS} answers other questions than {DESCRIPTION} names")
         return Packed(described, own_files, [str(folder / CODE)] if code else [], jobs, progress)
-    except (
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-        msgspec.MsgspecError,
-        InputError,
-    ) as error:
+    except (*MALFORMED, InputError) as error:
         raise InputError(path, f"{described.folder} is damaged: {describe_error(error)}", PACK) from None
 
 

@@ -131,6 +131,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         population=min(study.search.population, MAX_POPULATION),
         evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
         region=system.region,
+        scoring=system.measuring.scoring,
     )
     for seed in seeds:
         algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)

@@ -31,7 +31,6 @@ ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation 
 Interval = tuple[float, float]
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
-NOTABLE_MAGNITUDES = ("medium", "large")
 
 
 def fewest_runs(question: str, alpha: float = ALPHA) -> int:
