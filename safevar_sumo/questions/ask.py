@@ -18,6 +18,7 @@ from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from safevar_sumo.errors import InputError, unknown_name, warn
+from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
@@ -190,11 +191,15 @@ class Question:
         progress: bool | Progress = False,
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of options."""
+        from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
 
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
-            answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
+            with user_errors(self.name):
+                answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
+            if not isinstance(answer, Answer):
+                raise InputError(self.name, f"returns {type(answer).__name__}", "an Answer")
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
         verdict = f"{reason} {answer.verdict}".strip()
@@ -232,13 +237,15 @@ def find_question(name: str) -> Question:
     """
     module, _, function = name.partition(":") if ":" in name else (QUESTIONS.get(name, name), "", name)
     try:
-        found = getattr(import_module(module), function, None)
-    except ModuleNotFoundError as error:
-        if error.name not in (module, module.partition(".")[0]):
-            raise
-        found = None
+        with user_errors(name):
+            imported = import_module(module)
+    except ModuleNotFoundError:
+        legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
+        raise InputError("question", f"there is no {name!r}", legal) from None
+    found = getattr(imported, function, None)
     if not isinstance(found, Question):
-        raise InputError("question", repr(name), f"{', '.join(QUESTIONS)}, or module:name of a function with @question")
+        known = [name for name, value in vars(imported).items() if isinstance(value, Question)]
+        raise unknown_name("question", f"{module} has no function {function!r} with @question", function, known)
     return found
 
 

@@ -74,7 +74,7 @@ def list_models(kind: str | None = None) -> Answer:
         if kind not in tables:
             raise unknown_name("kind", f"there is no {kind!r} to list", kind, tables)
         tables = {kind: tables[kind]}
-    verdict = f"A study can name {', '.join(f'{len(frame)} {name}' for name, frame in tables.items())}."
+    verdict = f"A study can name {', '.join(f'{frame.iloc[:, 0].nunique()} {name}' for name, frame in tables.items())}."
     no_study: Any = None
     return Answer(question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables)
 

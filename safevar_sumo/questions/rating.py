@@ -95,6 +95,12 @@ def rating(
     """
     study, original = evaluator.study, evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}
+    if study.scenario.search:
+        raise InputError(
+            study.name,
+            "searches its scenario, and the cells of a rating are fixed",
+            "a study without [scenario.search]",
+        )
     if not is_rated(study):
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
     rater = assemble(study, study.source).rater
