@@ -195,4 +195,4 @@ def test_marked_numbers_are_those_that_their_commands_print(lines: tuple[str, ..
             else:
                 result = result[int(key) if isinstance(result, list) else key]
         unit = value.partition(" ")[2]
-        assert value == (f"{100 * result:.0f} %" if unit == "%" else f"{result:.2f} {unit}"), f"{page}: {path}"
+        assert value == (f"{100 * result:.0f} %" if unit == "%" else f"{result:.2f} {unit}".strip()), f"{page}: {path}"

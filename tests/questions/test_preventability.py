@@ -20,7 +20,7 @@ from safevar_sumo.questions.explain.failures import PointComparison, compare_at_
 from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure, robust_shares
 from safevar_sumo.questions.preventability import DRIVERS, avoided_by, drivers_frame, judge_collisions, judge_sample
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import ModelTable, load_study
+from safevar_sumo.study import ModelTable, ScenarioTable, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool
@@ -71,7 +71,7 @@ ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.value
 
 def evaluator(**parameters: object) -> Evaluator:
     """A short-sighted driving system in one scenario."""
-    scenario = ModelTable(model="crossing", parameters=parameters)
+    scenario = ScenarioTable(model="crossing", parameters=parameters)
     return Evaluator(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool())
 
 
