@@ -94,6 +94,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     against = json_of("tables", "part", "--algorithm", "rs")["tables"]["rq2"]["rows"]
     assert {(one["algorithm"], one["baseline"]) for one in against} == {("rs", "nsga2")}
+    assert "did you mean 'nsga2'?" in run("tables", "part", "--algorithm", "nsga3", expect=2).stderr
     sizes = zip([one["effect_size"] for one in records], [1 - one["effect_size"] for one in against], strict=True)
     assert all(one == pytest.approx(other) for one, other in sizes), "the same pair from the other side"
     Path("part/runs/rs-00.jsonl").unlink()
