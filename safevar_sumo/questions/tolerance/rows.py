@@ -117,16 +117,16 @@ def describe_failures(evaluator: Evaluator, settings: Mapping[str, FloatArray], 
 
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
-    """A failure at a safety degree, such as `the car hits a pedestrian at 40 km/h`."""
+    """A failure at a safety degree, such as `the car hits a pedestrian with 12 km/h in the test at 40 km/h`."""
     if unsafe.points is not None:  # points are of the whole matrix
         return f"the car {unsafe.in_words}"
-    speed = "" if scenario.test_speed is None else f" at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
+    test = "" if scenario.test_speed is None else f" in the test at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
     if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
-        impact = "" if speed or impact_speed < 1 else f" with {impact_speed:.2g} km/h"
-        return f"the car hits {scenario.obstacle()}{speed or impact}"
+        impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"
+        return f"the car hits {scenario.obstacle()}{impact}{test}"
     centre = " from centre to centre" if scenario.centre_to_centre and unsafe.below else ""
-    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{centre} from {scenario.obstacle()}{speed}"
+    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{centre} from {scenario.obstacle()}{test}"
 
 
 def _sentence(item: Characteristic, ends: Interval | None, specified: Ends, beyond: str | None) -> str:
