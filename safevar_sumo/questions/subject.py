@@ -217,6 +217,6 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
         raise InputError(
             directory / MANIFEST,
             f"{named}: new simulations would not match these results",
-            "the inputs of that time; or `as_it_is_now=True` to simulate with the present inputs and a warning",
+            "the inputs of that time; questions simulate with the present ones, and warn, by `as_it_is_now=True`",
         )
     return [f"{difference}; simulated as it is now" for difference in changes]

@@ -69,30 +69,18 @@ def unit_text(unit: str, layout: str = " {}") -> str:
     return "" if unit == "-" else layout.format(unit)
 
 
-class Uniform(
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    omit_defaults=True,
-    tag_field="distribution",
-    tag="uniform",
-):
+class _Distribution(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="distribution"):
+    """How the value of a characteristic varies between vehicles."""
+
+
+class Uniform(_Distribution, frozen=True, kw_only=True, tag="uniform"):
     """Every value from `lower` to `upper` is equally likely; by default the whole domain."""
 
     lower: float | None = None
     upper: float | None = None
 
 
-class Normal(
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    omit_defaults=True,
-    tag_field="distribution",
-    tag="normal",
-):
+class Normal(_Distribution, frozen=True, kw_only=True, tag="normal"):
     """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the
     ends of the domain.
     """
@@ -101,15 +89,7 @@ class Normal(
     mean: float | None = None
 
 
-class Triangular(
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    omit_defaults=True,
-    tag_field="distribution",
-    tag="triangular",
-):
+class Triangular(_Distribution, frozen=True, kw_only=True, tag="triangular"):
     """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the
     original.
     """
@@ -119,15 +99,7 @@ class Triangular(
     upper: float | None = None
 
 
-class Lognormal(
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    omit_defaults=True,
-    tag_field="distribution",
-    tag="lognormal",
-):
+class Lognormal(_Distribution, frozen=True, kw_only=True, tag="lognormal"):
     """A lognormal distribution with `median`, by default the original, cut off at the ends of the domain.
 
     `sigma` [-] is the standard deviation of the value's logarithm.
@@ -137,15 +109,7 @@ class Lognormal(
     median: float | None = None
 
 
-class Fixed(
-    Struct,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-    omit_defaults=True,
-    tag_field="distribution",
-    tag="fixed",
-):
+class Fixed(_Distribution, frozen=True, kw_only=True, tag="fixed"):
     """The characteristic always has `value`, by default the original."""
 
     value: float | None = None

@@ -185,7 +185,7 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
     if table in ("rq1-runs", "rq2-runs"):
         tests = frame.dropna(subset="effect_size")
         if few_count := len(tests) - tests["enough_runs"].sum():
-            how_many, needed = "all" if few_count == len(tests) else f"{few_count} of the", fewest_runs(rq, alpha)
-            yield f"{prefix}too few runs for {how_many} {len(tests)} tests of {rq} ({needed} are needed)."
+            needed = fewest_runs(rq, alpha)
+            yield f"{prefix}too few runs for {few_count} of {len(tests)} tests of {rq} ({needed} are needed)."
     if table == "combinations" and frame.empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."

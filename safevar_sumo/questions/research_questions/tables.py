@@ -60,7 +60,7 @@ class PaperTable(NamedTuple):
 
 TABLES: Mapping[str, PaperTable] = {
     "rq1-runs": PaperTable(
-        "RQ1 over runs: the means of runs against the original vehicle",
+        "RQ1 over runs: the means of runs against the original vehicle (effect below 0.5: less safe)",
         comparisons.rq1_runs,
         CASE
         | ALGORITHM
@@ -76,7 +76,7 @@ TABLES: Mapping[str, PaperTable] = {
         | ENOUGH,
     ),
     "rq2-runs": PaperTable(
-        "RQ2 over runs: an algorithm's runs against those of the others",
+        "RQ2 over runs: an algorithm's runs against those of the others (effect above 0.5: better)",
         comparisons.rq2_runs,
         CASE
         | ALGORITHM
