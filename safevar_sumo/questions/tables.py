@@ -191,7 +191,7 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     if long and len(columns) < 2:  # lines say it all
         yield frame.attrs.get("title", "")
         for first, *others in zip(*(column.texts for column in (*columns, *long)), strict=True):
-            yield f"{first}: {' '.join(filter(None, others))}"
+            yield ": ".join(filter(None, (first, " ".join(filter(None, others)))))
         return
     if 1 + sum(max(_least_width(column), LEAST_TEXT * column.is_long) for column in every) <= width:
         columns, long = every, []

@@ -69,7 +69,7 @@ def unit_text(unit: str, layout: str = " {}") -> str:
     return "" if unit == "-" else layout.format(unit)
 
 
-class _Distribution(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="distribution"):
+class _Distribution(Table, frozen=True, tag_field="distribution"):
     """How the value of a characteristic varies between vehicles."""
 
 

@@ -95,6 +95,8 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
     answer = replace(ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}).only("parts")
     assert list(answer.tables) == ["parts", "remarks"]
     assert [*answer.tables["remarks"]["remark"]] == ["one is old", "they are made up"]
+    long = tabulate("Remarks", {"remark": Column("", "remark")}, [("All of them are made up. " * 5,)])
+    assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render("text")
     assert "Others" not in ANSWER.render("latex", "parts")
     with pytest.raises(sv.InputError, match="did you mean 'parts'"):
         ANSWER.only("part")
