@@ -235,4 +235,4 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """The gap below which it brakes [m], at speeds [m/s] of shape (N,)."""
         stop = speed * self.t_response + speed * speed / (2 * self.a_ego_min)
         obstacle_stop = obstacle_speed * obstacle_speed / (2 * self.a_obj_min)
-        return np.asarray(stop - obstacle_stop + self.longitudinal_offset_margin)
+        return stop - obstacle_stop + self.longitudinal_offset_margin

@@ -243,10 +243,10 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
     is_detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
     lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
     lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
-    return np.asarray(is_detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor)))
+    return is_detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor))
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
     """Whether an obstacle is within `corridor` of the lane's middle [m], or moves towards the middle."""
     moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
-    return np.asarray((np.abs(seen.lateral) <= corridor) | moves_inwards)
+    return (np.abs(seen.lateral) <= corridor) | moves_inwards

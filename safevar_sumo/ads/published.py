@@ -281,4 +281,4 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         low, middle, high = self.throttle
         level = speed / SPEED_LEVEL
         above_first_level = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
-        return np.asarray(np.where(level < 1, low + (middle - low) * level, above_first_level))
+        return np.where(level < 1, low + (middle - low) * level, above_first_level)

@@ -265,7 +265,7 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
         rt, reaction_speed = self.reaction_time, speed + self.reaction_time * self.acceleration
         stop = speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
         leader_stop = leader_speed * leader_speed / (2 * self.leader_deceleration)
-        return np.asarray(np.maximum(stop - leader_stop, 0.0))
+        return np.maximum(stop - leader_stop, 0.0)
 
 
 class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):

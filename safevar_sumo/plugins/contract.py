@@ -108,7 +108,7 @@ class Legal(NamedTuple):
         """Which numbers are legal."""
         is_legal = (numbers > self.lowest) if self.above else (numbers >= self.lowest)
         is_legal &= (numbers <= self.highest) & (self.infinite | np.isfinite(numbers))
-        return np.asarray(is_legal | (self.undefined & np.isnan(numbers)))
+        return is_legal | (self.undefined & np.isnan(numbers))
 
 
 FINITE, POSITIVE, SHARE, TRUTH = Legal(), Legal(0.0, above=True), Legal(0.0, 1.0), Legal(kinds="b")

@@ -88,7 +88,7 @@ class Rater:
 def round_half_up(values: FloatArray, decimals: int) -> FloatArray:
     """Round values to decimals; a half rounds up."""
     scale = 10.0**decimals
-    return np.asarray(np.floor(np.round(values * scale, 4) + 0.5) / scale)
+    return np.floor(np.round(values * scale, 4) + 0.5) / scale
 
 
 def _rounded_share(values: FloatArray | float) -> FloatArray:

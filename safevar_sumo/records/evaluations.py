@@ -80,7 +80,7 @@ class Evaluations:
         """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is NaN everywhere."""
         if name in ("f_safe", "f_diff", "f_num_diff"):
             return np.asarray(getattr(self, name))
-        return np.asarray(self.metrics.get(name, np.full(len(self), np.nan)))
+        return self.metrics.get(name, np.full(len(self), np.nan))
 
     @property
     def objectives(self) -> FloatArray:

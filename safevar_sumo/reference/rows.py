@@ -55,7 +55,7 @@ class ReferenceData(NamedTuple):
 
     @property
     def collided(self) -> BoolArray:
-        return np.asarray(self.metrics[SAFETY_DEGREE] <= 0)
+        return self.metrics[SAFETY_DEGREE] <= 0
 
     def take(self, rows: BoolArray) -> ReferenceData:
         """The data in the rows of a mask."""

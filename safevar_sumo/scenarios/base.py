@@ -116,8 +116,8 @@ class Frame(NamedTuple):
             raise InputError(NETWORK_KEY, problem, "a crossing at right angles")
         return start
 
-    def point(self, along: float, left: float) -> Coordinates:
-        """The point at these distances along the lane and to its left [m]."""
+    def point(self, along: Any, left: Any) -> Coordinates:
+        """The point, or the points, at these distances along the lane and to its left [m]."""
         (x, y), (dir_x, dir_y) = self.origin, self.direction
         return x + along * dir_x - left * dir_y, y + along * dir_y + left * dir_x
 

@@ -244,7 +244,7 @@ def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> 
     to_corner = to_middle - target.ahead - PARKED_GAP
     # The line is `-lateral * to_corner / to_middle` from the lane's middle where it passes the car's corner.
     is_free = (to_corner <= 0) | (-target.lateral * to_corner < constants.parked_offset * to_middle)
-    return np.asarray(~np.asarray(constants.hidden) | is_free)
+    return ~np.asarray(constants.hidden) | is_free
 
 
 def value_at(times: Times, function: Callable[[float], float]) -> Quantity:

@@ -172,7 +172,7 @@ def _scores(evaluations: Evaluations, scoring: Scoring, safety_weight: float) ->
             score = score + (column - 1) / max(evaluations.settings.shape[1] - 1, 1)
         else:
             score = score + _normalise(column)
-    return np.asarray(score / (safety_weight + len(scoring.objectives) - 1))
+    return score / (safety_weight + len(scoring.objectives) - 1)
 
 
 def _normalise(values: FloatArray) -> FloatArray:
@@ -180,4 +180,4 @@ def _normalise(values: FloatArray) -> FloatArray:
     if np.all(np.isnan(values)):
         return values
     minimum, value_range = np.nanmin(values), np.nanmax(values) - np.nanmin(values)
-    return np.asarray((values - minimum) / value_range if value_range > 0 else values - minimum)
+    return (values - minimum) / value_range if value_range > 0 else values - minimum

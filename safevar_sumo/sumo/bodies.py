@@ -68,7 +68,7 @@ class Track(NamedTuple):
     @property
     def heading(self) -> FloatArray:
         """Direction, counter-clockwise from east [rad]."""
-        return np.asarray(np.arctan2(self.motion[..., 3], self.motion[..., 2]))
+        return np.arctan2(self.motion[..., 3], self.motion[..., 2])
 
 
 class World(ScenariosWorld, Protocol):

@@ -17,8 +17,7 @@ import numpy as np
 from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.scenarios import SEARCHABLE, Lane, Point, Scenario, searchable_in
-from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.scenarios import SEARCHABLE, Point, Scenario, searchable_in
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.network import stage_networks
@@ -44,7 +43,7 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
                 raise InputError(source, problem, f"a part of [{widest.lower:g}, {widest.upper:g}] {widest.unit}")
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
-    for point in points if ends else ():
+    for point in points:
         try:
             stage_networks([encounter(point, corner).scenario for corner in corners])
         except InputError as error:
@@ -53,44 +52,25 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
 
 def encounter(point: Point, values: Mapping[str, Any]) -> Point:
     """A point at other values of parameters, numbers, or arrays for N vehicles."""
-    of_weather = {name: value for name, value in values.items() if name in SEARCHABLE["weather"]}
-    of_scenario = {name: value for name, value in values.items() if name not in of_weather}
-    return point._replace(
-        scenario=_with_fields(point.scenario, of_scenario), weather=_with_fields(point.weather, of_weather)
-    )
-
-
-def _with_fields(record: Any, values: Mapping[str, Any]) -> Any:
-    changed = copy.copy(record)
+    scenario: Any = copy.copy(point.scenario)
+    weather = copy.copy(point.weather)
     for name, value in values.items():
-        force_setattr(changed, name, value)
-    return changed
+        force_setattr(weather if name in SEARCHABLE["weather"] else scenario, name, value)
+    return point._replace(scenario=scenario, weather=weather)
 
 
 def scenes_of_encounters(recording: Recording, scenario: Scenario, n: int) -> Recording:
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
-    layout = scenario.layout(_RecordedRoads(recording), recording.step_length, samples)
-    frame, track = layout.frame, recording.tracks[layout.target]
-    (x, y), (dir_x, dir_y) = frame.origin, frame.direction
-    left = layout.left
-    if layout.along is None:  # on a footpath, whose place along the lane SUMO knows where it crosses the lane
+    layout = scenario.layout(recording, recording.step_length, samples)
+    frame, track, along = layout.frame, recording.tracks[layout.target], layout.along
+    if along is None:  # on a footpath, whose place along the lane SUMO knows where it crosses the lane
         at_lane = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
         along = frame.along(track.motion[[at_lane], :2])
-    else:
-        along = layout.along
     sign = np.where(layout.backwards, -1.0, 1.0)
-    first = track.motion[0]
-    columns = (
-        x + along * dir_x - left * dir_y,
-        y + along * dir_y + left * dir_x,
-        sign * first[2],
-        sign * first[3],
-        layout.speeds,
-    )
-    motion = np.empty((len(columns), samples, n))
-    for values, column in zip(motion, columns, strict=True):
-        values[:] = column
+    _, _, dir_x, dir_y, _ = track.motion[0]
+    columns = *frame.point(along, layout.left), sign * dir_x, sign * dir_y, layout.speeds
+    motion = np.stack([np.broadcast_to(column, (samples, n)) for column in columns])
     return replace(
         recording,
         start=np.broadcast_to(recording.start if layout.front is None else layout.front, n),
@@ -106,13 +86,3 @@ def _extended(track: Track, samples: int) -> Track:
     """The track of an actor who stands, for at least this number of samples."""
     missing = max(samples - len(track.motion), 0)
     return track._replace(motion=np.pad(track.motion, ((0, missing), (0, 0)), mode="edge"))
-
-
-class _RecordedRoads:
-    """The lanes of a recorded scene."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self._recording.lanes[lane])

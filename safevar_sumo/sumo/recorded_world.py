@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, Scenario
-from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
+from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.vehicles import SumoType
@@ -33,7 +33,7 @@ def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) 
     `MSVehicle::getDeltaPos`.
     """
     acceleration = (new_speed - old_speed) / step
-    return np.asarray((old_speed + 0.5 * (acceleration * step)) * step)
+    return (old_speed + 0.5 * (acceleration * step)) * step
 
 
 class RecordedWorld:
@@ -124,7 +124,7 @@ class RecordedWorld:
         return self._scene.tracks[actor].width
 
     def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self._scene.lanes[lane])
+        return self._scene.lane(lane)
 
     def lane_of(self, vehicle: str) -> Lane:
         return self.lane(self._scene.first_lanes[vehicle])

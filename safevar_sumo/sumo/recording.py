@@ -17,7 +17,8 @@ import numpy as np
 from msgspec import msgpack, to_builtins
 
 from safevar_sumo.records import FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, Point, Scenario
+from safevar_sumo.scenarios import VUT, Lane, Point, Scenario
+from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
@@ -59,7 +60,7 @@ class LaneSequence(NamedTuple):
         [m].
         """
         share = lane_position * self.stretch / self.shape_length
-        return np.asarray(self.first + self.vector * share[:, np.newaxis])
+        return self.first + self.vector * share[:, np.newaxis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +88,10 @@ class Recording:
         """Vehicles in scenes with the same key may share a batch."""
         way = (column.tobytes() for column in self.way)
         return self.step_length, self.length, self.width, self.along.tobytes(), *way
+
+    def lane(self, lane: str) -> Lane:
+        """A lane by its id."""
+        return lane_through(lane, self.lanes[lane])
 
 
 class Scenes:

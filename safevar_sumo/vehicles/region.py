@@ -63,7 +63,7 @@ class _Bounds(NamedTuple):
     def excess(self, settings: FloatArray) -> FloatArray:
         """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
         values = self.quantity(settings)
-        return np.asarray(np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.width)
+        return np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.width
 
     def __str__(self) -> str:
         return f"{self.constraint.quantity} {self.condition}"

@@ -24,10 +24,10 @@ WET_FRICTION = tomllib.loads(Path(__file__).with_name("wet_friction.toml").read_
 def lift_of(water: float | FloatArray, tread: FloatArray, lift: float, texture: float) -> FloatArray:
     """k [s^2/m^2], shape (N,), of treads at depths of water [mm]; 0 on a dry road."""
     flood = water / NEW_TREAD
-    return np.asarray(lift * np.sqrt(water) / (texture + tread / (1 + flood * flood)))
+    return lift * np.sqrt(water) / (texture + tread / (1 + flood * flood))
 
 
 def lifted_friction(grip: float | FloatArray, lift: FloatArray, speed: FloatArray) -> FloatArray:
     """mu at speeds [m/s], shape (N,); `grip` on a dry road or at rest."""
     lifted = lift * (speed * speed)
-    return np.asarray(grip / np.sqrt(1 + lifted * lifted))
+    return grip / np.sqrt(1 + lifted * lifted)

@@ -212,10 +212,7 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values, originals = _values(case, algorithm, metric, over_runs), _originals(case, algorithm, metric, over_runs)
         original = originals.mean() if case.study.scenario.search else case.original[metric.name]
-        if over_runs:
-            test = signed_rank_test(values - originals, original - original)  # undefined without an original
-        else:
-            test = compare_samples(values, originals.dropna())
+        test = signed_rank_test(values - originals) if over_runs else compare_samples(values, originals.dropna())
         if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
             test = test.reversed()
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)

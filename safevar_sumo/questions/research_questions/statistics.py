@@ -83,14 +83,14 @@ def magnitude_of(effect_size: float) -> str:
     return next((name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible")
 
 
-def signed_rank_test(sample: ArrayLike, value: float) -> TwoSampleTest:
-    """Compare independent values, shape (N,), with one value by Wilcoxon's test; the effect size is the share of
-    greater values.
+def signed_rank_test(sample: ArrayLike) -> TwoSampleTest:
+    """Compare independent differences, shape (N,), with 0 by Wilcoxon's test; the effect size is the share of greater
+    ones.
 
-    The test drops values equal to `value` (as Wilcoxon did); the effect size counts them by half.
+    The test drops differences of 0 (as Wilcoxon did); the effect size counts them by half.
     """
-    differences = np.asarray(sample, dtype=float) - value
-    if not differences.size or np.isnan(value):
+    differences = np.asarray(sample, dtype=float)
+    if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
     if not differences.any():
         return TwoSampleTest(1.0, 0.5, magnitude_of(0.5), differences.size, 1, EXACT_SIGNED_TEST)
