@@ -34,7 +34,8 @@ COMMAND_PREFIX = "; to reproduce it: "
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Restricts a task to some points of a study, and varies parameters of its ADS.
+    """Restricts a task to some points of a study, and varies parameters of its ADS; no original vehicle drives in the
+    encounters of a study that searches its scenario.
 
     Attributes
     ----------
@@ -187,16 +188,17 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     selection, n = task.selection, len(system.characteristics)
     settings, values = rows[:, :n], rows[:, n:]
     if not values.size:
-        return evaluate(system, settings, task.engine)
+        return evaluate(system, settings, task.engine, with_originals=False)
     if selection.arrays:
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
-        return replace(evaluate(system, settings, task.engine), settings=rows)
+        return replace(evaluate(system, settings, task.engine, with_originals=False), settings=rows)
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
     groups, rows_of_groups = [], []
     for number, parameter_set in enumerate(parameter_sets.tolist()):
         group = np.flatnonzero(set_of_row.ravel() == number)
         study = with_parameters(task.study, dict(zip(selection.parameters, parameter_set, strict=True)))
-        evaluations = evaluate(replace(system, ads=assemble(study).ads), settings[group], task.engine)
+        driven = replace(system, ads=assemble(study).ads)
+        evaluations = evaluate(driven, settings[group], task.engine, with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
     return Evaluations.concatenate(groups).take(np.argsort(np.concatenate(rows_of_groups)))  # in the order of the rows

@@ -93,7 +93,8 @@ class Evaluator:
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.
 
-        The values stand beside the settings, shape (M, n + P).
+        The values stand beside the settings, shape (M, n + P). Encounters in which the original vehicle is not safe
+        count, too.
         """
         return self._evaluate_shown(rows, stage, 0, selection)
 
@@ -113,7 +114,7 @@ class Evaluator:
 
         evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection)
         self.simulated += total
-        return self._without_unsafe_originals(evaluations)
+        return self._without_unsafe_originals(evaluations) if selection == EVERYTHING else evaluations
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
         """Evaluations whose results are undefined where the original vehicle is not safe in the same encounter."""
@@ -143,7 +144,11 @@ class Evaluator:
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
-        """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe, shape (k, n)."""
+        """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe, shape (k, n); none
+        if the study searches no scenario.
+        """
+        if not len(self.characteristics.scenario):
+            return np.zeros((0, len(self.characteristics)))
         drawn = sobol_settings(self.characteristics, CANDIDATES)
         originals = self.evaluate(self.characteristics.with_original_vehicle(drawn), "encounters of the original")
         order = np.argsort(originals.f_safe, kind="stable")  # NaN is last

@@ -129,7 +129,7 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
 def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> FloatArray:
     """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
     approach, verdicts = approach_parameters(system), dict[str, FloatArray]()
-    if approach and len(system.characteristics.scenario):  # from rest, he would approach another encounter
+    if approach is None:
         return np.full((len(settings), len(DRIVERS)), np.nan)
     with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
     is_led = system.points[0].scenario.pre_crash == PreCrash.LEAD_DECELERATING
@@ -145,9 +145,9 @@ def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) 
     return np.column_stack(list(verdicts.values()))
 
 
-def approach_parameters(system: System) -> JsonObject:
+def approach_parameters(system: System) -> JsonObject | None:
     """Parameters with which a reference driver approaches from rest as the driving system does with the original
-    vehicle.
+    vehicle; None in a study that searches its scenario, where that would be the approach to another encounter.
 
     The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that
     speed, so that both are at the same position when the danger begins. If the run begins at speed, the driver keeps
@@ -157,5 +157,7 @@ def approach_parameters(system: System) -> JsonObject:
     speed, is_braking = trace.speed[:, 0], trace.brake[:, 0] > 0
     if speed[0] > 0 or not speed.any():
         return {}
+    if len(system.characteristics.scenario):
+        return None
     end = min(int(np.argmax(speed)), int(np.argmax(is_braking)) if is_braking.any() else len(speed))
     return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:end, 0].tolist()}

@@ -55,6 +55,12 @@ def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, flo
     return ", ".join(change_texts(characteristics, values)) or "no change at all"
 
 
+def encounter_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+    """The searched parameters of the scenario, such as ` in an encounter with speed 59.5 km/h`; empty without any."""
+    phrases = [f"{item.short_name} {item.text(values[item.name])}{item.suffix}" for item in characteristics.scenario]
+    return f" in an encounter with {join_phrases(phrases)}" if phrases else ""
+
+
 def question_command(question: str, subject: str, point: str = "") -> str:
     """The command that asks a question about results or a study; `point` may name a point of the study's matrix."""
     return f"{PROGRAM_COMMAND} {question} {quote(subject)}" + (f" --point {quote(point)}" if point else "")

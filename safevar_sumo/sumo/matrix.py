@@ -99,18 +99,21 @@ def vehicle_remarks(system: System) -> list[str]:
     ]
 
 
-def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> Evaluations:
+def evaluate(
+    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, *, with_originals: bool = True
+) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds
     the result of setting i at its worst point. In a study that searches its scenario, row i also holds the safety
-    degree of the original vehicle in the encounter of setting i.
+    degree of the original vehicle in the encounter of setting i, unless `with_originals` is false.
     """
-    takes_pairs = len(system.characteristics.scenario) > 0
+    takes_pairs = with_originals and len(system.characteristics.scenario) > 0
     size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
     if len(settings) > size:
-        batches = (settings[start : start + size] for start in range(0, len(settings), size))
-        return Evaluations.concatenate([evaluate(system, batch, engine) for batch in batches])
+        starts = range(0, len(settings), size)
+        batches = [settings[start : start + size] for start in starts]
+        return Evaluations.concatenate([evaluate(system, each, engine, with_originals=takes_pairs) for each in batches])
     vehicles = settings
     if takes_pairs:  # a variant and the original take turns: they share scenes
         originals = system.characteristics.with_original_vehicle(settings)

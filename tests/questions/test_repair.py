@@ -173,6 +173,24 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Pat
 
 
 @pytest.mark.slow
+def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
+    planted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gap of today decides the fastest of them; from there the worst promised sled needs a longer one."""
+    monkeypatch.setattr(attack, "GENERATIONS", 8)
+    search = 'search.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
+    planted.write_text(
+        STUDY.replace("speed = 72.0, ", "").replace('model = "car_to_car"', f'model = "car_to_car"\n{search}')
+    )
+    found = sv.repair(planted, change=["gap"], fits=0, pool=InlinePool())
+    (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
+    fastest = 2 * 8 * (GAP_TODAY - MARGIN)  # squared, with grip 8
+    assert repair["parameters"]["gap"] == pytest.approx(MARGIN + fastest / (2 * 5), rel=0.02)
+    assert repair["proof_failures"] == 0
+    assert "in the encounters with speed 30 to 72 km/h that a new vehicle survives" in found.verdict
+
+
+@pytest.mark.slow
 def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
     answers = [sv.repair(planted, change=["always"], pool=pool).to_dict() for pool in (InlinePool(), InlinePool(2))]
     assert answers[0] == answers[1]

@@ -14,7 +14,6 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
-from safevar_sumo.questions.repair import repair
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
@@ -248,11 +247,6 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     assert [*answer.tables["causes"]["elsewhere"]] == [
         changes["brakes"] < at_original for changes in answer.tables["causes"]["changes"]
     ]
-
-
-def test_a_repair_has_no_meaning_there() -> None:
-    with pytest.raises(InputError, match="a repair is proved at fixed encounters"):
-        repair.compute(planted(), Evaluator(planted(), InlinePool()))
 
 
 TOO_WIDE = {**SPEED, "upper": 500}

@@ -39,7 +39,14 @@ from safevar_sumo.questions.preventability import (
     judge_sample,
 )
 from safevar_sumo.questions.tables import Column, tabulate, with_interval
-from safevar_sumo.questions.words import constraints_in_words, ending_in_words, join_phrases, number_of, share_in_words
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    encounter_in_words,
+    ending_in_words,
+    join_phrases,
+    number_of,
+    share_in_words,
+)
 from safevar_sumo.records import BoolArray, JsonObject, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import contact_degree
@@ -307,11 +314,8 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
         for item in evaluator.characteristics
         if (value := leading["boundary"].get(item.name)) is not None
     ]
-    encounter = [
-        f"{item.short_name} {item.text(leading['encounter'][item.name])}{item.suffix}"
-        for item in evaluator.characteristics.scenario
-    ]
-    where = f" in an encounter with {join_phrases(encounter)}, where the original is safe," if encounter else ""
+    encounter = encounter_in_words(evaluator.characteristics, leading["encounter"])
+    where = f"{encounter}, where the original is safe," if encounter else ""
     sure = [robustness_in_words(leading["robust_share"])]
     sure += [f"in {leading['fits_holding']} of {fits} fitted vehicle models"] if fits else []
     notes = f" ({'; '.join(filter(None, sure))})" if any(sure) else ""

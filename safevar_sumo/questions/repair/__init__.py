@@ -31,7 +31,7 @@ from safevar_sumo.questions.repair.attack import Proof, find_failures, prove
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import Search
-from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
@@ -105,9 +105,6 @@ def repair(
     if is_rated(study):
         text = f"{study.name!r} is rated, and its repair would take a whole test matrix for every vehicle and change"
         raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
-    if study.scenario.search:
-        text = f"{study.name!r} searches its scenario, and a repair is proved at fixed encounters"
-        raise InputError(study.source, text, "a study with a [matrix] of these encounters, such as wear")
     if out is not None:
         _check_file(Path(out), study)
     problem = RepairProblem(
@@ -117,6 +114,9 @@ def repair(
         unsafe=Unsafe(keep=margin_of(study, margin), contact=contact_degree(assemble(study))),
     )
     vehicles = _first_vehicles(problem, subject)
+    if not len(vehicles):
+        text = f"{study.name!r}: the new vehicle keeps {problem.unsafe.keep:g} m in no encounter that was tried"
+        raise InputError(study.source, text, "a smaller --margin, or other domains under [scenario.search]")
     degrees = problem.degrees_with(problem.today, vehicles, "the driving system of today")
     order = np.argsort(degrees, kind="stable")
     vehicles, degrees = vehicles[order], degrees[order]
@@ -142,7 +142,7 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
         failures = subject.solutions[Unsafe(problem.margin).rows(subject.solutions)]
         settings.append(failures[list(promise.region.characteristics.names)].to_numpy(dtype=float))
     rows = np.unique(np.concatenate(settings), axis=0)
-    return rows[promise.holds(rows)]
+    return rows[problem.holds(rows)]
 
 
 def _find_survivors(problem: RepairProblem, vehicles: FloatArray) -> tuple[list[tuple[FloatArray, Proof]], FloatArray]:
@@ -176,7 +176,8 @@ def _sizes_over_fits(problem: RepairProblem, change: FloatArray, vehicles: Float
     changes = np.clip(problem.today + sizes[:, np.newaxis] * (change - problem.today), 0.0, 1.0)
 
     def smallest(each: Evaluator) -> float:
-        degrees, _ = replace(problem, evaluator=each).degrees(changes, vehicles, "fits of the vehicle")
+        fitted = replace(problem, evaluator=each)
+        degrees, _ = fitted.degrees(changes, vehicles[fitted.holds(vehicles)], "fits of the vehicle")
         is_safe = (degrees >= problem.margin).all(axis=1)
         return float(sizes[np.argmax(is_safe)]) if is_safe.any() else np.inf
 
@@ -187,13 +188,16 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     """What no driving system can survive: the minimal causes of failures of full braking, shrunk to the limit; for each
     characteristic of a cause the value from which on even full braking at once fails.
     """
-    if not len(failures):
+    if not len(failures) or problem.best_driver is None:
         return []
     driver, unsafe = problem.best_driver, Unsafe(problem.margin)
     chosen = failures[np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)]
     causes = [cause for group in find_minimal_causes(driver, chosen, unsafe) for cause in group]
-    limits = [one.boundary for one in find_limits(driver, causes, unsafe)]
-    return [limit for number, limit in enumerate(limits) if limit not in limits[:number]]
+    limits: dict[tuple[object, ...], dict[str, float]] = {}
+    for one, cause in zip(find_limits(driver, causes, unsafe), causes, strict=True):
+        kind = tuple(one.boundary if cause.encounter else one.boundary.items())  # of many encounters the first
+        limits.setdefault(kind, one.boundary | cause.encounter)
+    return list(limits.values())
 
 
 def _answer_of(
@@ -265,7 +269,7 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof, sizes: FloatA
     }
     row = {"parameters": values, "change": ", ".join(texts), "changed": len(values), "largest_change": size}
     row |= {"over_fits": over_fits, "fits": len(enough)}
-    return {**row, **price_of(problem.study, values), **proof._asdict()}
+    return {**row, **price_of(problem.study, values, problem.encounters), **proof._asdict()}
 
 
 def _repair_in_words(repair: JsonObject, wear: str) -> str:
@@ -290,14 +294,15 @@ def _proof_in_words(proof: Proof) -> str:
 
 
 def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
-    """A part that no driving system survives, such as `sensorRange below 21.4 m`."""
+    """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its encounter."""
+    characteristics = problem.promise.region.characteristics
     limits = [
         f"{member.name} {'below' if part[member.name] < member.original else 'above'} "
         f"{member.text(part[member.name])}{member.suffix}"
-        for member in problem.promise.region.characteristics
+        for member in characteristics.vehicle
         if member.name in part
     ]
-    return " with ".join(limits) or "even the original"
+    return (" with ".join(limits) or "even the original") + encounter_in_words(characteristics, part)
 
 
 def _check_file(path: Path, study: Study) -> None:

@@ -39,7 +39,7 @@ def find_failures(problem: RepairProblem, change: FloatArray, known: FloatArray,
     characteristics mutates: with equal probability to a random value, or a step towards one.
     """
     promise, rng = problem.promise, np.random.default_rng((problem.study.search.seed, number))
-    children = np.concatenate([known, promise.draw(RANDOM, rng)])
+    children = np.concatenate([known, problem.draw(RANDOM, rng)])
     parents, degrees = children[:0], np.zeros(0)
     for _ in range(GENERATIONS):
         new_degrees = problem.degrees_with(change, children, "attack")
@@ -54,7 +54,7 @@ def find_failures(problem: RepairProblem, change: FloatArray, known: FloatArray,
         random = promise.at(rng.random(shape))
         draw = rng.random(shape) * np.count_nonzero(promise.lower < promise.upper)
         children = np.select([draw < 0.5, draw < 1.0], [random, children + STEP * (random - children)], children)
-        children = children[promise.holds(children)]
+        children = children[problem.holds(children)]
     return np.unique(parents[degrees < problem.margin], axis=0)
 
 
@@ -66,7 +66,7 @@ def prove(problem: RepairProblem, change: FloatArray, number: int, attempt: int)
     """
     error = (1 - CONFIDENCE) / 2**attempt
     draws = math.ceil(math.log(error) / math.log1p(-MAX_UNSAFE_SHARE))
-    fresh = problem.promise.draw(draws, np.random.default_rng((problem.study.search.seed, 7, number)))
+    fresh = problem.draw(draws, np.random.default_rng((problem.study.search.seed, 7, number)))
     unsafe = fresh[problem.degrees_with(change, fresh, "proof on fresh wear") < problem.margin]
     is_repairable = problem.repairable(unsafe)
     samples = len(fresh) - int(np.count_nonzero(~is_repairable))  # what no driving system keeps safe proves nothing

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from msgspec.structs import replace as replace_in
@@ -14,6 +15,7 @@ from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import MatrixTable, Study
+from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
@@ -21,13 +23,13 @@ NEEDLESS_BRAKE = 0.1
 """Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the speed."""
 
 
-def price_of(study: Study, values: Mapping[str, float]) -> JsonObject:
+def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) -> JsonObject:
     """The price of other values of parameters against today's, by the names of the answer's columns; None where the new
-    vehicle brakes nowhere.
+    vehicle brakes nowhere. `encounters` are new vehicles in K encounters, shape (K, n).
     """
     today, changed = assemble(study), assemble(with_parameters(study, values))
-    onsets_today, _ = _drive_new_car(today)
-    onsets, deceleration = _drive_new_car(changed)
+    onsets_today, _ = _drive_new_cars(today, encounters)
+    onsets, deceleration = _drive_new_cars(changed, encounters)
     benign = benign_scenes(study, today)
     before, after = (needless_braking(system, benign) for system in (today, changed))
     metres, seconds = onsets_today - onsets
@@ -37,7 +39,7 @@ def price_of(study: Study, values: Mapping[str, float]) -> JsonObject:
         "metres_earlier": None if most is None else float(metres[most]),
         "metres_earlier_mean": None if most is None else float(np.mean(metres[braked])),
         "seconds_earlier": None if most is None else float(seconds[most]),
-        "most_at": None if most is None else today.points[most].name or None,
+        "most_at": None if most is None else today.points[most // len(encounters)].name or None,
         "largest_deceleration": deceleration,
         "needless_braking": sum(after),
         "needless_braking_today": sum(before),
@@ -45,37 +47,43 @@ def price_of(study: Study, values: Mapping[str, float]) -> JsonObject:
     }
 
 
-def _drive_new_car(system: System) -> tuple[FloatArray, float]:
-    """Where and when the new vehicle begins to brake at each of N points, shape (2, N), NaN if it does not [m, s]; its
-    largest deceleration [m/s^2].
+def _drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, float]:
+    """Where and when the new vehicle begins to brake at each of N points in each of K encounters, shape (2, N K), NaN
+    if it does not [m, s]; its largest deceleration [m/s^2].
     """
-    results = simulate_all_points(system, system.characteristics.original[np.newaxis])
-    onsets, deceleration = np.full((2, len(results)), np.nan), 0.0
-    for column, result in enumerate(results):
-        trace, step = result.runs.trace, brake_onset(result.runs, 0)
-        if step is not None:
-            onsets[:, column] = trace.position[step, 0], trace.time[step]
-        speed = trace.speed[trace.active[:, 0], 0]
+    onsets, deceleration = list[tuple[float, float]](), 0.0
+    for result, row in product(simulate_all_points(system, encounters), range(len(encounters))):
+        trace, step = result.runs.trace, brake_onset(result.runs, row)
+        onsets.append((np.nan, np.nan) if step is None else (trace.position[step, row], trace.time[step]))
+        speed = trace.speed[trace.active[:, row], row]
         deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))
-    return onsets, deceleration
+    return np.transpose(onsets), deceleration
 
 
 def benign_scenes(study: Study, system: System) -> list[Point]:
-    """The benign scenes that a study names, else those like its shipped scenarios; there may be none."""
+    """The benign scenes that a study names, else those like its shipped scenarios, in the original encounter and with
+    all searched parameters of the scenario at their lower or upper ends; there may be none.
+    """
     if study.repair.benign:
         return list(assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix)
-    return benign_points(system.points)
+    searched = system.characteristics.scenario
+    ends = [
+        dict(zip(searched.names, end.tolist(), strict=True))
+        for end in (searched.original, searched.lower, searched.upper)
+    ]
+    return benign_points(encounter(point, values) for values in ends for point in system.points)
 
 
 def needless_braking(system: System, benign: list[Point]) -> list[bool]:
     """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road without anybody."""
     one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
+    vehicle = system.characteristics.vehicle
     return [
         bool((np.where(result.runs.trace.active, result.runs.trace.brake, 0.0) > NEEDLESS_BRAKE).any())
         for points, sees_nobody in ((benign, False), (one_per_speed, True))
         if points
         for result in simulate_all_points(
-            replace(system, matrix=tuple(points), rater=None, sees_nobody=sees_nobody),
-            system.characteristics.original[np.newaxis],
+            replace(system, matrix=tuple(points), rater=None, sees_nobody=sees_nobody, characteristics=vehicle),
+            vehicle.original[np.newaxis],
         )
     ]

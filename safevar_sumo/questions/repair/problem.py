@@ -19,6 +19,7 @@ from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
 from safevar_sumo.questions.preventability import approach_parameters
+from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
 from safevar_sumo.study.characteristics import check_limits
@@ -31,6 +32,8 @@ is the one that has been tried.
 """
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
+DRAWS = 20
+"""Largest number of draws for each one in an encounter in which a new vehicle is safe."""
 ALL = "all"
 """The promise of the whole domain."""
 
@@ -61,7 +64,8 @@ class Parameter(NamedTuple):
 class Promise:
     """The promised wear: all settings from `lower` to `upper`, shape (n,), that keep the study's constraints.
 
-    The ends of characteristics that stay as in the original are equal.
+    The ends of characteristics that stay as in the original are equal. Parameters of the scenario that the study
+    searches take their whole domain.
     """
 
     region: FeasibleRegion
@@ -77,7 +81,7 @@ class Promise:
         InputError
             If a promise cannot be read, names no characteristic, lies outside its domain, or lets nothing wear.
         """
-        rows, stated, everything = study.vehicle.characteristics, study.repair.promise, region.characteristics
+        rows, stated, everything = study.domains, study.repair.promise, region.characteristics
         if list(texts) == [ALL] or (not texts and stated == ALL):
             return cls(region, everything.lower, everything.upper)
         of_study = stated if stated and isinstance(stated, dict) else study.limits
@@ -85,12 +89,13 @@ class Promise:
         limits = limits_of(texts, rows, None if texts else of_study, "promise")
         if not limits:
             raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
-        ends = [
-            limits[member.name].interval(rows[member.name]) if member.name in limits else (member.original,) * 2
-            for member in everything
-        ]
-        lower, upper = np.transpose(ends)
-        if (lower == upper).all():
+        lower, upper = (
+            np.where(everything.of_vehicle, everything.original, ends) for ends in (everything.lower, everything.upper)
+        )
+        for name, limit in limits.items():
+            column = everything.names.index(name)
+            lower[column], upper[column] = limit.interval(rows[name])
+        if (lower == upper)[everything.of_vehicle].all():
             raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
         return cls(region, lower, upper)
 
@@ -108,21 +113,28 @@ class Promise:
         return self.region.draw_feasible(lambda count: self.at(rng.random((count, len(self.lower)))), number)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """The ends of every characteristic that may wear."""
+        """The ends of every characteristic that may wear, and of every parameter of the scenario that varies."""
         names, ends = self.region.characteristics.names, np.transpose([self.lower, self.upper]).tolist()
         return {name: pair for name, pair in zip(names, ends, strict=True) if pair[0] < pair[1]}
 
     @property
     def in_words(self) -> str:
-        """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`."""
-        ends = self.to_dict()
-        return ", ".join(
+        """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, and the encounters."""
+        ends, characteristics = self.to_dict(), self.region.characteristics
+        worn = ", ".join(
             f"{member.name} {sign} {end:.5g}{member.suffix}"
-            for member in self.region.characteristics
+            for member in characteristics.vehicle
             if member.name in ends
             for sign, end in zip((">=", "<="), ends[member.name], strict=True)
             if end != member.original
         )
+        encounters = [
+            f"{member.name} {ends[member.name][0]:.5g} to {ends[member.name][1]:.5g}{member.suffix}"
+            for member in characteristics.scenario
+            if member.name in ends
+        ]
+        where = f", in the encounters with {join_phrases(encounters)} that a new vehicle survives" if encounters else ""
+        return worn + where
 
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
@@ -233,14 +245,49 @@ class RepairProblem:
         """Safety degrees of settings with one set of parameters, shape (L,)."""
         return self.degrees(change[np.newaxis], settings, stage)[0].reshape(-1)
 
+    def holds(self, settings: FloatArray) -> BoolArray:
+        """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps a new vehicle safe;
+        without a search of the scenario, all promised ones count.
+        """
+        is_promised, characteristics = self.promise.holds(settings), self.promise.region.characteristics
+        if len(characteristics.scenario) and is_promised.any():
+            originals = characteristics.with_original_vehicle(settings[is_promised])
+            is_promised[is_promised] = self.degrees_with(self.today, originals, "new vehicles") >= self.margin
+        return is_promised
+
+    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+        """Settings that hold, drawn uniformly, shape (number, n); fewer if `DRAWS` times as many do not suffice."""
+        settings = np.zeros((0, len(self.promise.lower)))
+        for _ in range(DRAWS):
+            drawn = self.promise.draw(number, rng)
+            settings = np.concatenate([settings, drawn[self.holds(drawn)]])[:number]
+            if len(settings) == number:
+                break
+        return settings
+
     @cached_property
-    def best_driver(self) -> Evaluator:
-        """Full braking at the first possible moment."""
-        ads = ModelTable(model="full_braking", parameters=approach_parameters(assemble(self.study)))
+    def encounters(self) -> FloatArray:
+        """The new vehicle in the original encounter, and in those promised ones in which it is least safe of many drawn
+        ones, shape (K, n).
+        """
+        original, settings = self.promise.region.characteristics.original, self.evaluator.critical_encounters
+        return np.concatenate([original[np.newaxis], settings[self.promise.holds(settings)]])
+
+    @cached_property
+    def best_driver(self) -> Evaluator | None:
+        """Full braking at the first possible moment; None where it has no approach (`approach_parameters`)."""
+        approach = approach_parameters(assemble(self.study))
+        if approach is None:
+            return None
+        ads = ModelTable(model="full_braking", parameters=approach)
         return self.evaluator.for_study(replace_in(self.study, ads=ads, spread={}), verified=0)
 
     def repairable(self, settings: FloatArray) -> BoolArray:
-        """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe."""
+        """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe; all without
+        that driver.
+        """
+        if self.best_driver is None:
+            return np.ones(len(settings), dtype=bool)
         is_safe = _degrees_of(self.best_driver.evaluate(settings, "full braking")) >= self.margin
         unsafe = np.flatnonzero(~is_safe)
         is_safe[unsafe] = self.degrees_with(self.today, settings[unsafe], "full braking") >= self.margin
