@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 
 INTERRUPT_EXIT_CODE = 130
@@ -97,6 +97,12 @@ def unknown_name(source: object, problem: str, name: object, names: Iterable[str
     """
     known_names = list(names)
     return InputError(source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}")
+
+
+def check_name(source: object, problem: str, name: object, names: Collection[str], otherwise: str = "") -> None:
+    """Refuse a name that is not known; raises the error of `unknown_name`."""
+    if name not in names:
+        raise unknown_name(source, problem, name, names, otherwise)
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads.base import ScalarAds, Trim, pedals_for, trim_at
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name, unknown_name
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.study.schema import ModelTable
@@ -75,8 +75,7 @@ class Fmu:
     def _variable(self, causality: str, quantity: str, name: str, quantities: Any) -> Any:
         """The real variable of a causality that takes or holds a quantity, one of some quantities, in its SI unit."""
         key = f"ads.{causality}s.{quantity}"
-        if quantity not in quantities:
-            raise unknown_name(self.code.source, f"{key}: there is no such quantity", quantity, quantities)
+        check_name(self.code.source, f"{key}: there is no such quantity", quantity, quantities)
         variables = {one.name: one for one in self._model.modelVariables if one.causality == causality}
         if name not in variables or variables[name].type not in REAL_TYPES:
             raise unknown_name(self.code.source, f"{key} = {name!r}: no real {causality} of the FMU", name, variables)

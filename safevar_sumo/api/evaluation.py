@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import evaluations_frame
 from safevar_sumo.study import Study, StudyLike, plain_values
@@ -116,8 +116,8 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
         if isinstance(settings, pd.DataFrame):
-            for name in settings.columns.difference(names, sort=False):
-                raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
+            for name in settings.columns:
+                check_name("settings", f"column {name!r} is no characteristic", name, names)
             values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index

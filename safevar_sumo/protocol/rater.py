@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from safevar_sumo.errors import unknown_name
+from safevar_sumo.errors import check_name
 from safevar_sumo.protocol.cells import COLOURS, EXTENDED, NOT_RED, STANDARD, WARNING, CellMatrix, Protocol, protocol_of
 from safevar_sumo.records import KMH_PER_MS, BoolArray, CellResults, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import weather_of
@@ -171,11 +171,10 @@ def rater_of(study: Study, source: str) -> Rater | None:
     protocol = protocol_of(study.matrix.protocol)
     for test, claims in study.rating.claims.items():
         key = f"rating.claims.{test}"
-        if test not in protocol.tests:
-            raise unknown_name(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
+        check_name(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
         legal = [layer.name for layer in protocol.layers_of(test) if not layer.simulated_conditions]
-        for claim in (claim for claim in claims if claim not in legal):
-            raise unknown_name(source, f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
+        for claim in claims:
+            check_name(source, f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name, unknown_name
 from safevar_sumo.questions.tables import (
     HIGH as HIGH,
     LATEX_PREAMBLE,
@@ -102,8 +102,7 @@ class Answer:
         """
         if name is None:
             return next(iter(self.tables.values()), pd.DataFrame())
-        if name not in self.tables:
-            raise unknown_name("table", f"there is no table {name!r}", name, self.tables)
+        check_name("table", f"there is no table {name!r}", name, self.tables)
         return self.tables[name]
 
     def only(self, name: str) -> Answer:

@@ -17,7 +17,7 @@ from pathlib import Path
 from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from safevar_sumo.errors import InputError, unknown_name, warn
+from safevar_sumo.errors import InputError, check_name, unknown_name, warn
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
 from safevar_sumo.records import JsonObject
@@ -278,8 +278,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     asked, values, waiting = find_question(name), dict[str, Any](), iter(words)
     options = {option.flag: option for option in asked.options}
     for flag in waiting:
-        if flag not in options:
-            raise unknown_name("ask", f"{name} has no option {flag!r}", flag, options)
+        check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]
         value: Any = option.kind is bool or next(waiting, None)
         try:

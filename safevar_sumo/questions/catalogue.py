@@ -9,7 +9,7 @@ import msgspec
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.errors import unknown_name
+from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.words import number_of
@@ -71,8 +71,7 @@ def list_models(kind: str | None = None) -> Answer:
         "objectives": tabulate("Objectives; every metric can be one, too", DESCRIBED, OBJECTIVES.items()),
     }
     if kind is not None:
-        if kind not in tables:
-            raise unknown_name("kind", f"there is no {kind!r} to list", kind, tables)
+        check_name("kind", f"there is no {kind!r} to list", kind, tables)
         tables = {kind: tables[kind]}
     verdict = f"A study can name {', '.join(f'{frame.iloc[:, 0].nunique()} {name}' for name, frame in tables.items())}."
     no_study: Any = None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.vehicles import CharacteristicSet
 
 NUMBER_PATTERN = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -48,8 +48,7 @@ def read_changes(
             raise InputError(source, repr(change), forms)
         if name in values_by_name:
             raise InputError(source, f"{name} is set twice", "each characteristic once")
-        if name not in characteristics.names:
-            raise unknown_name(source, f"there is no characteristic {name!r}", name, characteristics.names)
+        check_name(source, f"there is no characteristic {name!r}", name, characteristics.names)
         characteristic = characteristics.members[characteristics.names.index(name)]
         values_by_name[name] = _parse_values(change, text, characteristic.original, forms, source)
         if single and len(values_by_name[name]) > 1:

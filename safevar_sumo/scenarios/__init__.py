@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from safevar_sumo.errors import unknown_name
+from safevar_sumo.errors import check_name
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION as LOCATION_DIMENSION,
@@ -63,9 +63,8 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
     """
     if isinstance(choice, Weather):
         return choice
-    if choice not in WEATHERS:
-        fields = ", ".join(Weather.__struct_fields__)
-        raise unknown_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+    fields = ", ".join(Weather.__struct_fields__)
+    check_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
     return WEATHERS[choice]
 
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from safevar_sumo.errors import InputError, describe_error, unknown_name
+from safevar_sumo.errors import InputError, check_name, describe_error
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.study import PYMOO, label_of
@@ -204,8 +204,7 @@ def pymoo_algorithm(name: str, source: str) -> type[PymooAlgorithm]:
     InputError
         If pymoo is not installed or has no such algorithm.
     """
-    if name not in PYMOO_ALGORITHMS:
-        raise unknown_name(source, f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
+    check_name(source, f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
     fields = list[Any]()
     for argument, default in _plain_arguments(name).items():
         kind = TYPES.get(argument, type(default))

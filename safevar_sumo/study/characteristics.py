@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError, one_of, unknown_name
+from safevar_sumo.errors import InputError, check_name, one_of
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 Description = Annotated[str, Meta(max_length=200)]
@@ -132,14 +132,12 @@ def check_variation(
 ) -> None:
     """Refuse distributions and correlations that do not fit the characteristics' domains, or each other."""
     for name, distribution in variation.items():
-        if name not in rows:
-            raise unknown_name("", f"variation.{name}: there is no such characteristic", name, rows)
+        check_name("", f"variation.{name}: there is no such characteristic", name, rows)
         _check_distribution(f"variation.{name}", rows[name], distribution)
     pairs = [frozenset(correlation.between) for correlation in correlations]
     for correlation, pair in zip(correlations, pairs, strict=True):
         for name in correlation.between:
-            if name not in rows:
-                raise unknown_name("", f"correlations.between: there is no characteristic {name!r}", name, rows)
+            check_name("", f"correlations.between: there is no characteristic {name!r}", name, rows)
         if len(pair) < len(correlation.between) or pairs.count(pair) > 1:
             problem = f"correlations.between = {list(correlation.between)}"
             raise InputError("", problem, "two characteristics, each pair once")
@@ -218,8 +216,7 @@ def check_constraints(rows: Mapping[str, Domain], constraints: Sequence[Constrai
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
         for name in constraint.sum:
-            if name not in rows:
-                raise unknown_name("", f"{key}.sum.{name}: there is no such characteristic", name, rows)
+            check_name("", f"{key}.sum.{name}: there is no such characteristic", name, rows)
         units = {rows[name].unit for name in constraint.sum}
         legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
         if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
@@ -285,8 +282,7 @@ def limits_of(
 def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], source: object = "", table: str = "") -> None:
     """Refuse limits of unknown characteristics, outside the domain, or that exclude the original."""
     for name, limit in limits.items():
-        if name not in rows:
-            raise unknown_name(source, f"{table}{name}: there is no such characteristic", name, rows)
+        check_name(source, f"{table}{name}: there is no such characteristic", name, rows)
         row, unit = rows[name], unit_text(rows[name].unit)
         for side, lower, upper in (("at_least", row.lower, row.original), ("at_most", row.original, row.upper)):
             value = getattr(limit, side)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import force_setattr
 
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.scenarios import SEARCHABLE, Point, Scenario, searchable_in
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.bodies import Track
@@ -32,9 +32,7 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
         legal = searchable_in(type(point.scenario))
         for name, domain in study.scenario.search.items():
             key = f"scenario.search.{name}"
-            if name not in legal:
-                model = type(point.scenario).__name__
-                raise unknown_name(source, f"{key}: {model} has no such parameter to search", name, legal)
+            check_name(source, f"{key}: {type(point.scenario).__name__} has no such parameter to search", name, legal)
             widest = legal[name]
             if domain.unit != widest.unit:
                 raise InputError(source, f"{key}.unit = {domain.unit!r}", repr(widest.unit))

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics.unsafe import margin_of
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
@@ -190,8 +190,8 @@ def _assemble(study: Study, source: str) -> System:
         "model_error": study.model_error,
     }
     for key, table in tables_of_metrics.items():
-        for name in (name for name in table if name not in measuring.metrics):
-            raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
+        for name in table:
+            check_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
     matrix = _matrix_points(study if rater is None else expand_protocol(study, weather), source)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
@@ -334,8 +334,7 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
         key = f"vehicle.characteristics.{name}"
         if name in RESULT_COLUMNS:
             raise InputError(source, f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
-        if name not in units:
-            raise unknown_name(source, f"{key}: {study.vehicle.model} has no such characteristic", name, units)
+        check_name(source, f"{key}: {study.vehicle.model} has no such characteristic", name, units)
         if entry.unit != units[name]:
             raise InputError(source, f"{key}.unit = {entry.unit!r}", repr(units[name]))
         if is_shipped_vehicle and entry.lower <= 0:

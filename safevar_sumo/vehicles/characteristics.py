@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.plugins import FINITE, UserCode, quoted
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, plain_values, unit_text
@@ -253,8 +253,7 @@ class CharacteristicSet:
             )
         setting = self.original.copy()
         for name, value in values.items():
-            if name not in self.names:
-                raise unknown_name(source, f"there is no characteristic {name!r}", name, self.names)
+            check_name(source, f"there is no characteristic {name!r}", name, self.names)
             column = self.names.index(name)
             self.members[column].check(value, source, beyond=beyond, switch=switch)
             setting[column] = value

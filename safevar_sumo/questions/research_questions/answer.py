@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import pandas as pd
 
-from safevar_sumo.errors import unknown_name
+from safevar_sumo.errors import check_name
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Jobs, Range, Share
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, load_cases, solutions_for_metric
@@ -53,9 +53,9 @@ def tables(
         Number of worker processes that simulate causes, by default one for each core.
     """
     cases = _cases_of(results)
-    known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
-    if algorithm and label_of(algorithm) not in known:
-        raise unknown_name("algorithm", f"the results have no {algorithm!r}", algorithm, sorted(known))
+    if algorithm:
+        known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
+        check_name("algorithm", f"the results have no {algorithm!r}", label_of(algorithm), known)
     counted = {case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs}
     answer = answer_questions(cases, Choices(label_of(algorithm), alpha, counted))
     if figures is not None:

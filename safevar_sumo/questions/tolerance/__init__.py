@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import unknown_name
+from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe, margin_of
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
@@ -171,8 +171,7 @@ def tolerance(
 def _columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:
     chosen = [name.strip() for text in characteristics for name in text.split(",")]
     for name in chosen:
-        if name not in names:
-            raise unknown_name("characteristics", f"there is no characteristic {name!r}", name, names)
+        check_name("characteristics", f"there is no characteristic {name!r}", name, names)
     return [column for column, name in enumerate(names) if not chosen or name in chosen]
 
 
@@ -181,8 +180,7 @@ def _limits_of(study: Study, texts: Sequence[str], columns: Sequence[int]) -> di
     rows = study.vehicle.characteristics
     varied = [list(rows)[column] for column in columns]
     for name in limits_of(texts, rows):
-        if name not in varied:
-            raise unknown_name("limits", f"{name} does not vary with these --characteristics", name, varied)
+        check_name("limits", f"{name} does not vary with these --characteristics", name, varied)
     return {name: limit for name, limit in limits_of(texts, rows, study.limits).items() if name in varied}
 
 
