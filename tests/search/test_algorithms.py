@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import zip_longest
+from typing import Any
 
 import moocore
 import msgspec
@@ -12,16 +15,23 @@ import pytest
 from deap import tools
 from hypothesis import given, strategies as st
 
+from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
+from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.search.baselines import _Ranges
 from safevar_sumo.search.genetic import Individual, fitness_class, run_tournament, select_survivors
+from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
+REQUIRED: dict[str, dict[str, Any]] = {
+    "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
+    "pymoo:RNSGA3": {"ref_points": [[0.5, 0.3, 6.0]], "pop_per_ref_point": 21},
+}
+"""Arguments without a default value."""
 Evaluate = Callable[[CharacteristicSet, FloatArray], Evaluations]
 
 
@@ -43,61 +53,94 @@ def sphere(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluati
     return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
 
 
-def searched(
-    name: str,
+def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
+    """The sphere, where a part of the domain cannot be simulated."""
+    good, fails = sphere(characteristics, settings), settings[:, 0] < 5600
+    outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
+    metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
+    return dataclasses.replace(good, outcome=outcome, metrics=metrics)
+
+
+def steps_of(search: Search, evaluate: Callable[[FloatArray], Evaluations]) -> Iterator[Any]:
+    """The requests of a search, then its result."""
+    answer: Any = None
+    try:
+        while True:
+            asked = search.send(answer)
+            yield asked
+            answer = evaluate(asked)
+    except StopIteration as end:
+        yield end.value
+
+
+def begun(
+    algorithm: Algorithm,
     seed: int,
     evaluations: int,
-    characteristics: CharacteristicSet = SUN,
     evaluate: Evaluate = sphere,
-    algorithm: Algorithm | None = None,
-) -> tuple[Evaluations, list[FloatArray]]:
-    """Run an algorithm to its end; returns its result and all populations that it requested."""
+    scoring: Scoring = PUBLISHED_SCORING,
+    characteristics: CharacteristicSet = SUN,
+) -> Iterator[Any]:
     original = sphere(characteristics, characteristics.original[np.newaxis])
     problem = Problem(
-        characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION
+        characteristics=characteristics,
+        original=original,
+        evaluations=evaluations,
+        population=POPULATION,
+        scoring=scoring,
     )
-    search = (algorithm or ALGORITHMS[name]()).search(problem, np.random.default_rng(seed))
-    populations = [next(search)]
-    while True:
-        try:
-            populations.append(search.send(evaluate(characteristics, populations[-1])))
-        except StopIteration as end:
-            return end.value, populations
+    return steps_of(algorithm.search(problem, np.random.default_rng(seed)), partial(evaluate, characteristics))
 
 
-@pytest.fixture(params=sorted(ALGORITHMS))
-def name(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+def built(name: str, **arguments: Any) -> Algorithm:
+    """An algorithm of ours or of pymoo."""
+    kind: Any = ALGORITHMS.get(name) or pymoo_algorithm(name, "study")
+    return msgspec.convert(REQUIRED.get(name, {}) | arguments, kind)  # type: ignore[no-any-return]
 
 
+def searched(name: str, seed: int, evaluations: int, **changes: Any) -> tuple[Evaluations, list[FloatArray]]:
+    """Run an algorithm to its end; returns its result and all populations that it requested."""
+    *asked, result = begun(ALGORITHMS[name](), seed, evaluations, **changes)
+    return result, asked
+
+
+@pytest.mark.parametrize("name", [*ALGORITHMS, "pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"])
 @pytest.mark.parametrize("evaluations", [1, 7, POPULATION, 3 * POPULATION + 1, 500])
 def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> None:
-    assert sum(len(settings) for settings in searched(name, 1, evaluations)[1]) == evaluations
+    *asked, result = begun(built(name), 1, evaluations)
+    assert sum(map(len, asked)) == evaluations
+    assert len(result)
 
 
-def test_yielded_settings_and_results_are_filtered_and_in_the_domains(name: str) -> None:
-    solutions, asked = searched(name, 2, 400)
-    for settings in (*asked, solutions.settings):
-        assert np.all((settings >= SUN.lower) & (settings <= SUN.upper))
-        assert np.array_equal(SUN.filter(settings), settings)
-
-
-def test_a_run_is_the_same_for_the_same_seed_and_another_for_another(name: str) -> None:
-    first, again, other = (searched(name, seed, 300)[0].settings for seed in (3, 3, 4))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
-def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
-    def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
-        good, fails = sphere(characteristics, settings), settings[:, 0] < 5800
-        outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
-        metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
-        return dataclasses.replace(good, outcome=outcome, metrics=metrics)
-
-    solutions = searched(name, 1, 400, evaluate=failing)[0]
-    assert len(solutions) > 0
-    assert solutions.valid.all()
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if "AGEMOEA" in name else ())  # compiled by numba at their first call
+        for name in (*ALGORITHMS, *PYMOO_ALGORITHMS)
+    ],
+)
+def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(name: str) -> None:
+    """Two runs that take turns, while others draw from numpy's global state."""
+    alone = [list(begun(built(name), seed, 130, failing)) for seed in (1, 2)]
+    np.random.seed(5)
+    in_turn = []
+    for pair in zip_longest(*(begun(built(name), seed, 130, failing) for seed in (1, 2))):
+        in_turn.append(pair)
+        state = np.random.random()
+    np.random.seed(5)
+    assert state == np.random.random(len(in_turn))[-1], "the caller's random state"
+    for steps, (*asked, result) in zip(zip(*in_turn, strict=True), alone, strict=True):
+        *asked_in_turn, result_in_turn = (step for step in steps if step is not None)
+        assert all(map(np.array_equal, asked_in_turn, asked))
+        assert np.array_equal(result_in_turn.settings, result.settings)
+        every = np.concatenate(asked)
+        assert 0 < len(every) <= 130
+        assert np.all((every >= SUN.lower) & (every <= SUN.upper))
+        assert np.array_equal(SUN.filter(every), every)
+        assert len(result)
+        assert {row.tobytes() for row in result.settings} <= {row.tobytes() for row in every}
+        assert result.valid.all()
+    assert not np.array_equal(*in_turn[0]) or name == "pymoo:DIRECT", "another seed"
 
 
 @pytest.mark.parametrize("name", ["nsga2", "rs"])
@@ -121,7 +164,7 @@ def test_safe_fuzzer_ends_after_five_generations_without_improvement() -> None:
     def constant(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
         return evaluated(characteristics, np.full_like(settings, 6.0), np.ones(len(settings)))
 
-    _, asked = searched("safe_fuzzer", 4, 5000, single, constant)
+    _, asked = searched("safe_fuzzer", 4, 5000, characteristics=single, evaluate=constant)
     assert sum(len(settings) for settings in asked) == 500 + 5 * 50
 
 
@@ -201,6 +244,5 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
 
 @pytest.mark.parametrize("options", [{"tournament_size": 3}, {"mutation_probability": 1.0}])
 def test_options_change_what_a_search_asks_for(options: dict[str, object]) -> None:
-    algorithm = msgspec.convert(options, ALGORITHMS["nsga2"])
-    _, asked = searched("nsga2", 1, 200, algorithm=algorithm)
-    assert not np.array_equal(asked[-1], searched("nsga2", 1, 200)[1][-1])
+    asked, usual = (list(begun(built("nsga2", **one), 1, 200)) for one in (options, {}))
+    assert not np.array_equal(asked[-2], usual[-2])

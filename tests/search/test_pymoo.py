@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import inspect
-import pkgutil
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,125 +13,16 @@ import pytest
 
 from safevar_sumo.campaign.runs import algorithm_of
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.metrics import PUBLISHED_SCORING
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import load_runs, read_manifest
 from safevar_sumo.results.manifest import write_manifest
-from safevar_sumo.search import Algorithm, Problem
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study
+from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import FormulaPool, carried_out, solutions
-from tests.search.test_algorithms import SUN, sphere
+from tests.search.test_algorithms import POPULATION, begun, built, sphere
 from tests.search.test_standard_problems import PROBLEMS, result_of, standard_problem
-
-REQUIRED: dict[str, dict[str, Any]] = {
-    "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
-    "pymoo:RNSGA3": {"ref_points": [[0.5, 0.3, 6.0]], "pop_per_ref_point": 21},
-}
-NOT_OFFERED = {
-    "DNSGA2": "problems that change over time",
-    "KGB": "problems that change over time",
-    "PINSGA2": "asks a person",
-    "BGA": "bits",
-    "RandomSearch": "rs",
-    "Optuna": "another library",
-}
-POPULATION = 20
-
-
-def built(name: str, **arguments: Any) -> Algorithm:
-    algorithm: Algorithm = msgspec.convert(REQUIRED.get(name, {}) | arguments, pymoo_algorithm(name, "study"))
-    return algorithm
-
-
-def failing(settings: FloatArray) -> Evaluations:
-    """The sphere, where a part of the domain cannot be simulated."""
-    good, fails = sphere(SUN, settings), settings[:, 0] < 5600
-    outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
-    metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
-    return dataclasses.replace(good, outcome=outcome, metrics=metrics)
-
-
-def begun(
-    algorithm: Algorithm,
-    seed: int,
-    evaluations: int = 130,
-    formula: Callable[[FloatArray], Evaluations] = failing,
-    scoring: Scoring = PUBLISHED_SCORING,
-) -> Iterator[Any]:
-    """A run; yields each request, then the result."""
-    original = sphere(SUN, SUN.original[np.newaxis])
-    problem = Problem(
-        characteristics=SUN, original=original, evaluations=evaluations, population=POPULATION, scoring=scoring
-    )
-    search, answer = algorithm.search(problem, np.random.default_rng(seed)), None
-    try:
-        while True:
-            asked = search.send(answer)  # type: ignore[arg-type]
-            yield asked
-            answer = formula(asked)
-    except StopIteration as end:
-        yield end.value
-
-
-SLOW = ("pymoo:AGEMOEA", "pymoo:AGEMOEA2")
-"""Compiled by numba at their first call."""
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in sorted(PYMOO_ALGORITHMS)]
-)
-def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(name: str) -> None:
-    """Two runs that take turns, while others draw from numpy's global state."""
-    alone = [list(begun(built(name), seed)) for seed in (1, 2)]
-    np.random.seed(5)
-    in_turn: list[list[Any]] = [[], []]
-    runs = [begun(built(name), seed) for seed in (1, 2)]
-    while any([extend(steps, run) for steps, run in zip(in_turn, runs, strict=True)]):
-        state = np.random.random()
-    np.random.seed(5)
-    assert state == [np.random.random() for _ in range(max(map(len, in_turn)))][-1], "the caller's random state"
-    for steps, expected in zip(in_turn, alone, strict=True):
-        *asked, result = steps
-        assert all(map(np.array_equal, asked, expected[:-1]))
-        assert np.array_equal(result.settings, expected[-1].settings)
-        every = np.concatenate(asked)
-        assert 0 < len(every) <= 130
-        assert np.all((every >= SUN.lower) & (every <= SUN.upper))
-        assert np.array_equal(SUN.filter(every), every)
-        assert len(result)
-        assert {row.tobytes() for row in result.settings} <= {row.tobytes() for row in every}
-        assert result.valid.all()
-    assert not np.array_equal(in_turn[0][0], in_turn[1][0]) or name == "pymoo:DIRECT", "another seed"
-
-
-def extend(steps: list[Any], run: Iterator[Any]) -> bool:
-    """Take a step of a run; returns whether it had one."""
-    step = next(run, None)
-    steps += [] if step is None else [step]
-    return step is not None
-
-
-@pytest.mark.parametrize("name", ["pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"])
-@pytest.mark.parametrize("evaluations", [1, 7, POPULATION, 3 * POPULATION + 1])
-def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> None:
-    *asked, result = begun(built(name), 1, evaluations)
-    assert sum(map(len, asked)) == evaluations
-    assert len(result)
-
-
-def test_every_algorithm_of_pymoo_for_real_numbers_has_a_name() -> None:
-    from pymoo.core.algorithm import Algorithm as PymooAlgorithm
-
-    names = set[str]()
-    for folder in ("moo", "soo.nonconvex"):
-        package = importlib.import_module(f"pymoo.algorithms.{folder}")
-        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith(".optuna"):
-                members = vars(importlib.import_module(module.name)).values()
-                classes = [one for one in members if inspect.isclass(one) and one.__module__ == module.name]
-                names |= {one.__name__ for one in classes if issubclass(one, PymooAlgorithm)}
-    assert {f"pymoo:{name}" for name in names - set(NOT_OFFERED)} == set(PYMOO_ALGORITHMS)
 
 
 def test_arguments_reach_the_algorithm() -> None:
@@ -149,22 +36,16 @@ def test_arguments_reach_the_algorithm() -> None:
     assert [len(asked) for asked in begun(built("pymoo:GA", pop_size=9), 1, 60)][:3] == [9] * 3
 
 
-@pytest.mark.parametrize("name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA"])
-def test_an_algorithm_for_one_objective_minimises_the_first_alone(name: str) -> None:
-    """The sphere's minimum over the domains, 0, is at their lower ends, where many characteristics are changed."""
-    *_, result = begun(built(name), 1, 3000, formula=lambda settings: sphere(SUN, settings))
-    assert len(result) == 1
-    assert result.f_safe[0] < 0.05 < sphere(SUN, SUN.original[np.newaxis]).f_safe[0]
-
-
 @pytest.mark.parametrize(
     "name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA", "pymoo:NSGA2", pytest.param("pymoo:MOEAD", marks=pytest.mark.slow)]
 )
 def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str) -> None:
-    """The original vehicle is safe in the upper half of the first domain: there the sphere is 1/4 or more."""
+    """The original vehicle is safe in the upper half of the first domain: there the sphere, which an algorithm for one
+    objective minimises alone, is 1/4 or more.
+    """
 
-    def formula(settings: FloatArray) -> Evaluations:
-        evaluations, share = sphere(SUN, settings), (settings[:, 0] - SUN.lower[0]) / (SUN.upper[0] - SUN.lower[0])
+    def formula(sun: CharacteristicSet, settings: FloatArray) -> Evaluations:
+        evaluations, share = sphere(sun, settings), (settings[:, 0] - sun.lower[0]) / (sun.upper[0] - sun.lower[0])
         return dataclasses.replace(evaluations, metrics={**evaluations.metrics, ORIGINAL_DEGREE: share})
 
     scoring = msgspec.structs.replace(PUBLISHED_SCORING, safe_original=0.5)
@@ -233,7 +114,7 @@ def test_a_mistake_in_a_study_names_key_and_nearest_name(algorithm: str, table: 
 )
 def test_what_pymoo_refuses_is_an_error_of_the_user(name: str, arguments: dict[str, Any], error: str) -> None:
     with pytest.raises(InputError, match=error):
-        next(begun(built(name, **arguments), 1))
+        next(begun(built(name, **arguments), 1, 130))
 
 
 def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

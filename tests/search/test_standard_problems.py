@@ -20,7 +20,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search import ALGORITHMS, Problem, Search
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-from tests.search.test_algorithms import evaluated
+from tests.search.test_algorithms import evaluated, steps_of
 
 EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 
@@ -100,12 +100,8 @@ def standard_problem(
 
 
 def result_of(search: Search, problem: Problem) -> Evaluations:
-    asked = next(search)
-    while True:
-        try:
-            asked = search.send(evaluated(problem.characteristics, asked, np.zeros(len(asked))))
-        except StopIteration as end:
-            return end.value  # type: ignore[no-any-return]
+    *_, result = steps_of(search, lambda asked: evaluated(problem.characteristics, asked, np.zeros(len(asked))))
+    return result  # type: ignore[no-any-return]
 
 
 def front_of_ours(standard: StandardProblem, seed: int) -> FloatArray:
