@@ -31,8 +31,7 @@ from safevar_sumo.questions.explain.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.results import handles_of
-from safevar_sumo.sumo import assemble, evaluate
+from safevar_sumo.results import handles_of, solutions_frame
 from tests.conftest import FITS
 from tests.in_process import InlinePool
 from tests.questions.conftest import (
@@ -45,17 +44,6 @@ from tests.questions.conftest import (
     nowhere,
     two_islands,
 )
-
-
-@pytest.mark.slow
-def test_the_eight_digits_of_a_command_end_alike(case: Case, explained: Answer) -> None:
-    short = [
-        {name: float(f"{value:.8g}") for name, value in boundary.items()}
-        for boundary in explained.tables["causes"]["boundary"]
-    ]
-    rows = np.array([case.characteristics.setting(values, "test") for values in short])
-    assert (case.characteristics.filter(rows) == rows).all(), "a value that the filter takes for no change"
-    assert evaluate(assemble(case.study), rows).collided.all()
 
 
 @pytest.mark.slow
@@ -150,17 +138,11 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
 def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once() -> None:
     """`a` above 9 or `b` below 2 collides; the failures with the fewest changes come first, equal ones count once."""
     evaluator = made_up_evaluator(3, lambda settings: (settings[:, 0] > 9) | (settings[:, 1] < 2))
-    names = list(evaluator.characteristics.names)
-    settings = [(9.5, 5.0, 5.0), (9.5, 5.0, 5.0), (9.9, 1.0, 5.0), (9.6, 5.0, 9.0), (8.0, 4.0, 9.0)]
-    rows = [
-        {**dict(zip(names, setting, strict=True)), "algorithm": name, "run": run, "f_diff": 0.0}
-        | {"f_num_diff": sum(value != 5.0 for value in setting), "f_safe": 1.0, "safety_degree": 1.0}
-        | {"outcome": "collision" if setting[0] > 9 or setting[1] < 2 else "stopped"}
-        for name, run, numbers in (("rs", 0, range(5)), ("nsga2", 1, (4,)))
-        for setting in (settings[i] for i in numbers)
-    ]
+    settings = np.array([(9.5, 5.0, 5.0), (9.5, 5.0, 5.0), (9.9, 1.0, 5.0), (9.6, 5.0, 9.0), (8.0, 4.0, 9.0)])
+    found = evaluator.evaluate(settings, "solutions")
+    frame = solutions_frame(evaluator.characteristics.names, [(("rs", 0), found), (("nsga2", 1), found.take([4]))])
     finished = [("rs", 0), ("nsga2", 1), ("nsga2", 0)]
-    case = build_case(evaluator.study, {"safety_degree": 2.0}, pd.DataFrame(rows), pd.DataFrame(rows), finished, True)
+    case = build_case(evaluator.study, {"safety_degree": 2.0}, frame, frame, finished)
     counts = [causes_of_runs(case, evaluator, limit).to_numpy().tolist() for limit in (1, 9)]
     assert counts[0] == [["rs", 0, 3, 1, 1], ["nsga2", 1, 0, 0, 0], ["nsga2", 0, 0, 0, 0]]
     assert counts[1][0] == ["rs", 0, 3, 3, 2], "a up, b down"

@@ -210,11 +210,6 @@ def test_limits_that_a_region_breaks_are_not_kept_and_are_counted() -> None:
     assert box.at_most > box.unsafe / box.samples
 
 
-def test_the_box_with_limits_holds_no_known_solution() -> None:
-    box = box_of(3, nowhere, {"a": Limit(at_most=8)}, known=[[7.0, 8.0, 9.0]])
-    assert any(high < value for (_, high), value in zip(box.box.values(), (7.0, 8.0, 9.0), strict=True))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("limit", "code"), [("5", 0), ("4.6", 3)])
 def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:

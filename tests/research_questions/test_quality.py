@@ -40,7 +40,7 @@ from safevar_sumo.questions.research_questions.statistics import (
     survival_median,
 )
 from safevar_sumo.study import CharacteristicTable
-from tests.research_questions.test_questions import made_up, made_up_study, row, three_algorithms
+from tests.research_questions.test_questions import made_up, made_up_study, row
 
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:
@@ -103,10 +103,9 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[fl
     assert back.p_value == pytest.approx(there.p_value)
 
 
-@pytest.mark.parametrize("size", [2, 3, 5, 8])
-def test_exact_p_of_separated_samples_is_two_orders_of_all(size: int) -> None:
-    result = compare_samples(np.arange(size), 100 + np.arange(size))
-    assert result.p_value == pytest.approx(2 / math.comb(2 * size, size))
+def test_exact_p_of_separated_samples_is_two_orders_of_all() -> None:
+    result = compare_samples(np.arange(8), 100 + np.arange(8))
+    assert result.p_value == pytest.approx(2 / math.comb(16, 8))
     assert (result.effect_size, result.magnitude, result.method) == (0, "large", EXACT_TEST)
 
 
@@ -126,19 +125,14 @@ def test_signed_ranks_of_a_sample_without_a_difference_and_with_ties() -> None:
 @pytest.mark.parametrize(
     ("effect", "name"),
     [
-        (0.5, "negligible"),
-        (0.444, "small"),
         (0.4441, "negligible"),
+        (0.444, "small"),
         (0.5559, "negligible"),
         (0.556, "small"),
         (0.6379, "small"),
         (0.638, "medium"),
-        (0.7139, "medium"),
-        (0.714, "large"),
-        (0.362, "medium"),
         (0.286, "large"),
         (0.2861, "medium"),
-        (0, "large"),
         (1 - 0.714, "large"),
     ],
 )
@@ -157,21 +151,6 @@ def test_the_interval_against_one_value_is_wilsons_of_a_share(count: int) -> Non
     assert effect_interval(count / 10, 10, None, 0.05) == pytest.approx(tuple(expected), abs=1e-9)
 
 
-@pytest.mark.parametrize(("shift", "draw"), [(1.0, "normal"), (2.0, "normal"), (0.5, "exponential")])
-def test_the_interval_of_an_effect_covers_it(shift: float, draw: str) -> None:
-    """X is shifted by `shift`, so that P(X > Y) is Phi(shift / sqrt 2) of normal values, 1 - exp(-shift) / 2 of
-    exponential ones.
-    """
-    rng, repeats = np.random.default_rng(1), 1000
-    effect = scipy.stats.norm.cdf(shift / math.sqrt(2)) if draw == "normal" else 1 - math.exp(-shift) / 2
-    covered = 0
-    for _ in range(repeats):
-        x, y = getattr(rng, draw)(size=10) + shift, getattr(rng, draw)(size=15)
-        low, high = effect_interval((x[:, np.newaxis] > y).mean(), 10, 15, 0.05)
-        covered += low <= effect <= high
-    assert 0.93 < covered / repeats < 0.98
-
-
 def test_the_interval_of_samples_apart_has_a_width() -> None:
     low, high = effect_interval(1.0, 10, 10, 0.05)
     q1, q2 = low / (2 - low), 2 * low**2 / (1 + low)  # Hanley and McNeil's (1982), for exponential values
@@ -182,19 +161,12 @@ def test_the_interval_of_samples_apart_has_a_width() -> None:
 
 
 @pytest.mark.parametrize(("size", "alpha", "rank"), [(10, 0.05, 2), (30, 0.05, 10), (8, 0.01, 1), (12, 0.01, 2)])
-def test_the_interval_of_a_median_lies_between_the_order_statistics_of_the_sign_test(
+def test_the_interval_of_a_median_lies_between_the_order_statistics_of_tables_of_the_sign_test(
     size: int, alpha: float, rank: int
 ) -> None:
-    """The ranks of tables of the sign test; the next ones would leave too much outside."""
-    low, high = median_interval(np.random.default_rng(1).permutation(size) + 1, alpha)
-    assert (low, high) == (rank, size + 1 - rank)
-    outside = [2 * sum(math.comb(size, i) for i in range(number)) / 2**size for number in (rank, rank + 1)]
-    assert outside[0] <= alpha < outside[1]
-
-
-def test_too_few_values_have_no_interval_of_the_median() -> None:
-    assert np.isnan(median_interval(range(7), 0.01)).all()
-    assert np.isnan(median_interval([], 0.01)).all()
+    values = np.random.default_rng(1).permutation(size) + 1
+    assert median_interval(values, alpha) == (rank, size + 1 - rank)
+    assert np.isnan([median_interval(values[:7], 0.01), median_interval([], 0.01)]).all(), "too few values"
 
 
 PLACEBO = [1, 1, 2, 2, 3, 4, 4, 5, 5, 8, 8, 8, 8, 11, 11, 12, 12, 15, 17, 22, 23]
@@ -212,11 +184,8 @@ def test_survival_of_the_textbook_example() -> None:
     assert math.isnan(high)
     p_value = log_rank_test((PLACEBO, all_relapsed), (TREATED, RELAPSED))
     assert scipy.stats.chi2.isf(p_value, 1) == pytest.approx(16.79, abs=0.005)
-
-
-def test_without_an_event_there_is_no_median_and_no_test() -> None:
-    none = ([100, 100], [False, False])
-    assert np.isnan([survival_median(*none)[0], log_rank_test(none, none)]).all()
+    nobody = ([100, 100], [False, False])
+    assert np.isnan([survival_median(*nobody)[0], log_rank_test(nobody, nobody)]).all(), "no event, no median, no test"
 
 
 def rich_case(**changes: Any) -> Case:
@@ -332,6 +301,8 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     )
     answer = answer_questions([case])
     few = "too few runs of NSGA-II, RS for a test (8 are needed)"
+    over_runs = answer.only("rq1-runs").tables["remarks"]["remark"]
+    assert "too few runs for 8 of 8 tests of RQ1 (8 are needed)" in "".join(over_runs)
     for name, stands_out in (("rq1", False), ("rq2", True)):
         table, remarks = answer.only(name).tables.values()
         assert (table["p_value"] < 0.001).any()
@@ -339,14 +310,6 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
         assert (few in "".join(remarks["remark"])) is not stands_out
     imported = answer_questions([dataclasses.replace(case, has_runs=False)])
     assert imported.tables["rq1"]["significant"].any(), "the runs of imported solutions are unknown"
-
-
-def test_every_rendering_has_every_effect() -> None:
-    answer = answer_questions([three_algorithms()])
-    effects = [effect for frame in answer.tables.values() for effect in frame.get("effect_size", ())]
-    for form in ("text", "latex", "html"):
-        output = answer.render(form)
-        assert all(f"{effect:.3f}" in output for effect in effects)
 
 
 def test_readers_see_a_long_table_crosswise_and_every_table_within_80_columns() -> None:

@@ -11,10 +11,8 @@ import safevar_sumo as sv
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.replay.simulate import simulate
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.verification import verify_in_sumo
 
 
 def stops(weather: Any, *speeds: float, **tables: Any) -> System:
@@ -40,23 +38,6 @@ def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(brake_response: 
     mu = system.vehicle.tyre_friction * friction  # type: ignore[attr-defined]
     expected = (speeds / KMH_PER_MS) ** 2 / (2 * mu * GRAVITY)
     assert distances(system, brakeResponse=brake_response) == pytest.approx(expected, abs=0.01)
-
-
-@pytest.mark.parametrize("name", ["sun", "lgsvl", "native", "wear"])
-def test_sumo_repeats_the_stop_of_every_vehicle(name: str) -> None:
-    scenario = {"model": "stop", "parameters": {"speed": 50}}
-    study = {"extends": name, "name": "some", "scenario": scenario}
-    system = stops("wet", 50) if name == "wear" else assemble(load_study(study))
-    rng, domains = np.random.default_rng(1), system.characteristics
-    drawn = rng.uniform(domains.lower, domains.upper, (4, len(domains.names)))
-    settings = np.concatenate([domains.original[np.newaxis], drawn])
-    assert verify_in_sumo(system, settings) == ""
-    recorded, in_sumo = (
-        evaluate(system, settings, engine).metrics["stopping_distance"] for engine in (Engine.RECORDED, Engine.LIBSUMO)
-    )
-    np.testing.assert_array_equal(recorded, in_sumo)
-    np.testing.assert_array_equal(recorded[[2]], evaluate(system, settings[[2]]).metrics["stopping_distance"])
-    assert ((recorded > 9) & (recorded < 60)).all()
 
 
 def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> None:

@@ -208,6 +208,14 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
     assert places == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
 
 
+def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> None:
+    worst_feasible, best, slightly, badly = individuals((9, 9, 9), (0, 1, 0), (-9, 0, 0), (-99, 0, 0))
+    slightly.violation, badly.violation = 0.1, 5.0
+    assert select_survivors([badly, slightly, worst_feasible, best], 4) == [best, worst_feasible, slightly, badly]
+    assert select_survivors([badly, slightly], 1) == [slightly]
+    assert 0 < slightly.standing[0] < badly.standing[0], "no solution of a run"
+
+
 def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
     better, worse = individuals((0, 0, 0), (1, 1, 1))
     for one, rank, room in ((better, 0, 0.1), (worse, 1, 9.0)):

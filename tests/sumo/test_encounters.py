@@ -18,7 +18,6 @@ from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios.euro_ncap import KMH
-from safevar_sumo.search.genetic import Individual, fitness_class, select_survivors
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
@@ -192,20 +191,6 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
     assert (results.solutions["original_safety_degree"] >= MARGIN).all()
     assert set(results.solutions["algorithm"]) == {"nsga2", "rs", "safe_fuzzer"}
     assert (results.solutions["outcome"] == "collision").any()
-
-
-def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> None:
-    def individual(objectives: tuple[float, ...], violation: float) -> Individual:
-        one = Individual([0.0])
-        one.fitness, one.violation = fitness_class(2)(objectives), violation
-        return one
-
-    worst_feasible, best = individual((9.0, 9.0), 0.0), individual((0.0, 1.0), 0.0)
-    slightly, badly = individual((-9.0, 0.0), 0.1), individual((-99.0, 0.0), 5.0)
-    assert select_survivors([badly, slightly, worst_feasible, best], 4) == [best, worst_feasible, slightly, badly]
-    assert select_survivors([badly, slightly], 1) == [slightly]
-    assert slightly.standing < badly.standing
-    assert slightly.standing[0] > 0, "no solution of a run"
 
 
 @pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=pytest.mark.slow)])
