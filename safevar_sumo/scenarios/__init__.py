@@ -46,11 +46,13 @@ SEARCHABLE = msgspec.convert(
 
 
 def searchable_in(scenario: type) -> Mapping[str, FreeParameter]:
-    """Parameters of a scenario and its weather that a study may search; none of a user's scenario, or without an
-    encounter.
+    """Parameters of a scenario and its weather that a study may search: of a user's scenario those of its weather, and
+    none without an encounter.
     """
+    if scenario is Stop:
+        return {}
     name = next((name for name, shipped in SCENARIOS.items() if scenario is shipped), "")
-    return {**SEARCHABLE[name], **SEARCHABLE["weather"]} if name in SEARCHABLE else {}
+    return {**SEARCHABLE.get(name, {}), **SEARCHABLE["weather"]}
 
 
 def weather_of(choice: str | Weather, source: object) -> Weather:

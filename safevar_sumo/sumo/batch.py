@@ -107,14 +107,14 @@ def drive_all(
             with open_points_world(system, settings) as sumo_world:
                 return drive(fleet, vehicles, sumo_world, listen=listen)
         scenes = [scene for scene in system.scenes.of(points) if isinstance(scene, Recording)]
-        if fleet is not system:
+        if fleet.points[0].scenario is not points[0].scenario:  # each encounter has a scene of its own
             size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])
             scenario = system.at_encounters(settings[::size])[0].scenario
             world = RecordedWorld([scenes_of_encounters(scenes[0], scenario, n // size)], size)
             return drive(fleet, vehicles, world, listen=listen)
         targets = [point.scenario for point in points if isinstance(point.scenario, TargetTest)]
         observer = TargetObserver(targets, scenes, n) if targets else None
-        return drive(system, np.tile(settings, (len(points), 1)), RecordedWorld(scenes, n), observer, listen)
+        return drive(fleet, np.tile(vehicles, (len(points), 1)), RecordedWorld(scenes, n), observer, listen)
 
 
 def _vehicles_per_encounter(encounters: FloatArray) -> int:

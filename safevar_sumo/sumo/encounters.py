@@ -49,11 +49,13 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
 
 
 def encounter(point: Point, values: Mapping[str, Any]) -> Point:
-    """A point at other values of parameters, numbers, or arrays for N vehicles."""
-    scenario: Any = copy.copy(point.scenario)
-    weather = copy.copy(point.weather)
+    """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the same object if only
+    the weather varies.
+    """
+    of_weather, weather = SEARCHABLE["weather"].keys(), copy.copy(point.weather)
+    scenario: Any = point.scenario if values.keys() <= of_weather else copy.copy(point.scenario)
     for name, value in values.items():
-        force_setattr(weather if name in SEARCHABLE["weather"] else scenario, name, value)
+        force_setattr(weather if name in of_weather else scenario, name, value)
     return point._replace(scenario=scenario, weather=weather)
 
 

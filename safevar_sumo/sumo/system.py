@@ -227,11 +227,12 @@ def _assemble(study: Study, source: str) -> System:
 
 def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scenario: Scenario) -> Measuring:
     """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
-    (scene,) = scenes.of([Point(scenario, weather_of("clear", study.source))])
-    if isinstance(scene, str):
-        raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
-    contact = scene.length if scenario.centre_to_centre else 0.0
-    limit = contact + margin_of(study, None)
+    limit = margin_of(study, None)
+    if scenario.centre_to_centre:
+        (scene,) = scenes.of([Point(scenario, weather_of("clear", study.source))])
+        if isinstance(scene, str):
+            raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
+        limit += scene.length
     return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
 
 

@@ -9,10 +9,18 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.scenarios import PedestrianCrossing
 from safevar_sumo.vehicles import SumoType, Vehicle
 
 BRAKING, PULL, GAP = 10.0, 3.0, 20.0
 """Deceleration of the new vehicle on a dry road and its acceleration [m/s^2]; gap at which the driver brakes [m]."""
+
+
+class Slope(PedestrianCrossing, frozen=True, kw_only=True):
+    """A user's scenario in which others may react."""
+
+    grade: float = -2.0
+    reactive_actors = True
 
 
 class Prepared(NamedTuple):

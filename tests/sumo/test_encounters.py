@@ -74,6 +74,8 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         {"model": "car_to_car"},
         {"speed": SPEED, "headway": domain(3, 5, "s"), "impact_location": PLACE},
     ),
+    "weather": ("wear", {"model": "crossing", "parameters": {"test": "CPFA"}}, {}),
+    "mine": ("sun", {"model": "tests.sumo.planted:Slope"}, {}),
     "brakes": (
         "wear",
         {"model": "car_to_car", "parameters": {"test": "CCRb"}},
