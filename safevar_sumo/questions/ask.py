@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, update_wrapper
-from importlib import import_module
+from importlib import import_module, invalidate_caches
 from numbers import Integral, Real
 from pathlib import Path
 from shlex import quote, split
@@ -236,6 +236,7 @@ def find_question(name: str) -> Question:
         If there is no such question.
     """
     module, _, function = name.partition(":") if ":" in name else (QUESTIONS.get(name, name), "", name)
+    invalidate_caches()  # the module may have been written a moment ago
     try:
         with user_errors(name):
             imported = import_module(module)
