@@ -137,10 +137,16 @@ def _output_options() -> list[click.Option]:
 
 
 def _print(answer: Answer, form: str, table: str | None) -> None:
+    """Print an answer or one of its tables; the whole answer if it lacks the table, which may have taken long."""
+    try:
+        shown = answer.only(table) if table else answer
+    except InputError:
+        _print(answer, "json" if form == "csv" else form, None)
+        raise
     if form == "text":
-        (answer.only(table) if table else answer).print(Console())
+        shown.print(Console())
     else:
-        click.echo(answer.render(form, table), nl=False)
+        click.echo(shown.render(form), nl=False)
 
 
 def _parse(text: str) -> tuple[str, str, float]:
