@@ -106,7 +106,7 @@ class Simulation:
     no_verdict
         Why simulations of the study tell nothing about its ADS, in a sentence; empty if they do.
     original
-        The simulation of the original vehicle in the same study; for the original vehicle, the simulation itself.
+        The simulation of the original vehicle in the same encounter; for the original vehicle, the simulation itself.
     """
 
     study: Study
@@ -278,8 +278,9 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
     no_verdict = why_no_verdict(system)
-    original = _simulate_one(study, system, characteristics.original, no_verdict)
-    is_changed = not np.array_equal(setting, characteristics.original)
+    beside = characteristics.with_original_vehicle(setting)
+    original = _simulate_one(study, system, beside, no_verdict)
+    is_changed = not np.array_equal(setting, beside)
     simulation = _simulate_one(study, system, setting, no_verdict) if is_changed else original
     values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
     return replace(

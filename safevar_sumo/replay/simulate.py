@@ -193,7 +193,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         verdict.append(points_in_words(failing, len(points)))
     if with_spread:
         remarks += remarks_on_sets(study)
-        bands = compute_model_spreads(study, np.stack([setting, system.characteristics.original]))
+        bands = compute_model_spreads(study, np.stack([setting, system.characteristics.with_original_vehicle(setting)]))
         rows = [(name, *band) for name, band in zip(("simulated", "original"), bands, strict=True)]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     tables["remarks"] = _remark_table(remarks)

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import simulate
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
@@ -127,6 +128,8 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
         alone = evaluate(system, settings[[row]])
         for name, values in together.results.items():
             np.testing.assert_array_equal(alone.results[name], values[[row]])
+    beside = simulate("sun_joint", dict(zip(system.characteristics.names, settings[0].tolist(), strict=True)))
+    assert beside.original.evaluation.f_safe == pytest.approx(together.metrics["original_safety_degree"][:1])
     in_sumo = evaluate(system, settings, Engine.LIBSUMO)
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
     np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
