@@ -16,7 +16,7 @@ from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.ask import Jobs, Range
 from safevar_sumo.questions.case import UnanswerableError
 from safevar_sumo.questions.research_questions.answer import answer_questions
@@ -31,16 +31,16 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import System
 
-ALGORITHMS = {
-    "algorithm": Column("", "algorithm"),
-    "finished": Column("", "finished runs"),
-    "runs": Column("", "runs"),
-    "simulated": Column("", "different settings simulated so far"),
-    "collisions": Column("", "those that collide"),
-    "invalid_tests": Column("", "those that leave a test's speed before the ADS acts: neither failure nor success"),
-    "simulator_errors": Column("", "those that cannot be simulated"),
+ALGORITHMS: Columns = {
+    "algorithm": "algorithm",
+    "finished": "finished runs",
+    "runs": "runs",
+    "simulated": "different settings simulated so far",
+    "collisions": "those that collide",
+    "invalid_tests": "those that leave a test's speed before the ADS acts: neither failure nor success",
+    "simulator_errors": "those that cannot be simulated",
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
-    "solutions": Column("", "solutions of finished runs"),
+    "solutions": "solutions of finished runs",
 }
 
 

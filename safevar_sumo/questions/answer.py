@@ -17,6 +17,7 @@ from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     LOW as LOW,
     Column as Column,
+    Columns as Columns,
     Wide as Wide,
     columns_of,
     csv_cell,

@@ -11,21 +11,21 @@ import pandas as pd
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear, searchable_in
 from safevar_sumo.search import DESCRIPTIONS
 from safevar_sumo.study import load_study, study_names, unit_text
 from safevar_sumo.vehicles import CHANGES, CharacteristicSet
 
-NAME = {"name": Column("", "name in a study")}
-DESCRIBED = NAME | {"description": Column("", "what it is")}
-SCENARIO = DESCRIBED | {"search": Column("", "what [scenario.search] may vary, and its widest domain")}
-STUDIES = NAME | {key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")}
-VEHICLES = {
-    "vehicle": Column("", "vehicle"),
-    "name": Column("", "characteristic"),
-    "unit": Column("", "its unit"),
+NAME: Columns = {"name": "name in a study"}
+DESCRIBED: Columns = NAME | {"description": "what it is"}
+SCENARIO: Columns = DESCRIBED | {"search": "what [scenario.search] may vary, and its widest domain"}
+STUDIES: Columns = NAME | {key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")}
+VEHICLES: Columns = {
+    "vehicle": "vehicle",
+    "name": "characteristic",
+    "unit": "its unit",
     "original": Column("as unit", "value of the original vehicle", "g"),
     "lower": Column("as unit", "lower end of its domain", "g"),
     "upper": Column("as unit", "upper end of its domain", "g"),
@@ -33,26 +33,26 @@ VEHICLES = {
     "meaning": Column("", "what it is", is_shown=False),
     "counterpart": Column("", "what it is in other models", is_shown=False),
 }
-WEATHER = NAME | {
-    "road_friction": Column("", "factor on the tyres' friction"),
-    "visibility": Column("", "factor on the distance at which sensors detect an obstacle"),
+WEATHER: Columns = NAME | {
+    "road_friction": "factor on the tyres' friction",
+    "visibility": "factor on the distance at which sensors detect an obstacle",
     "recognition_delay": Column("s", "additional time to recognise somebody"),
-    "light": Column("", "day or night"),
+    "light": "day or night",
     "water": Column("mm", "depth of the water on the road"),
-    "effect": Column("", "none: an ADS drives as in clear weather, unless its parameters differ"),
+    "effect": "none: an ADS drives as in clear weather, unless its parameters differ",
 }
 OBJECTIVES: Mapping[str, object] = {
     **{name: f"The search drives {metric.name} to unsafe values." for name, metric in METRIC_OF_OBJECTIVE.items()},
     **{change.name: f"{change.title.capitalize()} [{change.unit}]." for change in CHANGES.values()},
     RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
 }
-FINDINGS = {
-    "finding": Column("", "what is wrong"),
-    "where": Column("", "place in the user's code"),
-    "input": Column("", "input that shows it"),
-    "expected": Column("", "what is expected"),
-    "check": Column("", "name of the check"),
-    "advice": Column("", "what to do"),
+FINDINGS: Columns = {
+    "finding": "what is wrong",
+    "where": "place in the user's code",
+    "input": "input that shows it",
+    "expected": "what is expected",
+    "check": "name of the check",
+    "advice": "what to do",
 }
 
 

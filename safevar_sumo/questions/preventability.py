@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reference_drivers import ANY_BRAKING
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.questions.tables import Column, with_interval
+from safevar_sumo.questions.tables import Column, Columns, with_interval
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
@@ -46,15 +46,14 @@ DRIVERS: dict[str, tuple[str, JsonObject]] = {
 TITLES = {LETTER: "competent driver", ANY_LEADER: "competent driver, any braking of a leader", FULL: "full braking"}
 NOBODY, NO_VERDICT = "nobody", "no verdict"
 """In the place of a driver who avoids a collision."""
-COLUMNS = {
-    "driver": Column(
-        "",
+COLUMNS: Columns = {
+    "driver": (
         "reference driver in the same vehicle: a competent driver; one who reacts to any braking of a leader, not only "
-        "above 5 m/s^2; full braking at the first possible moment",
+        "above 5 m/s^2; full braking at the first possible moment"
     ),
-    "avoided": Column("", "collisions that he avoids"),
-    "later": Column("", f"collisions that he avoids if he needs {DELAY:g} s longer"),
-    "no_verdict": Column("", "collisions at points where he collides in the original vehicle, too: no verdict"),
+    "avoided": "collisions that he avoids",
+    "later": f"collisions that he avoids if he needs {DELAY:g} s longer",
+    "no_verdict": "collisions at points where he collides in the original vehicle, too: no verdict",
     **with_interval("share", Column("-", "share that he avoids of those with a verdict", ".2f")),
     "later_share": Column("-", f"the share if he needs {DELAY:g} s longer", is_shown=False),
     "no_verdict_points": Column("", "points without a verdict", is_shown=False),

@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 DECIMALS = 9
 """Decimals of points and measured values; further decimals would hold only rounding errors."""
 POINTS = partial(Column, "", number_format=".2f")
-VEHICLE = {"variant": Column("", "the original vehicle, or its variant")}
-TEST = VEHICLE | {"test": Column("", "test of the protocol, with the light if it is driven by day and by night")}
-TESTS = TEST | {
+VEHICLE: Columns = {"variant": "the original vehicle, or its variant"}
+TEST: Columns = VEHICLE | {"test": "test of the protocol, with the light if it is driven by day and by night"}
+TESTS: Columns = TEST | {
     "possible": POINTS(meaning="points of the test"),
     "points": POINTS(meaning="points that the vehicle earns"),
     "lost": POINTS(meaning="points of the original vehicle minus those of this one"),
@@ -50,24 +50,24 @@ TESTS = TEST | {
     "robustness": POINTS(meaning="points of robustness layers"),
     "possible_standard": POINTS(meaning="points of the test in the standard range", is_shown=False),
     "possible_extended": POINTS(meaning="points of the test in the extended range", is_shown=False),
-    "failing_layers": Column("", "robustness layers that do not hold"),
-    "claimed_layers": Column("", "robustness layers that the study claims and that are not simulated"),
+    "failing_layers": "robustness layers that do not hold",
+    "claimed_layers": "robustness layers that the study claims and that are not simulated",
 }
-VEHICLES = VEHICLE | {
+VEHICLES: Columns = VEHICLE | {
     "points": POINTS(meaning="points that the vehicle earns"),
     "lost": POINTS(meaning="points of the original vehicle minus those of this one"),
-    "changes": Column("", "values that differ from the original's, in the study's units"),
-    "invalid_cells": Column("", "cells in which the vehicle cannot hold the speed; they earn nothing"),
-    "remark": Column("", "what the protocol or its calculator makes of this vehicle"),
+    "changes": "values that differ from the original's, in the study's units",
+    "invalid_cells": "cells in which the vehicle cannot hold the speed; they earn nothing",
+    "remark": "what the protocol or its calculator makes of this vehicle",
 }
-NOT_SIMULATED = {"test": Column("", "test of the protocol"), "points": POINTS(meaning="points of the test")}
-CELLS = TEST | {
-    "range": Column("", "standard or extended range, or a robustness layer"),
-    "condition": Column("", "condition of the robustness layer"),
+NOT_SIMULATED: Columns = {"test": "test of the protocol", "points": POINTS(meaning="points of the test")}
+CELLS: Columns = TEST | {
+    "range": "standard or extended range, or a robustness layer",
+    "condition": "condition of the robustness layer",
     "vut_speed": Column("km/h", "speed of the vehicle under test"),
     "target_speed": Column("km/h", "speed of the target"),
     "impact_location": Column("%", "impact location in percent of the vehicle's width"),
-    "colour": Column("", "colour; none if the vehicle cannot drive the test"),
+    "colour": "colour; none if the vehicle cannot drive the test",
     "relative_impact_speed": Column("km/h", "relative speed of the impact; none without one"),
     "warning_ttc": Column("s", "time to collision at the warning; none without one"),
 }

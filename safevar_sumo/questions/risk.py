@@ -17,7 +17,7 @@ import pandas as pd
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, Share, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -173,7 +173,8 @@ def _table(names: list[str], found: dict[str, Any], indices: dict[str, tuple[str
     """A row for each characteristic, the one that decides most of the safety degree first; `indices` maps an index to
     SALib's key and its meaning.
     """
-    columns, values = {"characteristic": Column("", "characteristic of the vehicle")}, dict[str, Any]()
+    columns: Columns = {"characteristic": "characteristic of the vehicle"}
+    values = dict[str, Any]()
     for output, of_what in OUTPUTS.items():
         for index, (key, meaning) in (indices | {"total": indices.get("total", ("", "undefined here"))}).items():
             name = f"{output}_{index}"

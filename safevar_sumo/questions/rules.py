@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.questions.words import constraints_in_words, join_phrases
@@ -39,8 +39,8 @@ LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
 UNLIMITED = np.array([[-np.inf], [np.inf]])
 """Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in row 1."""
-COLUMNS = {
-    "rule": Column("", "limits of the characteristics; all others anywhere in their domains"),
+COLUMNS: Columns = {
+    "rule": "limits of the characteristics; all others anywhere in their domains",
     **with_interval("density", Column("-", "unsafe share of the vehicles within the rule", ".2f")),
     **with_interval("coverage", Column("-", "share of all unsafe vehicles that lie within the rule", ".2f")),
 }

@@ -44,6 +44,10 @@ class Column(NamedTuple):
     is_shown: bool = True
 
 
+Columns = dict[str, Column | str]
+"""Columns by name; a text is the meaning of one without a unit."""
+
+
 class Wide(NamedTuple):
     """How readers see a long table: one for each column of `values`, in which a row stands for each combination of
     `labels` and a column for each value of `by`.
@@ -56,7 +60,7 @@ class Wide(NamedTuple):
 
 def tabulate(
     title: str,
-    columns: Mapping[str, Column],
+    columns: Mapping[str, Column | str],
     rows: pd.DataFrame | Iterable[Sequence[Any]],
     *,
     wide: Wide | None = None,
@@ -67,13 +71,13 @@ def tabulate(
     A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name the ends, too.
     Readers see the `words` in place of the texts that are their keys.
     """
-    named = dict(columns)
+    named = {name: Column("", column) if isinstance(column, str) else column for name, column in columns.items()}
     frame = pd.DataFrame(rows, columns=[*named])
     frame.attrs = {"title": title, "columns": named, "wide": wide, "words": words or {}}
     return frame
 
 
-def with_interval(name: str, column: Column) -> dict[str, Column]:
+def with_interval(name: str, column: Column) -> Columns:
     """A column and the two that hold the ends of its interval."""
     ends = {
         f"{name}{end}": column._replace(meaning=f"{word} end of {name}")

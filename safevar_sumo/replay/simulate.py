@@ -16,7 +16,7 @@ from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.ask import PointName, Range
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
@@ -42,24 +42,24 @@ from safevar_sumo.sumo.matrix import (
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
-REMARKS = {"remark": Column("", "what to know about this simulation")}
-CHARACTERISTICS = {
-    "characteristic": Column("", "characteristic"),
-    "unit": Column("", "unit of its values"),
+REMARKS: Columns = {"remark": "what to know about this simulation"}
+CHARACTERISTICS: Columns = {
+    "characteristic": "characteristic",
+    "unit": "unit of its values",
     "original": Column("", "value of the original vehicle", "g"),
     "simulated": Column("", "simulated value", "g"),
-    "changed": Column("", "whether the simulated value differs from the original's"),
+    "changed": "whether the simulated value differs from the original's",
     "meaning": Column("", "what it is", is_shown=False),
 }
-RESULTS = {
-    "result": Column("", "outcome, metric or objective"),
-    "unit": Column("", "its unit"),
-    "original": Column("", "of the original vehicle"),
-    "simulated": Column("", "of the simulated vehicle"),
+RESULTS: Columns = {
+    "result": "outcome, metric or objective",
+    "unit": "its unit",
+    "original": "of the original vehicle",
+    "simulated": "of the simulated vehicle",
 }
-POINTS = {
-    "point": Column("", "point of the study's matrix"),
-    "outcome": Column("", "how the simulation ends"),
+POINTS: Columns = {
+    "point": "point of the study's matrix",
+    "outcome": "how the simulation ends",
     "impact_speed": Column("m/s", "speed of the vehicle at the collision", ".2f"),
     "relative_impact_speed": Column("m/s", "relative speed of the impact", ".2f", is_shown=False),
     SAFETY_DEGREE: Column("m", "safety degree; minus the collision's speed in m/s", ".2f"),
@@ -70,12 +70,12 @@ POINTS = {
     "side": Column("", "side of the vehicle that touches", is_shown=False),
     "place": Column("%", "position of the contact along that side", is_shown=False),
 }
-SPREAD = {
-    "vehicle": Column("", "the simulated vehicle or the original"),
-    "sets": Column("", "parameter sets that fit published data equally well"),
+SPREAD: Columns = {
+    "vehicle": "the simulated vehicle or the original",
+    "sets": "parameter sets that fit published data equally well",
     "lower": Column("m", "lower end of the 90 % band of the safety degree", ".2f"),
     "upper": Column("m", "its upper end", ".2f"),
-    "collisions": Column("", "parameter sets with which it collides"),
+    "collisions": "parameter sets with which it collides",
 }
 
 

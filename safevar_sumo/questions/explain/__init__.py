@@ -38,7 +38,7 @@ from safevar_sumo.questions.preventability import (
     judge_collisions,
     judge_sample,
 )
-from safevar_sumo.questions.tables import Column, tabulate, with_interval
+from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import (
     constraints_in_words,
     encounter_in_words,
@@ -60,8 +60,8 @@ MAX_DISTINCT = 10
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the whole domain"
 """What the settings are of which some are unsafe."""
-CAUSE_COLUMNS = {
-    "solution": Column("", "handle of the failure"),
+CAUSE_COLUMNS: Columns = {
+    "solution": "handle of the failure",
     "changes": Column("", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False),
     "encounter": Column("", "the encounter, of which the original vehicle is safe", ".5g"),
     "boundary": Column("", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"),
@@ -69,37 +69,37 @@ CAUSE_COLUMNS = {
     "fraction": Column("-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False),
     "end": Column("", "what lies just below the boundary", is_shown=False),
     "size": Column("", "number of changes", is_shown=False),
-    "elsewhere": Column("", "whether these changes are unsafe in the original encounter, too"),
+    "elsewhere": "whether these changes are unsafe in the original encounter, too",
     "outcome": Column("", "outcome with these changes only", is_shown=False),
     "safety_degree": Column("m", "safety degree with these changes only; -m/s on a collision", is_shown=False),
     "robust_share": Column("-", "share of the neighbours of these changes that are unsafe, too", ".2f"),
-    "fits_holding": Column("", "number of fitted vehicle models in which these changes are a cause, too"),
+    "fits_holding": "number of fitted vehicle models in which these changes are a cause, too",
     "avoided_by": Column("", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False),
 }
 OF_ENCOUNTER = ("encounter", "elsewhere")
 """Columns of a study that searches its scenario."""
-SOLUTION_COLUMNS = {
-    "solution": Column("", "handle"),
-    "reason": Column("", "why it is explained"),
+SOLUTION_COLUMNS: Columns = {
+    "solution": "handle",
+    "reason": "why it is explained",
     "outcome": Column("", "outcome", is_shown=False),
     "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
-    "changed": Column("", "number of changes"),
+    "changed": "number of changes",
     "largest_change": Column("-", "largest change, as a share of the original value", is_shown=False),
     "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
     "ends": Column("", "how the original vehicle and this one end, where this one is worst", is_shown=False),
     "points": Column("", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False),
-    "avoided_by": Column("", "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable"),
+    "avoided_by": "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable",
 }
-CHARACTERISTIC_COLUMNS = {
-    "characteristic": Column("", "characteristic of the vehicle"),
+CHARACTERISTIC_COLUMNS: Columns = {
+    "characteristic": "characteristic of the vehicle",
     "changed": Column("-", "share of the failures that change it", ".2f"),
     **with_interval("needed", Column("-", "share of the failures of which every minimal cause contains it", ".2f")),
     "in_some": Column("-", "share of the failures of which some minimal cause contains it", ".2f"),
 }
 """The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else the share itself."""
-DISTINCT_COLUMNS = {
-    "cause": Column("", "a minimal cause, without the sizes of its changes"),
-    "failures": Column("", "failures with this cause"),
+DISTINCT_COLUMNS: Columns = {
+    "cause": "a minimal cause, without the sizes of its changes",
+    "failures": "failures with this cause",
     "share": Column("-", "their share", ".2f"),
 }
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import pandas as pd
 
 from safevar_sumo.errors import check_name
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Columns, tabulate
 from safevar_sumo.questions.ask import Jobs, Range, Share
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, load_cases, solutions_for_metric
 from safevar_sumo.questions.research_questions import changes
@@ -18,7 +18,7 @@ from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choic
 from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
-from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, TABLES, WEATHER
+from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, SETTING, TABLES, WEATHER
 from safevar_sumo.study import label_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.subject import Results
 
-REMARKS = {"table": Column("", "table"), "remark": Column("", "what is missing or left out there, and why")}
+REMARKS: Columns = {"table": "table", "remark": "what is missing or left out there, and why"}
 
 
 def tables(
@@ -113,10 +113,7 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
             else:
                 parts.append(part if name == WEATHER else part.assign(setting=group[0].name))
                 remarks += [(name, note) for case in group for note in _remarks(name, case, part, choices.alpha)]
-        shown = {
-            key: column._replace(is_shown=len(cases) > 1) if key == "setting" else column
-            for key, column in columns.items()
-        }
+        shown = {**columns, "setting": SETTING._replace(is_shown=len(cases) > 1)}
         frames[name] = tabulate(
             title, shown, pd.concat(parts, ignore_index=True) if parts else [], wide=wide, words=words
         )

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.questions.answer import Column, Wide, with_interval
+from safevar_sumo.questions.answer import Column, Columns, Wide, with_interval
 from safevar_sumo.questions.research_questions import changes, comparisons
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 
@@ -18,27 +18,29 @@ CHOSEN = ("rq1-runs", "rq2-runs", "medians", "first-collision", CAUSES, "rq1", "
 Hidden = partial(Column, is_shown=False)
 """A column that JSON and CSV alone have."""
 SIZE_OF_CHANGE = partial(Column, "as characteristic", number_format="+.3g")
-COMMON = {
-    "setting": Column("", "case: the results of one study"),
-    "other": Column("", "case in the other weather"),
-    "algorithm": Column("", "algorithm"),
-    "baseline": Column("", "the other algorithm"),
-    "metric": Column("", "safety metric or quality of a run's front"),
-    "characteristic": Column("", "characteristic"),
-    "run": Column("", "number of the run"),
-    "runs": Column("", "number of runs"),
-    "j": Column("", "number of characteristics changed; any: of all critical solutions"),
+SETTING = Column("", "case: the results of one study")
+PERCENT = Column("%", "critical solutions that change it", ".1f")
+COMMON: Columns = {
+    "setting": SETTING,
+    "other": "case in the other weather",
+    "algorithm": "algorithm",
+    "baseline": "the other algorithm",
+    "metric": "safety metric or quality of a run's front",
+    "characteristic": "characteristic",
+    "run": "number of the run",
+    "runs": "number of runs",
+    "j": "number of characteristics changed; any: of all critical solutions",
     "p_value": Column("", "p-value of the test, two-sided", ".2g"),
     "p_holm": Column("", "p-value after Holm's correction for all tests of RQ1 and RQ2 of a case", ".2g"),
-    "magnitude": Column("", "magnitude of the effect by Kitchenham's intervals"),
-    "n1": Column("", "number of values of the algorithm"),
-    "n2": Column("", "number of values of the other algorithm, or times that the original's value is repeated"),
+    "magnitude": "magnitude of the effect by Kitchenham's intervals",
+    "n1": "number of values of the algorithm",
+    "n2": "number of values of the other algorithm, or times that the original's value is repeated",
     "method": Hidden("", "name of the test"),
     "mean": Column("", "mean of the algorithm's values", ".2f"),
     "original": Column("", "value of the original vehicle", ".2f"),
     "enough_runs": Hidden("", "whether a test with so many runs can be significant"),
-    "significant": Column("", "whether p is below alpha, corrected if there is p_holm, and there are enough runs"),
-    "percent": Column("%", "critical solutions that change it", ".1f"),
+    "significant": "whether p is below alpha, corrected if there is p_holm, and there are enough runs",
+    "percent": PERCENT,
 }
 """Columns of several tables."""
 UNCORRECTED = Hidden("", "p-value of the test, two-sided, before the correction")
@@ -47,7 +49,7 @@ AGAINST_ORIGINAL = with_interval(
 )
 AGAINST_BASELINE = with_interval("effect_size", Column("", "A12; above 0.5 the algorithm is better", ".3f"))
 IN_ONE_WEATHER = {
-    "percent": COMMON["percent"],
+    "percent": PERCENT,
     "rank": Column("", "rank by percent"),
     "increase": SIZE_OF_CHANGE("mean increase, in the characteristic's unit"),
     "decrease": SIZE_OF_CHANGE("mean decrease, in the characteristic's unit"),
@@ -57,7 +59,7 @@ IN_THE_OTHER = {
 }
 
 
-def _columns(names: str, own: Mapping[str, Column] = {}) -> dict[str, Column]:
+def _columns(names: str, own: Mapping[str, Column | str] = {}) -> Columns:
     """Columns in the order of `names`: a table's own ones, and else the common ones."""
     known = {**COMMON, **own}
     return {name: known[name] for name in names.split()}
@@ -68,7 +70,7 @@ class PaperTable(NamedTuple):
 
     title: str
     compute: Callable[..., pd.DataFrame]
-    columns: Mapping[str, Column]
+    columns: Columns
     wide: Wide | None = None
 
 
@@ -100,7 +102,7 @@ TABLES: Mapping[str, PaperTable] = {
         "Evaluations to the first collision of a run",
         comparisons.first_collisions,
         _columns("setting algorithm runs")
-        | {"collided": Column("", "runs with a collision")}
+        | {"collided": "runs with a collision"}
         | with_interval("median", Column("", "median by Kaplan and Meier: runs without a collision need more"))
         | {"p_value": Column("", "p-value of the log-rank test against the algorithm that RQ2 compares", ".2g")}
         | {"p_holm": Column("", "p-value after Holm's correction for these tests", ".2g")},
@@ -110,9 +112,9 @@ TABLES: Mapping[str, PaperTable] = {
         comparisons.minimal_causes,
         _columns("setting algorithm run")
         | {
-            "failures": Column("", "different unsafe solutions"),
-            "examined": Column("", "those whose minimal causes were simulated"),
-            "causes": Column("", "different smallest sets of changes, by characteristic and direction"),
+            "failures": "different unsafe solutions",
+            "examined": "those whose minimal causes were simulated",
+            "causes": "different smallest sets of changes, by characteristic and direction",
         },
         Wide(["setting", "run"], "algorithm", ["causes"]),
     ),
@@ -141,16 +143,16 @@ TABLES: Mapping[str, PaperTable] = {
         count_evaluations,
         _columns("setting algorithm run")
         | {
-            "requested": Column("", "evaluations that the algorithm requests"),
-            "simulated": Column("", "different settings, which are simulated once each"),
-            "budget": Column("", "evaluations that a run may request"),
+            "requested": "evaluations that the algorithm requests",
+            "simulated": "different settings, which are simulated once each",
+            "budget": "evaluations that a run may request",
         },
         Wide(["setting", "run"], "algorithm", ["simulated"]),
     ),
     "rq3.1": PaperTable(
         "RQ3.1: critical solutions of a run with j characteristics changed",
         changes.rq31,
-        _columns("setting run j") | {"count": Column("", "critical solutions")},
+        _columns("setting run j") | {"count": "critical solutions"},
         Wide(["setting", "run"], "j", ["count"]),
     ),
     "rq3.2": PaperTable(
@@ -158,8 +160,8 @@ TABLES: Mapping[str, PaperTable] = {
         changes.rq32,
         _columns("setting characteristic j")
         | {
-            "percent": COMMON["percent"]._replace(number_format=".0f"),
-            "rank": Column("", "rank by the percentage among all critical solutions, in rows of any"),
+            "percent": PERCENT._replace(number_format=".0f"),
+            "rank": "rank by the percentage among all critical solutions, in rows of any",
         },
         Wide(["setting", "characteristic"], "j", ["percent"]),
     ),
@@ -169,10 +171,10 @@ TABLES: Mapping[str, PaperTable] = {
         _columns(
             "setting characteristic direction j pc delta n",
             {
-                "direction": Column("", "increase or decrease"),
+                "direction": "increase or decrease",
                 "pc": Column("", "PC, the mean change as a share of the original value", ".2f"),
                 "delta": SIZE_OF_CHANGE("mean signed change in the characteristic's unit"),
-                "n": Column("", "number of changes"),
+                "n": "number of changes",
             },
         ),
         Wide(["setting", "characteristic", "direction"], "j", ["pc", "delta"]),
@@ -183,14 +185,13 @@ TABLES: Mapping[str, PaperTable] = {
         _columns(
             "setting quantity j value percent n",
             {
-                "quantity": Column(
-                    "",
+                "quantity": (
                     "without collisions the reduction of the distance and the increases of TET and TIT; the speed of "
-                    "collisions; over all solutions the decrease of aveDece",
+                    "collisions; over all solutions the decrease of aveDece"
                 ),
                 "value": Column("as quantity", "mean [m, s, m/s, s^2 or m/s^2]", ".2f"),
                 "percent": Column("%", "% of the original's value", ".0f"),
-                "n": Column("", "number of solutions"),
+                "n": "number of solutions",
             },
         ),
         Wide(["setting", "quantity"], "j", ["value", "percent"]),
@@ -200,8 +201,8 @@ TABLES: Mapping[str, PaperTable] = {
         changes.count_collisions,
         _columns("setting algorithm")
         | {
-            "solutions": Column("", "number of solutions"),
-            "collisions": Column("", "solutions that collide"),
+            "solutions": "number of solutions",
+            "collisions": "solutions that collide",
             "share": Column("", "share of the solutions that collide", ".1%"),
         },
     ),
@@ -210,8 +211,8 @@ TABLES: Mapping[str, PaperTable] = {
         changes.frequent_combinations,
         _columns("setting")
         | {
-            "rank": Column("", "rank by frequency"),
-            "characteristics": Column("", "what is changed"),
+            "rank": "rank by frequency",
+            "characteristics": "what is changed",
             "percent": Column("%", "of the critical solutions with exactly four changes", ".1f"),
         },
     ),

@@ -20,7 +20,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator
 from safevar_sumo.questions.model_spread import across
-from safevar_sumo.questions.tables import Column, tabulate, with_interval
+from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.tolerance.boxes import random_settings
 from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.questions.tolerance.rows import limit_rows
@@ -38,11 +38,8 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.case import Case
 
-CHARACTERISTIC = {
-    "characteristic": Column("", "characteristic of the vehicle"),
-    "unit": Column("", "unit of its values"),
-}
-LIMITS = {
+CHARACTERISTIC: Columns = {"characteristic": "characteristic of the vehicle", "unit": "unit of its values"}
+LIMITS: Columns = {
     **CHARACTERISTIC,
     "original": Column("", "value of the original vehicle", ".6g"),
     **{
@@ -54,25 +51,25 @@ LIMITS = {
         )
         for end in ("low", "high")
     },
-    "kept": Column("", "whether the car is safe within the specified limits, alone and together"),
+    "kept": "whether the car is safe within the specified limits, alone and together",
     "fails_first": Column("", "what fails first beyond the limit", is_shown=False),
-    "sentence": Column("", "for a maintenance manual; all of these may be obeyed together"),
+    "sentence": "for a maintenance manual; all of these may be obeyed together",
 }
-INTERVALS = {
+INTERVALS: Columns = {
     **CHARACTERISTIC,
-    "state": Column("", "safe, unsafe, not_simulated, or infeasible: a constraint is violated"),
+    "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
     "low": Column("", "first simulated value that is so, all others as in the original", ".6g"),
     "high": Column("", "last one", ".6g"),
     "degree_low": Column("m", "safety degree at the first value; in -m/s on a collision", ".2f"),
     "degree_high": Column("m", "safety degree at the last value; in -m/s on a collision", ".2f"),
 }
-FITS = {
+FITS: Columns = {
     **CHARACTERISTIC,
-    "end": Column("", "low or high end of what is safe alone"),
+    "end": "low or high end of what is safe alone",
     **with_interval("alone", Column("", "this end, not rounded; the interval holds it with all fits", ".4g")),
     "fits": Column("-", "number of fits with which the original is safe, so that there is an end"),
 }
-POINTS = {
+POINTS: Columns = {
     **CHARACTERISTIC,
     "any_lost": Column("", "value nearest to the original that loses points", ".5g"),
     "first_point_lost": Column("", "value nearest to the original that loses a whole point", ".5g"),
