@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
+from typing import Any
 
 PACKAGE = Path(__file__).resolve().parent
 PROGRAM = "safevar-sumo"
@@ -15,6 +17,11 @@ def _find_folder(name: str) -> Path:
     """Find a data folder in the installed package or, in a checkout, beside it."""
     installed_folder = PACKAGE / name
     return installed_folder if installed_folder.is_dir() else PACKAGE.parent / name
+
+
+def shipped_table(path: str) -> dict[str, Any]:
+    """A TOML file of the package, by its path in it."""
+    return tomllib.loads((PACKAGE / path).read_text(encoding="utf-8"))
 
 
 STUDIES = _find_folder("studies")

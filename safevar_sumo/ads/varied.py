@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import tomllib
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,12 +11,10 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.ads.base import Ads, Memory, PerVehicleAds
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study.schema import FreeParameter
 
-CHANGEABLE = msgspec.convert(
-    tomllib.loads(Path(__file__).with_name("changeable.toml").read_text(encoding="utf-8")),
-    dict[str, dict[str, FreeParameter]],
-)
+CHANGEABLE = msgspec.convert(shipped_table("ads/changeable.toml"), dict[str, dict[str, FreeParameter]])
 """Parameters that a repair may change, by shipped ADS and name: changeable.toml beside this module."""
 
 

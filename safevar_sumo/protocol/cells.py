@@ -5,10 +5,8 @@ can be simulated.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
@@ -16,6 +14,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.records import FloatArray
+from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study.schema import Parameters
 
 EURO_NCAP_2026 = "euro_ncap_2026"
@@ -319,5 +318,4 @@ def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
 @lru_cache
 def protocol_of(name: str) -> Protocol:
     """A protocol by its name."""
-    tables: Parameters = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
-    return msgspec.convert(tables, Protocol)
+    return msgspec.convert(shipped_table(f"protocol/{name}.toml"), Protocol)

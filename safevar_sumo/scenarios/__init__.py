@@ -1,8 +1,6 @@
 """Scenarios and weathers by name, and their words; the weathers are in weather.toml beside this module."""
 
-import tomllib
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import msgspec
 
@@ -22,6 +20,7 @@ from safevar_sumo.scenarios.base import (
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.stop import Stop
+from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study import FreeParameter, Weather
 
 SCENARIOS: Mapping[str, type] = {
@@ -33,15 +32,14 @@ SCENARIOS: Mapping[str, type] = {
     "stop": Stop,
 }
 
-_TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
-WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
+WEATHERS = {
+    name: msgspec.convert({"name": name, **table}, Weather)
+    for name, table in shipped_table("scenarios/weather.toml").items()
+}
 """Weathers by name."""
 
 
-SEARCHABLE = msgspec.convert(
-    tomllib.loads(Path(__file__).with_name("searchable.toml").read_text(encoding="utf-8")),
-    dict[str, dict[str, FreeParameter]],
-)
+SEARCHABLE = msgspec.convert(shipped_table("scenarios/searchable.toml"), dict[str, dict[str, FreeParameter]])
 """Parameters that a study may search, by shipped scenario, or `weather`, and name: searchable.toml in this folder."""
 
 

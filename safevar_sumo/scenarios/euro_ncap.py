@@ -11,8 +11,9 @@ import math
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import KMH_PER_MS, FloatArray
@@ -27,6 +28,7 @@ from safevar_sumo.scenarios.base import (
     XmlChanges,
     as_text,
 )
+from safevar_sumo.shipped import shipped_table
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
@@ -130,7 +132,7 @@ def target_type(target: str) -> dict[str, str]:
     }
 
 
-class TestRow(NamedTuple):
+class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
     """A row of the protocol's table.
 
     Attributes
@@ -161,26 +163,8 @@ class TestRow(NamedTuple):
     headway: float = 5.0
 
 
-_NARROW, _WIDE = (50.0, 10.0, 25.0, 75.0, 90.0), (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0)
-TESTS = {
-    # target, pre-crash type, slowest, fastest, locations, target speed, acceleration distance, side, lateral start
-    "CPFA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 8.0, 1.5, "far", 6.0),
-    "CPNA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 5.0, 1.0, "near", 4.0),
-    "CPNCO": TestRow("child", PreCrash.PEDESTRIAN, 10, 60, _NARROW, 5.0, 1.0, "near", 4.0, hidden=True),
-    "CBNA": TestRow("cyclist", PreCrash.CYCLIST, 10, 60, _NARROW, 15.0),
-    "CBFA": TestRow("cyclist", PreCrash.CYCLIST, 10, 60, _NARROW, 20.0, side="far"),
-    "CBNAO": TestRow("cyclist", PreCrash.CYCLIST, 10, 60, _NARROW, 10.0, hidden=True),
-    "CCCscp": TestRow("car", PreCrash.STRAIGHT_PATHS, 20, 80, (50.0,), 40.0),
-    "CMCscp": TestRow("motorcyclist", PreCrash.STRAIGHT_PATHS, 20, 80, (50.0,), 40.0),
-    "CPLA": TestRow("adult", PreCrash.PEDESTRIAN, 10, 80, _NARROW, 5.0, 1.0),
-    "CBLA": TestRow("cyclist", PreCrash.CYCLIST, 20, 80, _NARROW, 15.0),
-    "CCRs": TestRow("car", PreCrash.LEAD_STOPPED, 10, 80, _WIDE),
-    "CCRm": TestRow("car", PreCrash.LEAD_SLOWER, 30, 130, _WIDE),
-    "CCRb": TestRow("car", PreCrash.LEAD_DECELERATING, 30, 130, _WIDE, headway=1.0),
-    "CMRs": TestRow("motorcyclist", PreCrash.LEAD_STOPPED, 10, 80, _NARROW),
-    "CMRb": TestRow("motorcyclist", PreCrash.LEAD_DECELERATING, 30, 130, _NARROW, headway=1.0),
-}
-"""The rows of the protocol's table."""
+TESTS = msgspec.convert(shipped_table("scenarios/euro_ncap.toml"), dict[str, TestRow])
+"""The rows of the protocol's table: euro_ncap.toml beside this module."""
 
 
 class SpeedProfile(NamedTuple):

@@ -20,6 +20,7 @@ from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.scenarios.target import TargetTest
+from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import open_world
@@ -162,9 +163,7 @@ def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
 @cache
 def _code_bytes() -> bytes:
     """SUMO's version and the code that plays scenes: a scene depends on them and on its scenario."""
-    files = sorted(
-        file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py")
-    )
+    files = sorted(file for folder in ("sumo", "scenarios") for file in (PACKAGE / folder).glob("*.*"))
     return b"".join([sumo_version().encode(), *(file.read_bytes() for file in files)])
 
 

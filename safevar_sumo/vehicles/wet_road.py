@@ -8,16 +8,14 @@ dry road are fitted to published stops and a handbook's table by `calibration/we
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-
 import numpy as np
 
 from safevar_sumo.records import FloatArray
+from safevar_sumo.shipped import shipped_table
 
 NEW_TREAD = 8.0
 """Tread of a new tyre [mm]."""
-WET_FRICTION = tomllib.loads(Path(__file__).with_name("wet_friction.toml").read_text(encoding="utf-8"))
+WET_FRICTION = shipped_table("vehicles/wet_friction.toml")
 """The fit: `worn` has the constants; `grip`, `water` and `handbook` what was fitted for each source."""
 
 
