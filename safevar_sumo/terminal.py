@@ -46,7 +46,7 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self._title_line:
             yield self._title_line  # rich breaks a title where its table ends
-        sizes, count = list[tuple[int, int]](), len(self.columns)
+        sizes, count = [], len(self.columns)
         for column in self.columns:
             cells = (column.header, *column.cells)
             measures = [Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell) for cell in cells]

@@ -298,7 +298,7 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 
 def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:
     settings = setting[np.newaxis]
-    observations = list[Observation]()
+    observations = []
     system_at_point = system_at_worst_point(system, settings)
     runs = drive_all(
         system_at_point,

@@ -126,7 +126,7 @@ def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dic
     """
     passes, nominal = passing_cells(protocol, colours), colours[:, protocol.nominal_numbers]
     is_counted = (nominal != RED) & (nominal != UNKNOWN)
-    holds: dict[tuple[str, str], BoolArray] = {}
+    holds = {}
     for layer in protocol.layers:
         if layer.simulated_conditions:
             numbers = protocol.numbers_of(layer.test_name, layer.name)

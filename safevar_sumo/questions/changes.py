@@ -40,7 +40,7 @@ def read_changes(
     InputError
         If a change cannot be parsed, a name is unknown or given twice, or a value is outside its domain.
     """
-    values_by_name: dict[str, list[float]] = {}
+    values_by_name = {}
     forms = SINGLE_VALUE_FORMS if single else CHANGE_FORMS
     for change in changes:
         name, equals, text = (text.strip() for text in change.partition("="))

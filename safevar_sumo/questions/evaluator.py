@@ -195,7 +195,7 @@ class Evaluator:
             (Task(study=self.study, batch_size=max(len(settings), 1), cells=(part, parts)), settings)
             for part in range(parts)
         ]
-        results, done = list[CellResults](), 0
+        results, done = [], 0
 
         def show_more_done(ended: Sequence[int]) -> None:
             nonlocal done

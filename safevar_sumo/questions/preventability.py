@@ -85,7 +85,7 @@ def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
 
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of `judge_sample`."""
-    rows, share_of = list[tuple[Any, ...]](), avoided_shares(verdicts)
+    rows, share_of = [], avoided_shares(verdicts)
     for driver in TITLES if len(verdicts) else ():
         later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
         low = high = share_of.get(driver)

@@ -64,7 +64,7 @@ def risk(
     """
     study, model = evaluator.study, VariationModel(evaluator.study)
     criterion = evaluator.choose_criterion(unsafe, subject)
-    rng, batches = np.random.default_rng(study.search.seed), list[Evaluations]()
+    rng, batches = np.random.default_rng(study.search.seed), []
     for start in range(0, samples, VEHICLES_PER_CALL):
         vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng, study.source)
         batches.append(evaluator.evaluate(vehicles, "sampling vehicles"))

@@ -69,7 +69,7 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     total, failures = len(training) + len(testing), int(is_unsafe.sum() + is_unsafe_in_test.sum())
     if not total:
         raise SimulationError(f"study {study.name!r}: none of {len(rows)} vehicles could be simulated")
-    boxes, remark = list[FloatArray](), ""
+    boxes, remark = [], ""
     if is_unsafe.all() and len(training):
         boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]
     elif min(is_unsafe.sum(), (~is_unsafe).sum()) < MIN_SETTINGS:
@@ -115,7 +115,7 @@ def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
 def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[float]:
     """The unsafe share within a box, and the share of the unsafe settings within it, each with its interval."""
     is_inside = is_within(box, settings)
-    count, values = int(np.count_nonzero(is_inside & is_unsafe)), list[float]()
+    count, values = int(np.count_nonzero(is_inside & is_unsafe)), []
     for total in (int(is_inside.sum()), int(is_unsafe.sum())):
         values += [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
     return values

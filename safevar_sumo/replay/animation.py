@@ -204,7 +204,7 @@ def animation_page(scene: FlatScene) -> str:
 def player_data(scene: FlatScene) -> JsonObject:
     """The data of the template `player`, under `played` those of its script. y points down."""
     comparison, trace = scene.comparison, scene.comparison.runs.trace
-    drives, jumps = list[JsonObject](), list[JsonObject]()
+    drives, jumps = [], []
     for row, (braking_start, nearest, end) in enumerate(comparison.moments):
         name, samples = comparison.name(row), slice(0, end + 1)
         ending = "is nearest" if np.isnan(comparison.runs.collision_speed[row]) else "collides"

@@ -192,7 +192,7 @@ def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = Fa
     """The contents of a journal, and the size of the lines that were read [bytes]; with `until_failure`, without the
     first batch that failed and all that came after it.
     """
-    positions, batches, results = list[int](), list[Evaluations](), dict[int, list[int]]()
+    positions, batches, results = [], [], {}
     first, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(first)
     if lines and owner != head:

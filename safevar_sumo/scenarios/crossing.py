@@ -252,7 +252,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
         kerb_start, kerb_left = frame.lane_coordinates(roads.lane(KERB_LANE).start)
-        changes, offset = dict[str, dict[str, str]](), self._parked_edge - PARKED_WIDTH / 2 - kerb_left
+        changes, offset = {}, self._parked_edge - PARKED_WIDTH / 2 - kerb_left
         front = impact_position - PARKED_GAP - kerb_start  # of the car nearer to the target's path
         for car, length in PARKED_LENGTH.items():
             changes[f"vehicle[@id='{car}']"] = {"departPos": repr(front), "departPosLat": repr(offset)}

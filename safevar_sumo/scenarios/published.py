@@ -91,7 +91,7 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle, the pedestrian's start and speed, as far as the study sets them."""
-        changes = dict[str, dict[str, str]]()
+        changes = {}
         if self.distance is not None:
             changes["vehicle[@id='vut']"] = {"departPos": as_text(self._front(roads))}
         if self.lateral_start is not None:

@@ -64,8 +64,8 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         ranges = _Ranges(problem)
-        generations: list[Evaluations] = []
-        scores: list[FloatArray] = []
+        generations = []
+        scores = []
         lowest_score = np.inf
         used = unimproved = last_update = 0
         while used < problem.evaluations and unimproved < self.generations_without_improvement:

@@ -180,7 +180,7 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
         individual.standing = len(individuals) + place, 0.0
     individuals = [individual for individual in individuals if not individual.violation]
     sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
-    best: list[Individual] = []
+    best = []
     for rank, front in enumerate(sort_into_fronts(sorted_individuals)):
         tools.emo.assignCrowdingDist(front)
         for individual in front:

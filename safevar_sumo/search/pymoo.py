@@ -205,7 +205,7 @@ def pymoo_algorithm(name: str, source: str) -> type[PymooAlgorithm]:
         If pymoo is not installed or has no such algorithm.
     """
     check_name(source, f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
-    fields = list[Any]()
+    fields = []
     for argument, default in _plain_arguments(name).items():
         kind = TYPES.get(argument, type(default))
         is_required = default is inspect.Parameter.empty and argument != "ref_dirs"

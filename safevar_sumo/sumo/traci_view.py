@@ -198,7 +198,7 @@ class SensedTraffic:
         api, vut = self._world.api, copied_id(copy, VUT)
         if vut not in self._world.driving:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
-        actors: dict[str, dict[str, Values]] = {}
+        actors = {}
         for domain, functions in SENSED.items():
             getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]
             actors[domain] = {
@@ -356,7 +356,7 @@ class TraciView:
             return results if name == "getAllSubscriptionResults" else results.get(actor, {})
         requested, *_, parameters = details  # between them: begin and end
         functions = {_constant(name): function for name, function in VARIABLES.items()}
-        variables: Variables = {}
+        variables = {}
         for number in map(_constant, DEFAULT_VARIABLES) if requested is None else requested:
             if functions.get(number) not in CALLS[domain]:
                 raise refused(domain, name, f"variable {number!r} is none of {', '.join(VARIABLES)}")

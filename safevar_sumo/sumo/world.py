@@ -144,7 +144,7 @@ class SumoWorld:
         On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under
         test may be either.
         """
-        self._struck_ids, speeds = {}, dict[int, float]()
+        self._struck_ids, speeds = {}, {}
         for collision in self.api.simulation.getCollisions():
             pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
             if collision.type == "junction":

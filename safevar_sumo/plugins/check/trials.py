@@ -135,7 +135,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     )
     for seed in seeds:
         algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)
-        search, settings = algorithm.search(problem, np.random.default_rng(seed)), list[FloatArray]()
+        search, settings = algorithm.search(problem, np.random.default_rng(seed)), []
         try:
             settings.append(next(search))
             while True:

@@ -242,7 +242,7 @@ def _causes_table(
             settings_of(evaluator.characteristics, at_original), "causes in the original encounter"
         )
         elsewhere = unsafe.of(there)
-    numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), list[tuple[Any, ...]]()
+    numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), []
     for index in np.lexsort([-robust, numbers]).tolist():
         cause, failure = causes[index], solutions.iloc[numbers[index]]
         own = (cause.outcome, cause.safety_degree, robust[index])

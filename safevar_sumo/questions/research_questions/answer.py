@@ -97,13 +97,13 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
         If no question has an answer.
     """
     words = titles_of(cases)
-    frames: dict[str, pd.DataFrame] = {}
-    remarks, errors = list[tuple[str, str]](), list[UnanswerableError]()
+    frames = {}
+    remarks, errors = [], []
     for name in names:
         title, compute, columns, wide = TABLES[name]
         if name == CAUSES and not choices.causes:
             continue
-        parts = list[pd.DataFrame]()
+        parts = []
         for group in [cases] if name == WEATHER else [[case] for case in cases]:
             try:
                 part = compute(*group, *([choices] if name in CHOSEN else []))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from safevar_sumo.errors import warn
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
@@ -149,7 +148,7 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     UnanswerableError
         If no case has an answer.
     """
-    counts_by_case, errors = dict[str, pd.DataFrame](), list[UnanswerableError]()
+    counts_by_case, errors = {}, []
     for case in cases:
         try:
             counts_by_case[case.name] = rq31(case)

@@ -37,7 +37,7 @@ def limit_rows(
     nearest = {one.characteristic.name: one.nearest_unsafe(one.characteristic.original) for one in scans}
     beyond_alone = _failures_alone(evaluator, nearest, unsafe)
     beyond = {} if box is None else describe_failures(evaluator, box.beyond, unsafe)
-    rows, broken = list[JsonObject](), list[str]()
+    rows, broken = [], []
     for one in scans:
         item, is_sought = one.characteristic, not is_rated(evaluator.study)
         name, limit = item.name, limits.get(item.name)
@@ -105,7 +105,7 @@ def describe_failures(evaluator: Evaluator, settings: Mapping[str, FloatArray], 
     points, members = assemble(evaluator.study).points, evaluator.characteristics
     runs = evaluator.evaluate(np.array(list(settings.values())), "what fails first")
     worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
-    words, names = dict[str, str](), members.scenario.names
+    words, names = {}, members.scenario.names
     columns = (settings, worst.tolist(), runs.settings[:, ~members.of_vehicle].tolist(), runs.collided, runs.f_safe)
     for is_unsafe, (name, point, values, collided, degree) in zip(
         unsafe.of(runs), zip(*columns, strict=True), strict=True

@@ -83,7 +83,7 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
     sensor = world.spawn_actor(
         world.get_blueprint_library().find("sensor.other.collision"), carla.Transform(), attach_to=vehicle
     )
-    touched, speed = list[str](), 0.0
+    touched, speed = [], 0.0
     for _ in range(SETTLING):
         vehicle.apply_control(carla.VehicleControl(brake=1.0))
         world.tick()
