@@ -31,14 +31,7 @@ from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_ha
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import (
-    PointResult,
-    contact_degree,
-    point_record,
-    simulate_all_points,
-    study_at,
-    vehicle_remarks,
-)
+from safevar_sumo.sumo.matrix import contact_degree, point_record, simulate_all_points, study_at, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
@@ -187,7 +180,8 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     if system.rater is not None:
         verdict.append(f"The command `rating` simulates all {len(system.matrix)} cells and variations.")
     elif system.matrix:
-        points = [_point_row(result) for result in simulate_all_points(system, setting[np.newaxis])]
+        records = map(point_record, simulate_all_points(system, setting[np.newaxis]))
+        points = [{**row, **row.get("contact", {})} for row in records]
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
         failing = [row["point"] for row in points if row["impact_speed"] is not None]
         verdict.append(points_in_words(failing, len(points)))
@@ -293,11 +287,6 @@ def _results(simulation: Simulation) -> pd.DataFrame:
     original, simulated = simulation.original.numbers, simulation.numbers
     names = {"outcome": "", **simulation.units}
     return tabulate("Results", RESULTS, [(name, unit, original[name], simulated[name]) for name, unit in names.items()])
-
-
-def _point_row(result: PointResult) -> JsonObject:
-    row = point_record(result)
-    return {**row, **row.get("contact", {})}
 
 
 def _verdict(simulation: Simulation) -> list[str]:

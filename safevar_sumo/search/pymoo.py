@@ -88,18 +88,14 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
     name: ClassVar[str]
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        randomness, known, left = (
-            _Randomness(self.name, rng),
-            dict[bytes, tuple[Evaluations, int]](),
-            problem.evaluations,
-        )
+        randomness, left, seen = _Randomness(self.name, rng), problem.evaluations, [problem.original.take([])]
         with randomness:
             from pymoo.core.individual import Individual
             from pymoo.core.population import Population
             from pymoo.util.optimum import filter_optimum
 
             algorithm, optimum = self.begin(problem, randomness.seed), Population()
-        while left and algorithm.has_next():
+        while left > 0 and algorithm.has_next():
             with randomness:
                 asked = algorithm.ask()
             group = [asked] if isinstance(asked, Individual) else asked
@@ -109,7 +105,7 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
             batch, left = Population.create(*new[:left]), left - len(new)
             if new:
                 evaluations = yield _settings(batch, problem)
-                known |= {setting.tobytes(): (evaluations, row) for row, setting in enumerate(evaluations.settings)}
+                seen.append(evaluations)
                 _score(batch, evaluations, problem, algorithm)
             with randomness:
                 if left >= 0:
@@ -117,10 +113,9 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                     optimum = algorithm.opt
                 else:
                     optimum = filter_optimum(Population.merge(optimum, batch), least_infeasible=True)
-            left = max(left, 0)
-        found = [known[setting.tobytes()] for setting in _settings(optimum, problem)]
-        batches = [evaluations.take([row]) for evaluations, row in found]
-        result = Evaluations.concatenate([problem.original.take([]), *batches])
+        every = Evaluations.concatenate(seen)
+        rows = {setting.tobytes(): row for row, setting in enumerate(every.settings)}
+        result = every.take([rows[setting.tobytes()] for setting in _settings(optimum, problem)])
         return result.take(problem.scoring.valid(result))
 
     def begin(self, problem: Problem, seed: int) -> Any:
@@ -130,8 +125,11 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
 
         objectives = len(problem.scoring.objectives) if PYMOO_ALGORITHMS[self.name].startswith("moo.") else 1
         defaults = _plain_arguments(self.name)
-        given = {name: value for name in defaults if (value := getattr(self, name)) is not UNSET}
-        given |= {name: np.array(value) for name, value in given.items() if isinstance(value, list) and name != "F"}
+        given = {
+            name: np.array(value) if isinstance(value, list) and name != "F" else value
+            for name in defaults
+            if (value := getattr(self, name)) is not UNSET
+        }
         if isinstance(defaults.get("pop_size"), int):
             given = {"pop_size": problem.population, **given}
         if "ref_dirs" in defaults:

@@ -102,7 +102,11 @@ def _meant(kind: Any, value: Any) -> Any:
         return _meant(get_args(kind)[0], value)
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    kinds = [one for one in get_args(kind) if one is not NoneType and _is_table(one) == isinstance(value, dict)]
+    kinds = [
+        one
+        for one in get_args(kind)
+        if one is not NoneType and (_is_record(one) or get_origin(one) is dict) == isinstance(value, dict)
+    ]
     tagged = [
         one
         for one in kinds
@@ -113,10 +117,6 @@ def _meant(kind: Any, value: Any) -> Any:
 
 def _is_record(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, Struct)
-
-
-def _is_table(kind: Any) -> bool:
-    return _is_record(kind) or get_origin(kind) is dict
 
 
 def _inner_type(kind: Any, name: str) -> Any:

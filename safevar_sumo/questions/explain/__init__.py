@@ -244,22 +244,16 @@ def _causes_table(
         elsewhere = unsafe.of(there)
     numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), []
     for index in np.lexsort([-robust, numbers]).tolist():
-        cause, failure = causes[index], solutions.iloc[numbers[index]]
-        own = (cause.outcome, cause.safety_degree, robust[index])
-        holds = int(fits_holding[index]) if holding else None
-        limits = shrunk[index]
         rows.append(
-            (
-                failure["solution"],
-                cause.changes,
-                cause.encounter,
-                *limits,
-                len(cause.changes),
-                bool(elsewhere[index]),
-                *own,
-                holds,
-                failure["avoided_by"],
-            )
+            {
+                **solutions[["solution", "avoided_by"]].iloc[numbers[index]],
+                **causes[index]._asdict(),
+                **shrunk[index]._asdict(),
+                "size": len(causes[index].changes),
+                "elsewhere": bool(elsewhere[index]),
+                "robust_share": robust[index],
+                "fits_holding": int(fits_holding[index]) if holding else None,
+            }
         )
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
     omitted = () if study.scenario.search else OF_ENCOUNTER
@@ -314,7 +308,7 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
         for item in evaluator.characteristics
         if (value := leading["boundary"].get(item.name)) is not None
     ]
-    encounter = encounter_in_words(evaluator.characteristics, leading["encounter"])
+    encounter = encounter_in_words(evaluator.characteristics, leading.get("encounter", {}))
     where = f"{encounter}, where the original is safe," if encounter else ""
     sure = [robustness_in_words(leading["robust_share"])]
     sure += [f"in {leading['fits_holding']} of {fits} fitted vehicle models"] if fits else []

@@ -225,9 +225,9 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
 def _test_opponents(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
     """A row for each baseline and metric."""
     (first, others), samples = opponents_of(case, choices.algorithm), _samples(case, choices, over_runs)
-    directions = {
-        name: more for name, more in _directions(case).items() if name != CAUSES or (first, CAUSES) in samples
-    }
+    # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more causes.
+    directions = MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+    directions |= {CAUSES: True} if (first, CAUSES) in samples else {}
     rows, fewest = [], fewest_runs("RQ2", choices.alpha)
     for baseline, (metric, more_is_better) in product(others, directions.items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
@@ -242,13 +242,6 @@ def _test_opponents(case: Case, choices: Choices, *, over_runs: bool = False) ->
 def _finished_runs(case: Case, algorithm: str) -> float:
     """The number of an algorithm's finished runs; without limit for imported solutions, whose runs are unknown."""
     return sum(name == algorithm for name, _ in case.finished_runs) if case.has_runs else math.inf
-
-
-def _directions(case: Case) -> dict[str, bool]:
-    """For each indicator and metric: whether larger values speak for an algorithm (a better front, or more unsafe
-    solutions).
-    """
-    return MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics} | {CAUSES: True}
 
 
 def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:

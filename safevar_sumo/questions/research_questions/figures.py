@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.errors import warn
-from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE
 from safevar_sumo.questions.case import Case, UnanswerableError
 from safevar_sumo.questions.figures import (
     BLUE,
@@ -72,6 +72,10 @@ def draw_pareto_fronts(case: Case) -> Figure:
         for algorithm in case.algorithms
         if len(points := points_of(case, case.solutions_of(algorithm)))
     }
+    labels = [
+        OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
+        for objective in objectives
+    ]
     pairs = list(combinations(range(len(objectives)), 2))
     title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
     figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
@@ -86,7 +90,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
         axis.scatter(x, y, marker="*", s=80, color="black", label="original vehicle")
         if objectives[pair[0]] == F_SAFE:
             axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less")
-        _label_axes(axis, [objectives[i] for i in pair])
+        axis.set(xlabel=labels[pair[0]], ylabel=labels[pair[1]])
     _add_legend_below(figure, axes[0])
     return figure
 
@@ -122,14 +126,6 @@ def draw_convergence(case: Case) -> Figure:
     _add_legend_below(figure, axis)
     axis.get_legend().remove()
     return figure
-
-
-def _label_axes(axis: Axes, objectives: Sequence[Objective]) -> None:
-    labels = [
-        OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
-        for objective in objectives
-    ]
-    axis.set(xlabel=labels[0], ylabel=labels[1])
 
 
 def _add_legend_below(figure: Figure, axis: Axes) -> None:
