@@ -91,7 +91,6 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
         explain.compute(case, evaluator, solution=("nsga2:7:0",))
 
 
-@pytest.mark.slow
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(case: Case, explained: Answer) -> None:
     """The limits are those of the first row; nothing names a solution."""
     leading, verdict = explained.tables["causes"].iloc[0], explained.verdict
