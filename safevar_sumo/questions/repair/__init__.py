@@ -47,6 +47,8 @@ MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
 CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
+SHOWN_LIMITS = 3
+"""Number of limits of full braking that the verdict names."""
 SIZES, SIZED_VEHICLES = tuple(k / 8 for k in range(17)), 16
 """Shares of a repair's change that are tried with each fit of the vehicle, and the number of counterexamples for it."""
 REPAIRS = {
@@ -246,7 +248,9 @@ def _answer_of(
         names = join_phrases(parameter.name for parameter in problem.parameters)
         verdict = f"No change of one or two of {names} was found that survives this wear {wear}."
     if not_repairable:
-        parts = "; or ".join(_limits_in_words(problem, part) for part in not_repairable)
+        fewest = sorted(not_repairable, key=len)
+        parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
+        parts += f" (or {len(fewest) - SHOWN_LIMITS} more, not_repairable)" if len(fewest) > SHOWN_LIMITS else ""
         verdict += f" No driving system survives {parts}: that needs another part, not a parameter."
     return Answer(question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables)
 

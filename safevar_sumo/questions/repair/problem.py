@@ -121,6 +121,7 @@ class Promise:
     def in_words(self) -> str:
         """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, and the encounters."""
         ends, characteristics = self.to_dict(), self.region.characteristics
+        whole_domain = all(ends.get(member.name) == [member.lower, member.upper] for member in characteristics.vehicle)
         worn = ", ".join(
             f"{member.name} {sign} {end:.5g}{member.suffix}"
             for member in characteristics.vehicle
@@ -128,6 +129,7 @@ class Promise:
             for sign, end in zip((">=", "<="), ends[member.name], strict=True)
             if end != member.original
         )
+        worn = "the whole domain" if whole_domain else worn
         encounters = [
             f"{member.name} {ends[member.name][0]:.5g} to {ends[member.name][1]:.5g}{member.suffix}"
             for member in characteristics.scenario
