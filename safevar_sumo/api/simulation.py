@@ -274,7 +274,7 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool) -> Simulation:
-    """Simulate a setting, shape (n,), which is filtered first if `filtered`, and the original vehicle."""
+    """Simulate a setting, shape (n,), which is filtered first if `filtered`, and the original vehicle beside it."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
     no_verdict = why_no_verdict(system)

@@ -18,9 +18,10 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.ask import Jobs, Range
-from safevar_sumo.questions.case import UnanswerableError
+from safevar_sumo.questions.case import UnanswerableError, are_collisions
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.comparisons import titles_of
+from safevar_sumo.questions.research_questions.fronts import feasible_rows
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.questions.words import ending_in_words, list_of_changes, number_of, question_command
 from safevar_sumo.records import JsonObject, Outcome
@@ -36,7 +37,7 @@ ALGORITHMS: Columns = {
     "finished": "finished runs",
     "runs": "runs",
     "simulated": "different settings simulated so far",
-    "collisions": "those that collide",
+    "collisions": "those that collide, and the original vehicle is safe in the same encounter",
     "invalid_tests": "those that leave a test's speed before the ADS acts: neither failure nor success",
     "simulator_errors": "those that cannot be simulated",
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
@@ -174,7 +175,7 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
 def _verdict(results: Results, system: System) -> str:
     """How many solutions are unsafe, and how little is enough."""
     case, names = results.case, list(system.characteristics.names)
-    if results.original["collision"] and not system.rater:
+    if results.original["collision"] and not system.rater and not system.characteristics.scenario:
         return "The original vehicle itself collides: no change is needed."
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
@@ -207,10 +208,12 @@ def summarise(results: Results) -> Answer:
     for name in study.search.labels:
         simulated, solutions = (frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions))
         outcomes = Counter(simulated["outcome"])
-        counts = [outcomes[kind] for kind in (Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
+        feasible = simulated[feasible_rows(case, simulated)]
+        counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
-        best = simulated["f_safe"].min()
-        rows.append((name, finished[name], study.search.runs, len(simulated), *counts, best, len(solutions), *means))
+        collisions, best = int(are_collisions(feasible).sum()), feasible["f_safe"].min()
+        ends = (collisions, *counts, best, len(solutions))
+        rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
     metrics = {metric.name: Column(metric.unit, "mean over solutions", ".2f") for metric in case.scoring.metrics}
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     try:

@@ -27,7 +27,7 @@ from safevar_sumo.questions.repair.price import benign_scenes, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples, fewest_runs, signed_rank_test
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
-from safevar_sumo.questions.words import number_of
+from safevar_sumo.questions.words import counted_in_words, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -95,7 +95,7 @@ def compare(
         all(is_rated(one.study) for one in evaluators),
     )
     criterion = stated[0] if stated else _default_criterion(both_rated, runs, originals)
-    is_valid = runs[0].valid & runs[1].valid
+    is_valid, is_left_out = runs[0].valid & runs[1].valid, runs[0].infeasible | runs[1].infeasible
     frame, (a, b) = frame[is_valid].reset_index(drop=True), [run.take(is_valid) for run in runs]
     settings = pd.concat([frame, table_of_pairs(frame["solution"], a, b, criterion).drop(columns="solution")], axis=1)
     metric = RATING_POINTS.name if both_rated else SAFETY_DEGREE
@@ -109,17 +109,19 @@ def compare(
         "p": p,
         "a12": a12,
         "outside": outside,
-        "not_simulated": int(np.count_nonzero(~is_valid)),
+        "not_simulated": int(np.count_nonzero(~is_valid & ~is_left_out)),
         **_needless_braking(*(one.study for one in evaluators)),
         **_ends_of_originals(evaluators, originals, with_points=both_rated),
     }
     titles = tuple(one.study.name for one in evaluators)
     titles = titles if len(set(titles)) == 2 else ("A", "B")
     test = _test_in_words("rating" if both_rated else "safety degree", titles[1], p, a12, pairs)
-    verdict = f"{count_in_words(numbers, titles[0], titles[1], criterion)} {test}"
+    words = count_in_words(numbers, titles[0], titles[1], criterion), test
+    verdict = " ".join([*words, *counted_in_words(study, int(np.count_nonzero(is_left_out)))])
     if reason_b not in ("", evaluator.no_verdict):
         verdict = f"{reason_b} {verdict}"
-    limits = [*_limits(*(scan(one, range(len(names)), criterion) for one in evaluators))]
+    columns = np.flatnonzero(evaluator.characteristics.of_vehicle).tolist()
+    limits = [*_limits(*(scan(one, columns, criterion) for one in evaluators))]
     tables = {
         "limits": tabulate("Limits of each alone, all others as in the original", LIMIT_COLUMNS, limits),
         "settings": _settings_table(evaluator, settings),
@@ -217,6 +219,8 @@ def _limits(in_a: Sequence[OneAtATimeScan], in_b: Sequence[OneAtATimeScan]) -> I
 def _needless_braking(a: Study, b: Study) -> dict[str, int]:
     """In how many of A's benign scenes the original vehicles of A and B brake, and the number of these scenes."""
     systems = [assemble(study, study.source) for study in (a, b)]
+    # What a study searches in its scenario, these scenes do not have.
+    systems = [replace(one, characteristics=one.characteristics.vehicle) for one in systems]
     scenes = benign_scenes(a, systems[0])
     brakes_in_a, brakes_in_b = (needless_braking(system, scenes) for system in systems)
     counts = {"a_needless_braking": sum(brakes_in_a), "b_needless_braking": sum(brakes_in_b)}
@@ -224,12 +228,16 @@ def _needless_braking(a: Study, b: Study) -> dict[str, int]:
 
 
 def _in_order_of(a: Study, b: Study) -> Study:
-    """Study B with its characteristics in A's order; refuses other characteristics and other units."""
-    rows_a, rows_b = a.vehicle.characteristics, b.vehicle.characteristics
-    units_a, units_b = ({(name, row.unit) for name, row in rows.items()} for rows in (rows_a, rows_b))
+    """Study B with its characteristics in A's order; refuses other characteristics and searched parameters, and other
+    units.
+    """
+    units_a, units_b = ({(name, row.unit) for name, row in study.domains.items()} for study in (a, b))
     if units_a == units_b:
+        characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
         return msgspec.structs.replace(
-            b, vehicle=msgspec.structs.replace(b.vehicle, characteristics={name: rows_b[name] for name in rows_a})
+            b,
+            vehicle=msgspec.structs.replace(b.vehicle, characteristics=characteristics),
+            scenario=msgspec.structs.replace(b.scenario, search={name: b.domains[name] for name in a.scenario.search}),
         )
     a_alone, b_alone = (
         ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
@@ -238,7 +246,7 @@ def _in_order_of(a: Study, b: Study) -> Study:
     raise InputError(
         b.source,
         f"cannot be compared: characteristics of {a.name!r} alone: {a_alone}; of {b.name!r} alone: {b_alone}",
-        "studies with the same characteristics in the same units",
+        "studies with the same characteristics and searched parameters in the same units",
     )
 
 

@@ -219,8 +219,13 @@ class Evaluator:
         ------
         SimulationError
             If the original vehicle cannot be simulated.
+        InputError
+            If the study searches its scenario, and the original vehicle is not safe in the original encounter.
         """
         evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
+        if len(self.characteristics.scenario) and evaluations.infeasible[0]:
+            problem = "scenario.search: the original vehicle is not safe in the encounter of the original values"
+            raise InputError(self.study.source, problem, "original values with which it is, as in all results")
         if not evaluations.valid[0]:
             raise SimulationError(
                 f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}"

@@ -5,9 +5,10 @@ CommonRoad's multi-body vehicle, B; the driving system keeps its knowledge of ou
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
@@ -15,14 +16,14 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Criterion, question
-from safevar_sumo.questions.compare import SETTING_COLUMNS, counts_of, draw_pairs, paired_test, table_of_pairs
+from safevar_sumo.questions.compare import SETTING_COLUMNS, SIDES, counts_of, draw_pairs, paired_test, table_of_pairs
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, draw_neighbours, robustness_in_words
 from safevar_sumo.questions.multi_body import load_bmw_parameters
 from safevar_sumo.questions.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import contact_degree, evaluate
 from safevar_sumo.sumo.system import System, assemble
@@ -36,6 +37,7 @@ Verdict = Literal["outside", "confirmed", "contradicted", "borderline"]
 COLUMNS = {name: column._replace(is_shown=name == "solution") for name, column in SETTING_COLUMNS.items()} | {
     "opinion": Column("", ", ".join(get_args(Verdict))),
     "changes": Column("", "the cause: values in their units"),
+    "encounter": Column("", "its encounter", ".5g"),
     "because": Column("", "the reason"),
 }
 SIMULATION_LIMIT = 12_000
@@ -71,6 +73,7 @@ def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = 
         f"{found['contradicted']}; {found['borderline']} are borderline, and it has no answer on {found['outside']} "
         f"({criterion.description})."
     )
+    columns = {name: column for name, column in COLUMNS.items() if name in frame}
     if safe := [name for name in explained.tables["solutions"]["solution"] if name not in {*causes["solution"]}]:
         verdict += f" Not unsafe, without a cause: {join_phrases(safe)}."
     return Answer(
@@ -78,7 +81,7 @@ def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = 
         study=subject.study,
         verdict=verdict,
         numbers=numbers,
-        tables={"settings": tabulate("Minimal causes with both models", COLUMNS, frame)},
+        tables={"settings": tabulate("Minimal causes with both models", columns, frame)},
         draw=partial(draw_pairs, titles=("our model", "the second")),
     )
 
@@ -96,66 +99,105 @@ def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
     return system, SecondVehicle(system.vehicle, study)
 
 
+class _Runs(NamedTuple):
+    """Simulations with both models of N settings, the study's original vehicle and then causes: in rows 0 to N - 1 the
+    settings, in the N after them the original vehicle in the encounter of each.
+
+    `scaled` says whether the second model is unsafe with each of `CHANGE_SHARES` of a setting's changes, shape (N, K);
+    `here` and `there` are the endings of all rows in words.
+    """
+
+    settings: FloatArray
+    ours: Evaluations
+    theirs: Evaluations
+    scaled: BoolArray
+    here: list[str]
+    there: list[str]
+
+
 def judge_causes(
     study: Study, causes: pd.DataFrame, unsafe: Unsafe, progress: Progress = show_no_progress
 ) -> tuple[pd.DataFrame, JsonObject]:
-    """Simulate minimal causes, rows of the table `causes` of `explain`, with both models: a row of `COLUMNS` for each,
-    and how both original vehicles end. Raises the errors of `assemble_both_systems`.
+    """Simulate minimal causes, rows of the table `causes` of `explain`, with both models, each in its encounter: a row
+    of `COLUMNS` for each, and how both original vehicles end. Raises the errors of `assemble_both_systems`.
     """
     system, vehicle = assemble_both_systems(study)
-    second_system, characteristics = replace(system, vehicle=vehicle), system.characteristics
-    original, contact = characteristics.original, contact_degree(system)
-    settings = np.stack([original, *(characteristics.setting(one, "cause", beyond=True) for one in causes["changes"])])
-    progress(STAGE, 0, len(settings))
-    # Shares of each setting's changes, one setting after the other; shape (settings times shares, n).
-    scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
-    ours, theirs = evaluate(system, settings), evaluate(second_system, np.concatenate([settings, scaled]))
-    fails_there = unsafe.of(theirs)
-    fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
-    frame = table_of_pairs(["", *causes["solution"]], ours, theirs.take(range(len(settings))), unsafe)
-    here, there = (
-        [ending_in_words(*end, contact) for end in zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)]
-        for side in "ab"
-    )
-
-    def judge(row: int, cause: dict[Any, Any]) -> tuple[Verdict, str]:
-        """The verdict on a cause, and its reason."""
-        if reasons := vehicle.reasons_to_omit(cause["changes"]):
-            return "outside", "; ".join(reasons)
-        if unsafe.of(ours)[0]:
-            return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
-        if fails_there[0] or not theirs.valid[0]:
-            return "outside", f"the original vehicle itself is not safe with the second model: it {there[0]}"
-        if not theirs.valid[row]:
-            return "outside", f"with the second model it {there[row]}"
-        if settings[row].tobytes() in vehicle.spinning:  # filled by `evaluate(second_system, ...)` above
-            return "outside", f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
-        verdict: Verdict = "contradicted"
-        because = f"safe with the second model: it {there[row]}; the original vehicle {there[0]}"
-        if fails_there[row]:
-            verdict = "confirmed"
-            safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~fails_scaled[row])  # the largest that is still safe
-            because = (
-                f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[0]}. "
-                f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
-                f"model, {cause['fraction']:.1%} with ours"
-            )
-        robust = cause["robust_share"]
-        reason = _why_borderline(second_system, settings[row], robust, fails_there[row], unsafe, study.search.seed)
-        return ("borderline", f"{reason}; {because}") if reason else (verdict, because)
-
-    judged = list[tuple[Verdict, dict[str, float], str]]()
-    for row, cause in enumerate(causes.to_dict("records"), 1):
-        verdict, because = judge(row, cause)
-        judged.append((verdict, cause["changes"], f"with our model it {here[row]}; {because}"))
-        progress(STAGE, row + 1, len(settings))
+    second_system = replace(system, vehicle=vehicle)
+    rows, count = causes.to_dict("records"), len(causes) + 1
+    progress(STAGE, 0, count)
+    frame, runs = _drive_both(system, second_system, rows, unsafe)
+    judged = list[tuple[Verdict, dict[str, float], dict[str, float], str]]()
+    for row, cause in enumerate(rows, 1):
+        verdict, because = _judge(second_system, vehicle, runs, row, cause, unsafe, study.search.seed)
+        words = f"with our model it {runs.here[row]}; {because}"
+        judged.append((verdict, cause["changes"], cause.get("encounter", {}), words))
+        progress(STAGE, row + 1, count)
         if vehicle.reasons_to_omit(cause["changes"]):
             frame.loc[row, ["b_outcome", "b_degree"]] = None, np.nan
     originals = {str(name): frame[name][0] for name in frame.columns.drop(["solution", "unsafe_in"])}
-    frame = frame.iloc[1:].reset_index(drop=True)
-    frame = pd.concat([frame, pd.DataFrame(judged, columns=["opinion", "changes", "because"])], axis=1)
+    frame = frame.iloc[1:count].reset_index(drop=True)
+    frame = pd.concat([frame, pd.DataFrame(judged, columns=["opinion", "changes", "encounter", "because"])], axis=1)
     frame.loc[frame["opinion"] == "outside", "unsafe_in"] = ""
-    return frame, originals
+    return frame if study.scenario.search else frame.drop(columns="encounter"), originals
+
+
+def _drive_both(
+    system: System, second_system: System, causes: Sequence[dict[Any, Any]], unsafe: Unsafe
+) -> tuple[pd.DataFrame, _Runs]:
+    """Simulate the original vehicle and the causes with both models: a frame with `SETTING_COLUMNS`, and the runs."""
+    characteristics, contact = system.characteristics, contact_degree(system)
+    values = [{}, *(cause["changes"] | cause.get("encounter", {}) for cause in causes)]
+    settings = np.stack([characteristics.setting(one, "cause", beyond=True) for one in values])
+    originals = characteristics.with_original_vehicle(settings)
+    both = np.concatenate([settings, originals])
+    # Shares of each setting's changes, one setting after the other; shape (settings, shares, n).
+    scaled = originals[:, np.newaxis] + CHANGE_SHARES[:, np.newaxis] * (settings - originals)[:, np.newaxis]
+    ours = evaluate(system, both)
+    theirs = evaluate(second_system, np.concatenate([both, scaled.reshape(-1, len(characteristics))]))
+    names = ["", *(cause["solution"] for cause in causes)] * 2
+    frame = table_of_pairs(names, ours, theirs.take(range(len(both))), unsafe)
+    endings = (
+        [ending_in_words(*end, contact) for end in zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)]
+        for side in SIDES
+    )
+    fails_scaled = unsafe.of(theirs)[len(both) :].reshape(len(settings), -1)
+    return frame, _Runs(settings, ours, theirs, fails_scaled, *endings)
+
+
+def _judge(
+    second_system: System,
+    vehicle: SecondVehicle,
+    runs: _Runs,
+    row: int,
+    cause: dict[Any, Any],
+    unsafe: Unsafe,
+    seed: int,
+) -> tuple[Verdict, str]:
+    """The verdict on a cause, and its reason."""
+    if reasons := vehicle.reasons_to_omit(cause["changes"]):
+        return "outside", "; ".join(reasons)
+    own, there, fails_there = len(runs.settings) + row, runs.there, unsafe.of(runs.theirs)
+    if unsafe.of(runs.ours)[own]:
+        return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
+    if fails_there[own] or not runs.theirs.valid[own] or second_system.measuring.scoring.violation(runs.theirs)[row]:
+        return "outside", f"the original vehicle itself is not safe with the second model: it {there[own]}"
+    if not runs.theirs.valid[row]:
+        return "outside", f"with the second model it {there[row]}"
+    setting = runs.settings[row]
+    if setting[second_system.characteristics.of_vehicle].tobytes() in vehicle.spinning:  # filled by the simulations
+        return "outside", f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
+    verdict: Verdict = "contradicted"
+    because = f"safe with the second model: it {there[row]}; the original vehicle {there[own]}"
+    if fails_there[row]:
+        verdict = "confirmed"
+        safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~runs.scaled[row])  # the largest that is still safe
+        because = (
+            f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[own]}. "
+            f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
+            f"model, {cause['fraction']:.1%} with ours"
+        )
+    reason = _why_borderline(second_system, setting, cause["robust_share"], fails_there[row], unsafe, seed)
+    return ("borderline", f"{reason}; {because}") if reason else (verdict, because)
 
 
 def _why_borderline(
@@ -168,7 +210,8 @@ def _why_borderline(
         return f"with our model {robustness_in_words(robust_share)}"
     neighbours = draw_neighbours(second_system.characteristics, setting[np.newaxis], seed)
     runs = evaluate(second_system, neighbours[second_system.region.feasible(neighbours)])
-    share = np.mean((unsafe.of(runs) == is_unsafe)[runs.valid]) if runs.valid.any() else 0.0
+    counts = runs.valid & (second_system.measuring.scoring.violation(runs) == 0)
+    share = np.mean((unsafe.of(runs) == is_unsafe)[counts]) if counts.any() else 0.0
     result = "unsafe" if is_unsafe else "safe"
     if share >= MIN_ROBUST_SHARE:
         return ""

@@ -21,7 +21,7 @@ from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, Columns, ta
 from safevar_sumo.questions.ask import Count, Criterion, Share, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import constraints_in_words, join_phrases
+from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
@@ -90,13 +90,12 @@ def risk(
         f"{_probability_in_words(study, failures / total)} ({criterion.description}; from {100 * low:.3g} to "
         f"{100 * high:.3g} % with {100 * confidence:g} % confidence, {failures:,} of {total:,} vehicles)."
     )
-    if left_out := int(drawn.infeasible.sum()):
-        verdict += f" Left out are {left_out:,} encounters in which the original vehicle is not safe."
+    left_out = int(drawn.infeasible.sum())
     if total + left_out < samples:
         verdict += f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
     if len(table):
         verdict += f" {table.iloc[0]['characteristic']} decides most of the safety degree's variance."
-    verdict = " ".join([verdict, *constraints_in_words(study)])
+    verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
     return Answer(question="risk", study=study, verdict=verdict, numbers=numbers, tables={"sensitivity": table})
 
 
@@ -173,7 +172,7 @@ def _table(names: list[str], found: dict[str, Any], indices: dict[str, tuple[str
     """A row for each characteristic, the one that decides most of the safety degree first; `indices` maps an index to
     SALib's key and its meaning.
     """
-    columns: Columns = {"characteristic": "characteristic of the vehicle"}
+    columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
     values = dict[str, Any]()
     for output, of_what in OUTPUTS.items():
         for index, (key, meaning) in (indices | {"total": indices.get("total", ("", "undefined here"))}).items():

@@ -17,7 +17,7 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.questions.words import constraints_in_words, join_phrases
+from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -95,7 +95,8 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
         "share": failures / total,
         "interval": [low, high],
     }
-    verdict = " ".join([verdict, *constraints_in_words(study)])
+    left_out = int(evaluations.infeasible.sum())
+    verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
     return Answer(question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table})
 
 

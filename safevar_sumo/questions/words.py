@@ -107,6 +107,16 @@ def two_decimals(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"  # -0.0 + 0.0 is 0.0
 
 
+def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
+    """What a vehicle of a study that searches its scenario meets, and how many encounters do not count, in a sentence;
+    empty for any other study.
+    """
+    names = join_phrases(study.scenario.search) if study.scenario.search else ""
+    those = "those" if left_out is None else f"{left_out:,}"
+    left_out_in_words = f"{those} in which the original vehicle is not safe are left out"
+    return [f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}."] if names else []
+
+
 def constraints_in_words(study: Study) -> list[str]:
     """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
     characteristics = study.vehicle.characteristics

@@ -72,6 +72,10 @@ SPREAD: Columns = {
 }
 
 
+NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
+"""Why a setting of a study that searches its scenario is in no result."""
+
+
 class Target(NamedTuple):
     """What is simulated: a study, and its name in errors; of a solution also its handle and its row of the results."""
 
@@ -260,7 +264,10 @@ def _sweep(study: Study, system: System, requested: FloatArray, names: list[str]
     remarks = [*_remarks(system), degree_note(contact)]
     if resets:
         remarks.append(f"In {resets} of {len(frame)} settings the filter reset small changes; --no-filter keeps them.")
-    original = f"The original vehicle: {evaluations.outcome[0]}, safety degree {evaluations.f_safe[0]:.2f}."
+    if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
+        remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
+    where = " in the original encounter" if study.scenario.search else ""
+    original = f"The original vehicle{where}: {evaluations.outcome[0]}, safety degree {evaluations.f_safe[0]:.2f}."
     return Answer(
         question="simulate",
         study=study,
@@ -291,10 +298,13 @@ def _results(simulation: Simulation) -> pd.DataFrame:
 
 def _verdict(simulation: Simulation) -> list[str]:
     """How the original vehicle and, if it differs, the simulated one end."""
-    original = f"The original vehicle {simulation.original.verdict}."
-    if simulation.setting == simulation.original.setting:
-        return [original]
-    return [original, f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}."]
+    least = simulation.scoring.safe_original
+    verdict = [f"{'The' if least is None else 'In this encounter the'} original vehicle {simulation.original.verdict}."]
+    if simulation.setting != simulation.original.setting:
+        verdict.append(f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}.")
+    if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:
+        verdict.append(f"Here {NOT_SAFE}: at least {least:.2f} m.")
+    return verdict
 
 
 def _safety_comparison(simulation: Simulation) -> str:

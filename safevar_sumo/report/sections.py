@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from safevar_sumo.errors import warn
 from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.model_spread import compute_model_spreads
-from safevar_sumo.questions.words import change_texts, number_of, question_command
+from safevar_sumo.questions.words import change_texts, counted_in_words, number_of, question_command
 from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
 from safevar_sumo.replay.animation import player_data
@@ -38,8 +39,10 @@ FIRST_CHOICES = {"fewest": "fewest changes", "smallest": "smallest changes", "mo
 """Choices that select the solutions to replay, as the flags of `simulate` do, in words."""
 MAX_CAUSES = 6
 """Maximum number of replays of settings that answers name by their changes."""
-CHANGES = "changes"
-"""A table's column of settings to replay: values by characteristic, all others as in the original vehicle."""
+CHANGES, ENCOUNTER = "changes", "encounter"
+"""A table's column of settings to replay: values by characteristic, all others as in the original vehicle; and, in a
+study that searches its scenario, the column of their encounters.
+"""
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated; no result contains them",
     Outcome.INVALID_TEST: "left the tolerance of a test's speed before the driving system acted: they are neither "
@@ -53,7 +56,7 @@ GENERAL_LIMITS = (
     "Driving system and vehicle are models: how far they agree with published data is told where there is any.",
 )
 CHARACTERISTICS = {
-    "characteristic": Column("", "characteristic of the vehicle"),
+    "characteristic": Column("", "characteristic of the vehicle, or of its encounter"),
     "unit": Column("", "unit of its values"),
     "original": Column("as in column unit", "value of the original vehicle"),
     "lowest": Column("as in column unit", "lower end of its domain"),
@@ -158,10 +161,11 @@ def tested(study: ReportedStudy) -> Answer:
         for item in case.characteristics
     ]
     remarks = [*case.remarks, *vehicle_remarks(study.system)]
+    sentences = [f"{'. '.join(models)}; {_conditions(study)}.", *counted_in_words(case.study), _search(study)]
     return Answer(
         question="what was tested",
         study=case.study,
-        verdict=" ".join([f"{'. '.join(models)}; {_conditions(study)}. {_search(study)}", *([tags] if tags else [])]),
+        verdict=" ".join([*sentences, *([tags] if tags else [])]),
         numbers={},
         tables={
             "characteristics": tabulate("Characteristics and their domains", CHARACTERISTICS, rows),
@@ -256,13 +260,15 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     characteristics, settings = study.case.characteristics, dict[str, FloatArray]()
     for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
         settings[handle] = setting
-    changes: dict[tuple[str, ...], Mapping[str, float]] = {}
+    changes: dict[tuple[str, ...], tuple[Mapping[str, float], Mapping[str, float]]] = {}
     for answer in study.answers:
         for frame in answer.tables.values():
-            for row in frame.get(CHANGES, ()):
-                changes.setdefault(tuple(sorted(row)), row)
-    causes = [row for row in changes.values() if row][:MAX_CAUSES]
-    settings |= {f"Only {', '.join(row)}": characteristics.setting(row, "cause", beyond=True) for row in causes}
+            for row, encounter in zip(frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False):
+                changes.setdefault(tuple(sorted(row)), (row, encounter))
+    causes = [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]
+    for row, encounter in causes:
+        name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
+        settings[name] = characteristics.setting({**row, **encounter}, "cause", beyond=True)
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))

@@ -41,6 +41,7 @@ from safevar_sumo.questions.preventability import (
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import (
     constraints_in_words,
+    counted_in_words,
     encounter_in_words,
     ending_in_words,
     join_phrases,
@@ -63,7 +64,7 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the
 CAUSE_COLUMNS: Columns = {
     "solution": "handle of the failure",
     "changes": Column("", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False),
-    "encounter": Column("", "the encounter, of which the original vehicle is safe", ".5g"),
+    "encounter": Column("", "the encounter, in which the original vehicle is safe", ".5g"),
     "boundary": Column("", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"),
     "single_boundary": Column("", "of each, the value if this change alone is scaled back", ".5g", is_shown=False),
     "fraction": Column("-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False),
@@ -164,6 +165,7 @@ def explain(
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
     sentences = [_verdict(evaluator, population, kind, len(holding), tables["causes"]), _avoided_in_words(verdicts)]
+    sentences += counted_in_words(study, population.left_out) if kind == DRAWN else []
     verdict = " ".join([*filter(None, sentences), *constraints_in_words(study)])
     return Answer(question="explain", study=study, verdict=verdict, numbers=numbers, tables=tables, draw=draw_needed)
 

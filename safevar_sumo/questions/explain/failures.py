@@ -60,6 +60,8 @@ class Population(NamedTuple):
         The unsafe rows, or those that the user names.
     otherwise
         Number of rows with another outcome than in the results.
+    left_out
+        Number of drawn settings in whose encounter the original vehicle is not safe, which are no rows.
     """
 
     original: Evaluations
@@ -69,6 +71,7 @@ class Population(NamedTuple):
     rows: list[int]
     is_named: bool
     otherwise: int
+    left_out: int
 
 
 def find_failures(
@@ -98,11 +101,15 @@ def find_failures(
         chosen = list(dict.fromkeys([*named_rows, *distinct]))  # the named ones first
         settings, handles = table[characteristics].to_numpy(dtype=float)[chosen], handles_of(table)
         names, recorded = [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen]
-    evaluations = evaluator.evaluate(settings, "settings to explain")
+    evaluations, left_out = evaluator.evaluate(settings, "settings to explain"), 0
+    if isinstance(subject, Study):
+        counts = np.flatnonzero(~evaluations.infeasible)
+        left_out = len(evaluations) - len(counts)
+        evaluations, names, recorded = evaluations.take(counts), [names[row] for row in counts], recorded[counts]
     unsafe = unsafe or Unsafe.default_among(evaluations, original)
     rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
     otherwise = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
-    return Population(original, evaluations, names, unsafe, rows, bool(named), int(otherwise))
+    return Population(original, evaluations, names, unsafe, rows, bool(named), int(otherwise), left_out)
 
 
 def choose_failures(

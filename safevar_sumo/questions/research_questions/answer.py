@@ -19,7 +19,7 @@ from safevar_sumo.questions.research_questions.figures import draw_change_counts
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, SETTING, TABLES, WEATHER
-from safevar_sumo.study import label_of
+from safevar_sumo.study import SAFETY_DEGREE, label_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,7 +140,8 @@ def _verdict(case: Case) -> str:
     except UnanswerableError:
         return f"{text}."
     of_all = len(case.solutions_of(NSGA2))
-    return f"{text}; {critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle."
+    where = " in the same encounter" if case.study.scenario.search else ""
+    return f"{text}; {critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle{where}."
 
 
 def describe_evaluations(case: Case) -> str:
@@ -169,8 +170,9 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
             values = solutions_for_metric(case.solutions, metric)[metric.name]
             if undefined := int(values.isna().sum()):
                 yield f"{prefix}{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
-        undefined_names = ", ".join(metric for metric, value in case.original.items() if math.isnan(value))
-        if table == "rq1" and undefined_names:
+        is_known = {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}  # in a solution's encounter
+        omitted = [name for name, value in case.original.items() if math.isnan(value) or name not in is_known]
+        if table == "rq1" and (undefined_names := ", ".join(omitted)):
             yield f"{prefix}the original vehicle's {undefined_names} is undefined, so that no test uses it."
         if table == "rq2" and not case.has_runs:
             yield (

@@ -47,15 +47,16 @@ def critical_solutions(case: Case) -> pd.DataFrame:
 
 
 def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
-    """Changes of n characteristics in M solutions, each in its unit: filtered minus original value, the paper's v'' -
-    v; shape (M, n).
+    """Changes of the vehicle's n characteristics in M solutions, each in its unit: filtered minus original value, the
+    paper's v'' - v; shape (M, n).
     """
-    return solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original
+    vehicle = case.characteristics.vehicle
+    return solutions[list(vehicle.names)].to_numpy(dtype=float) - vehicle.original
 
 
 def change_numbers(case: Case) -> list[str]:
     """The numbers of changed characteristics, "1".."n"."""
-    return [str(j) for j in range(1, len(case.characteristics) + 1)]
+    return [str(j) for j in range(1, len(case.characteristics.vehicle) + 1)]
 
 
 def count_changes(case: Case) -> npt.NDArray[np.str_]:
@@ -95,7 +96,7 @@ def rq32(case: Case) -> pd.DataFrame:
     j = "any"; ties share the better rank and the next one is skipped).
     """
     shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
-    values = {(name,): column for name, column in zip(case.characteristics.names, shares.T, strict=True)}
+    values = {(name,): column for name, column in zip(case.characteristics.vehicle.names, shares.T, strict=True)}
     frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(columns="n")
     frame["percent"] *= 100
     ranks = frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
@@ -110,7 +111,8 @@ def rq33(case: Case) -> pd.DataFrame:
     changes); pc and delta are undefined where n is 0.
     """
     changes = changes_of(case, critical_solutions(case))
-    originals = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
+    vehicle = case.characteristics.vehicle
+    originals = dict(zip(vehicle.names, vehicle.original, strict=True))
     values = {
         (name, direction): np.where(np.sign(column) == sign, column, np.nan)
         for name, column in zip(originals, changes.T, strict=True)
@@ -131,19 +133,25 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
     - TET [s], TIT [s^2]: mean increase over solutions without collision;
     - aveDece: mean decrease over all solutions [m/s^2].
+
+    In a study that searches its scenario only the original's safety degree is known in the encounter of a solution,
+    so that TET, TIT and aveDece are undefined; the original's value is the mean over these encounters.
     """
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
     safety_degree, tet, tit, deceleration = solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
+    degrees, original = case.original_degrees(solutions), case.original
+    if case.study.scenario.search:
+        original = {**dict.fromkeys(original, np.nan), SAFETY_DEGREE: degrees.mean()}
     values = {
-        ("avgSD_mD",): np.where(has_collided, np.nan, case.original_degrees(solutions) - safety_degree),
+        ("avgSD_mD",): np.where(has_collided, np.nan, degrees - safety_degree),
         ("avgSD_cS",): np.where(has_collided, -safety_degree, np.nan),
-        ("TET",): np.where(has_collided, np.nan, tet - case.original["tet"]),
-        ("TIT",): np.where(has_collided, np.nan, tit - case.original["tit"]),
-        ("aveDece",): case.original["ave_dece"] - deceleration,
+        ("TET",): np.where(has_collided, np.nan, tet - original["tet"]),
+        ("TIT",): np.where(has_collided, np.nan, tit - original["tit"]),
+        ("aveDece",): original["ave_dece"] - deceleration,
     }
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
-    scale = frame["quantity"].map(SAFETY_SCALES).map(case.original).abs().replace(0.0, np.nan)
+    scale = frame["quantity"].map(SAFETY_SCALES).map(original).abs().replace(0.0, np.nan)
     frame["percent"] = 100 * frame["value"] / scale
     return frame
 
@@ -178,7 +186,7 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     rows = []
     for indices, number in most_frequent:
         rank = 1 + sum(other > number for other in counts.values())
-        rows.append((rank, [case.characteristics.names[i] for i in indices], 100 * number / len(masks)))
+        rows.append((rank, [case.characteristics.vehicle.names[i] for i in indices], 100 * number / len(masks)))
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])
 
 

@@ -200,8 +200,9 @@ def draw_change_sizes(case: Case) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
     changes_of_solutions = _critical_changes(case)
     title = f"{case.name}: changes in critical solutions"
-    figure, axes = new_panels(title, len(case.characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
-    for axis, characteristic, changes in zip(axes, case.characteristics, changes_of_solutions.T, strict=True):
+    vehicle = case.characteristics.vehicle
+    figure, axes = new_panels(title, len(vehicle), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    for axis, characteristic, changes in zip(axes, vehicle, changes_of_solutions.T, strict=True):
         low, high = characteristic.lower - characteristic.original, characteristic.upper - characteristic.original
         increases, decreases = changes[changes > 0], changes[changes < 0]
         axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)

@@ -25,7 +25,7 @@ from safevar_sumo.questions.tolerance.boxes import random_settings
 from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.questions.tolerance.rows import limit_rows
 from safevar_sumo.questions.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, scan
-from safevar_sumo.questions.words import constraints_in_words, join_phrases
+from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study, limits_of
 from safevar_sumo.sumo.matrix import contact_degree
@@ -132,8 +132,7 @@ def tolerance(
     )
     box = None
     if is_sought and not criterion.of(original)[0]:
-        known = [_unsafe_solutions(subject, all_columns, criterion)]
-        known += [] if everywhere else [_unsafe_alone(members, scans)]
+        known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, scans)]
         limits_of_box = {**specified, **everywhere}
         box = find_joint_limits(evaluator, all_columns, criterion, limits_of_box, scans, np.concatenate(known))
     rows, broken = limit_rows(evaluator, scans, box, specified, criterion)
@@ -157,7 +156,13 @@ def tolerance(
     return Answer(
         question="tolerance",
         study=study,
-        verdict=" ".join([*_verdict(scans, box, criterion, broken, bool(specified)), *constraints_in_words(study)]),
+        verdict=" ".join(
+            [
+                *_verdict(scans, box, criterion, broken, bool(specified)),
+                *counted_in_words(study),
+                *constraints_in_words(study),
+            ]
+        ),
         numbers=numbers,
         tables=tables,
         failures=tuple(f"limit of {text}" for text in broken),
@@ -181,11 +186,13 @@ def _limits_of(study: Study, texts: Sequence[str], columns: Sequence[int]) -> di
     return {name: limit for name, limit in limits_of(texts, rows, study.limits).items() if name in varied}
 
 
-def _unsafe_alone(characteristics: CharacteristicSet, scans: Sequence[OneAtATimeScan]) -> FloatArray:
-    """The ends of the unsafe intervals as settings, shape (K, n)."""
+def _unsafe_alone(evaluator: Evaluator, scans: Sequence[OneAtATimeScan]) -> FloatArray:
+    """The ends of the unsafe intervals as settings, shape (K, n), each in its worst encounter."""
+    characteristics = evaluator.characteristics
     ends = [(one.characteristic.name, end) for one in scans for interval in one.of_state("unsafe") for end in interval]
     settings = [characteristics.setting({name: end}, name) for name, end in ends]
-    return np.array(settings).reshape(-1, len(characteristics))
+    ends_of_intervals = np.array(settings).reshape(-1, len(characteristics))
+    return evaluator.evaluate_over_encounters(ends_of_intervals, "ends of what is unsafe alone").settings
 
 
 def _unsafe_solutions(subject: Study | Case, columns: Sequence[int], unsafe: Unsafe) -> FloatArray:

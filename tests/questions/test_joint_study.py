@@ -1,0 +1,153 @@
+"""Every question about a study that searches its scenario: a setting is a vehicle and an encounter, and the original
+vehicle drives in the same one.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from safevar_sumo.questions import evaluator
+from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.tolerance import scans
+from safevar_sumo.study import load_study
+from tests.in_process import json_of, refused, run, searched
+
+STUDY = """
+extends = "rain"
+name = "tiny"
+title = "Which vehicle, at which gap?"
+[scenario.search]
+distance = { unit = "m", original = 12.129, lower = 8, upper = 18, meaning = "gap at the start" }
+[search]
+algorithms = ["nsga2", "rs"]
+population = 10
+evaluations = 80
+runs = 1
+"""
+LEFT_OUT = r"Each vehicle drives in an encounter of its own \(distance\); {} in which the original vehicle is not safe"
+COUNTED = LEFT_OUT.format(r"[\d,]+")
+CAUSE = "in an encounter with .* where the original is safe, the vehicle collides"
+QUESTIONS = {
+    "risk tiny.toml --samples 300": COUNTED,
+    "risk results --samples 300": COUNTED,
+    "rules tiny.toml --samples 300": COUNTED,
+    "explain tiny.toml --limit 500 --top 2 --fits 0": f"{CAUSE}.* {COUNTED}",
+    "explain results --limit 500 --top 2 --fits 0": CAUSE,
+    "tables results": "are less safe than the original vehicle in the same encounter",
+    "simulate results --fewest": "In this encounter the original vehicle stops",
+}
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the study's file and its results."""
+    folder = tmp_path_factory.mktemp("joint")
+    (folder / "tiny.toml").write_text(STUDY)
+    searched(load_study(str(folder / "tiny.toml")), folder / "results")
+    return folder
+
+
+@pytest.fixture
+def case(joint: Path) -> Case:
+    return load_cases([joint / "results"])[0]
+
+
+@pytest.fixture(autouse=True)
+def _few_encounters(joint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(joint)
+    monkeypatch.setattr(scans, "SCAN_VALUES", 11)
+    monkeypatch.setattr(evaluator, "ENCOUNTERS", 4)
+    monkeypatch.setattr(evaluator, "CANDIDATES", 64)
+
+
+@pytest.mark.parametrize("typed", QUESTIONS)
+def test_a_question_says_which_encounters_count(typed: str) -> None:
+    assert re.search(QUESTIONS[typed], json_of(*typed.split())["verdict"])
+
+
+def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_same_encounter(case: Case) -> None:
+    drawn = case.evaluations
+    limit = case.scoring.safe_original
+    row = drawn[drawn["original_safety_degree"] < limit].iloc[0]
+    values = [f"--set={name}={float(row[name])!r}" for name in case.characteristics.names]
+    answer = json_of("simulate", "results", *values, "--no-filter")
+    degrees = next(one for one in answer["tables"]["results"]["rows"] if one["result"] == "safety_degree")
+    assert (degrees["original"], degrees["simulated"]) == (row["original_safety_degree"], row["safety_degree"])
+    assert "Here the original vehicle keeps less than a search demands" in answer["verdict"]
+    sweep = json_of("simulate", "results", *values[:-1], "--set=distance=8..18:5", "--no-filter")
+    counted = [one["remark"] for one in sweep["tables"]["remarks"]["rows"] if "demands" in one["remark"]]
+    assert len(counted) == 1
+    rows = json_of("study", "tiny.toml", "--status", "--out", "results")["tables"]["algorithms"]["rows"]
+    safe = drawn[drawn["original_safety_degree"] >= limit]
+    expected = [((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum() for name in ("nsga2", "rs")]
+    assert [one["collisions"] for one in rows] == expected
+    assert sum(expected) < (drawn["outcome"] == "collision").sum()
+
+
+@pytest.mark.slow
+def test_limits_together_are_not_wider_than_those_alone() -> None:
+    answer = json_of("tolerance", "tiny.toml", "--fits", "0", "--characteristics", "tireFric,radius")
+    assert re.search(LEFT_OUT.format("those"), answer["verdict"])
+    rows: list[dict[str, Any]] = answer["tables"]["limits"]["rows"]
+    assert any(one["alone_low"] > 30 for one in rows)
+    for one in rows:
+        assert one["alone_low"] <= one["together_low"] <= one["together_high"] <= one["alone_high"]
+
+
+@pytest.mark.slow
+def test_a_second_model_judges_a_cause_in_its_encounter() -> None:
+    """Where it collides with our model, and the original vehicle does not."""
+    rows = json_of("opinion", "results")["tables"]["settings"]["rows"]
+    assert rows
+    assert {one["a_outcome"] for one in rows} == {"collision"}
+    assert all(8 <= one["encounter"]["distance"] <= 18 for one in rows)
+    assert all("our model it collides" in one["because"] for one in rows)
+
+
+def test_changes_are_those_of_the_vehicle(case: Case) -> None:
+    tables = json_of("tables", "results")["tables"]
+    solutions = case.solutions[case.solutions["algorithm"] == "nsga2"]
+    critical = solutions[solutions["safety_degree"] < solutions["original_safety_degree"]]
+    counts = {int(one["j"]): one["count"] for one in tables["rq3.1"]["rows"] if one["count"]}
+    assert counts == critical["f_num_diff"].astype(int).value_counts().to_dict()
+    assert "distance" not in {one["characteristic"] for one in tables["rq3.2"]["rows"]}
+
+
+def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path) -> None:
+    (joint / "wider.toml").write_text(STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20"))
+    answer = json_of("compare", "results", "wider.toml", "--samples", "64")
+    assert re.search(LEFT_OUT.format(r"[\d,]+"), answer["verdict"])
+    assert answer["numbers"]["only_a_unsafe"] == answer["numbers"]["only_b_unsafe"] == 0
+    frame = answer["tables"]["settings"]["rows"]
+    assert all(10 <= one["distance"] <= 18 for one in frame)
+    assert "distance" not in {one["characteristic"] for one in answer["tables"]["limits"]["rows"]}
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("compare tiny.toml rain", "characteristics of 'tiny' alone: distance [m]; of 'rain' alone: none"),
+        ("compare rain tiny.toml", "characteristics of 'rain' alone: none; of 'tiny' alone: distance [m]"),
+        ("risk unsafe.toml", "the original vehicle is not safe in the encounter of the original values"),
+    ],
+)
+def test_a_question_without_meaning_is_refused(typed: str, told: str, joint: Path) -> None:
+    (joint / "unsafe.toml").write_text(f"{STUDY}\n[model_error]\nsafety_degree = 2.5\n")
+    refused(*typed.split(), message=(told,))
+
+
+@pytest.mark.slow
+def test_the_page_replays_causes_in_their_encounters_and_evidence_is_verified() -> None:
+    ask = ("--ask", "explain --limit 500 --top 2 --fits 0", "--jobs", "1")
+    run("report", "results", "--out", "page.html", *ask)
+    page = Path("page.html").read_text()
+    replays = re.findall(r"<summary>(Only [^<]*)</summary>", page)
+    assert replays
+    assert all("in its encounter: collides" in one for one in replays)
+    assert "Each vehicle drives in an encounter of its own (distance)" in page
+    run("evidence", "results", "--out", "pack.zip", *ask)
+    assert json_of("verify", "pack.zip")["numbers"]["differs"] == 0
