@@ -111,10 +111,12 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     """What a vehicle of a study that searches its scenario meets, and how many encounters do not count, in a sentence;
     empty for any other study.
     """
-    names = join_phrases(study.scenario.search) if study.scenario.search else ""
-    those = "those" if left_out is None else f"{left_out:,}"
-    left_out_in_words = f"{those} in which the original vehicle is not safe are left out"
-    return [f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}."] if names else []
+    if not study.scenario.search:
+        return []
+    names, those = join_phrases(study.scenario.search), "those" if left_out is None else f"{left_out:,}"
+    return [
+        f"Each vehicle drives in an encounter of its own ({names}); left out: {those} in which the original is not safe."
+    ]
 
 
 def constraints_in_words(study: Study) -> list[str]:

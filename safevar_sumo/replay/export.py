@@ -215,7 +215,8 @@ def export(
     study = target.study if point is None else study_at(target.study, point, source="point")
     system = assemble(study, directory)
     setting = target.setting(system)
-    values = dict(zip(system.characteristics.names, setting.tolist(), strict=True))
+    vehicle, of_vehicle = system.characteristics.vehicle, setting[system.characteristics.of_vehicle]
+    values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
     physics = carla_physics(values, directory) if to == "carla" else {}
     write_files(compare_setting(study, system, setting), to, out, solution, physics)
     return f"{to}: {out}"

@@ -28,7 +28,7 @@ population = 10
 evaluations = 80
 runs = 1
 """
-LEFT_OUT = r"Each vehicle drives in an encounter of its own \(distance\); {} in which the original vehicle is not safe"
+LEFT_OUT = r"in an encounter of its own \(distance\); left out: {} in which the original is not safe"
 COUNTED = LEFT_OUT.format(r"[\d,]+")
 CAUSE = "in an encounter with .* where the original is safe, the vehicle collides"
 QUESTIONS = {
