@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
+import math
 from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar
 
@@ -59,7 +60,9 @@ PYMOO_ALGORITHMS = {PYMOO + name: module for module, names in MODULES.items() fo
 """
 PARTITIONS = 12
 """Partitions of each objective in Das and Dennis's directions (1998), where a study gives no others."""
-Count = Annotated[int, Meta(ge=1, le=100_000)]
+MAX_DIRECTIONS = 100_000
+"""Largest number of reference directions, and of individuals."""
+Count = Annotated[int, Meta(ge=1, le=MAX_DIRECTIONS)]
 TYPES: dict[str, Any] = {
     "ref_dirs": Count | list[list[float]],
     "ref_points": list[list[float]],
@@ -135,6 +138,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         if "ref_dirs" in defaults:
             partitions = given.get("ref_dirs", PARTITIONS)
             if isinstance(partitions, int):
+                if math.comb(partitions + objectives - 1, partitions) > MAX_DIRECTIONS:
+                    raise ValueError(f"ref_dirs = {partitions} are more than {MAX_DIRECTIONS:,} reference directions")
                 given["ref_dirs"] = get_reference_directions("das-dennis", objectives, n_partitions=partitions)
             if given.get("pop_size", np.inf) < len(given["ref_dirs"]):
                 raise ValueError(f"pop_size is less than the {len(given['ref_dirs'])} reference directions")

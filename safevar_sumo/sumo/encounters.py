@@ -25,8 +25,8 @@ from safevar_sumo.sumo.recording import Recording
 
 
 def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
-    """Refuse a searched parameter that a scenario of the study does not have, a domain that is wider than the
-    scenario's, and domains in which an encounter is impossible.
+    """Refuse a searched parameter that a scenario of the study does not have or in which weathers of its matrix differ,
+    a domain that is wider than the scenario's, and domains in which an encounter is impossible.
     """
     for point in points:
         legal = searchable_in(type(point.scenario))
@@ -39,6 +39,10 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
             if domain.lower < widest.lower or domain.upper > widest.upper:
                 problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
                 raise InputError(source, problem, f"a part of [{widest.lower:g}, {widest.upper:g}] {widest.unit}")
+            first, other = points[0].weather, point.weather
+            if name in SEARCHABLE["weather"] and getattr(first, name) != getattr(other, name):
+                problem = f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
+                raise InputError(source, problem, "a domain, or values in the weathers")
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
     for point in points:

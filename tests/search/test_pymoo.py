@@ -108,6 +108,7 @@ def test_a_mistake_in_a_study_names_key_and_nearest_name(algorithm: str, table: 
     ("name", "arguments", "error"),
     [
         ("pymoo:NSGA3", {"pop_size": 5}, "91 reference directions"),
+        ("pymoo:NSGA3", {"ref_dirs": 1000}, "more than 100,000 reference directions"),
         ("pymoo:NSGA3", {"ref_dirs": [[1.0, 0.0]]}, "2 != 3"),
         ("pymoo:DE", {"variant": "DE/best"}, "DE/<selection>/<n_diffs>/<crossover>"),
     ],

@@ -270,5 +270,7 @@ def test_a_matrix_and_a_search_over_one_parameter_are_refused() -> None:
         load_study("wear", scenario={"search": {"speed": SPEED}})
     with pytest.raises(InputError, match=r"ads: there is no such key|ads.search"):
         load_study("wear", ads={"search": {"speed": SPEED}})
+    with pytest.raises(InputError, match="weathers clear and night of the matrix set visibility, too"):
+        assemble(load_study("euro_ncap_pedestrian", scenario={"search": {"visibility": WEATHER["visibility"]}}))
     with pytest.raises(InputError, match="the cells of euro_ncap_2026 are fixed"):
         load_study("euro_ncap_rating", scenario={"search": {"speed": SPEED}})
