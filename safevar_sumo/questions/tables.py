@@ -77,7 +77,7 @@ def tabulate(
     return frame
 
 
-def with_interval(name: str, column: Column) -> Columns:
+def with_interval(name: str, column: Column) -> dict[str, Column]:
     """A column and the two that hold the ends of its interval."""
     ends = {
         f"{name}{end}": column._replace(meaning=f"{word} end of {name}")

@@ -135,7 +135,7 @@ class SolutionId(NamedTuple):
         return f"{self.algorithm}:{self.run}:{self.row}"
 
     @classmethod
-    def parse(cls, text: str, source: object = "solution") -> SolutionId:
+    def parse(cls, text: str) -> SolutionId:
         """Read a handle.
 
         Raises
@@ -145,7 +145,7 @@ class SolutionId(NamedTuple):
         """
         match = re.fullmatch(r"([^:]+):([0-9]{1,9}):([0-9]{1,9})", text)
         if match is None:
-            raise InputError(source, repr(text), HANDLE_FORMAT)
+            raise InputError("solution", repr(text), HANDLE_FORMAT)
         return cls(match[1], int(match[2]), int(match[3]))
 
 
@@ -161,7 +161,7 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
     ]
 
 
-def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
+def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:
     """The row number, in the frame, of the solution with this handle.
 
     Raises
@@ -174,7 +174,7 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = 
         return all_handles.index(handle)
     last_handles = {(other.algorithm, other.run): str(other) for other in all_handles}
     expected = f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:MAX_EXAMPLES])}"
-    raise InputError(source, f"there is no solution {handle}", expected)
+    raise InputError("solution", f"there is no solution {handle}", expected)
 
 
 CHOICES = {

@@ -233,13 +233,9 @@ class CharacteristicSet:
         """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method section 3)."""
         return np.asarray(np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1), dtype=float)
 
-    def setting(
-        self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True"
-    ) -> FloatArray:
+    def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False) -> FloatArray:
         """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the
         domain are legal.
-
-        `switch` is passed to `Characteristic.check`.
 
         Raises
         ------
@@ -255,7 +251,7 @@ class CharacteristicSet:
         for name, value in values.items():
             check_name(source, f"there is no characteristic {name!r}", name, self.names)
             column = self.names.index(name)
-            self.members[column].check(value, source, beyond=beyond, switch=switch)
+            self.members[column].check(value, source, beyond=beyond)
             setting[column] = value
         return setting
 

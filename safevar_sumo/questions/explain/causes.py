@@ -266,12 +266,7 @@ def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) 
 
 
 def find_boundary_shares(
-    evaluator: Evaluator,
-    starts: FloatArray,
-    ends: FloatArray,
-    unsafe: Unsafe,
-    lowest: FloatArray | float = 0.0,
-    stage: str = "boundaries",
+    evaluator: Evaluator, starts: FloatArray, ends: FloatArray, unsafe: Unsafe, lowest: FloatArray
 ) -> tuple[FloatArray, list[BoundaryState]]:
     """The first unsafe share above `lowest` of each of M lines, whose end must be unsafe, and what lies just below it.
 
@@ -279,13 +274,13 @@ def find_boundary_shares(
     nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
     """
     number = len(starts)
-    rows, lowest = np.arange(number), np.broadcast_to(lowest, number)
+    rows = np.arange(number)
     low, high, low_is_valid = lowest, np.ones(number), np.ones(number, dtype=bool)
     for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high  # without a rounding error; known to be unsafe
         inner = settings_on_lines(starts, ends, shares[:, :-1])
-        evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), stage)
+        evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), "boundaries")
         is_unsafe, is_valid = (
             np.column_stack([flags.reshape(number, parts - 1), np.ones(number, dtype=bool)])
             for flags in (unsafe.of(evaluations), evaluations.valid)

@@ -18,7 +18,7 @@ from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choic
 from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
 from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
-from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, SETTING, TABLES, WEATHER
+from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, TABLES, WEATHER
 from safevar_sumo.study import SAFETY_DEGREE, label_of
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
             else:
                 parts.append(part if name == WEATHER else part.assign(setting=group[0].name))
                 remarks += [(name, note) for case in group for note in _remarks(name, case, part, choices.alpha)]
-        shown = {**columns, "setting": SETTING._replace(is_shown=len(cases) > 1)}
+        shown = {**columns, "setting": columns["setting"]._replace(is_shown=len(cases) > 1)}
         frames[name] = tabulate(
             title, shown, pd.concat(parts, ignore_index=True) if parts else [], wide=wide, words=words
         )
