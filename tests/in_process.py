@@ -55,7 +55,7 @@ class InlinePool(Pool):
         super().__init__(workers, lambda place: self)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        future: Future[Any] = Future()
+        future = Future()
         try:
             future.set_result(self.compute(function, *arguments))
         except Exception as error:

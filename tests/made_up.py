@@ -75,7 +75,7 @@ def made_up_evaluations(safety: Any, **columns: Any) -> Evaluations:
     """Vehicles of these safety degrees: collisions where these are 0 or less."""
     values = np.asarray(safety, dtype=float)
     collided = values <= 0
-    made_up: dict[str, Any] = {
+    made_up = {
         "settings": np.ones((len(values), 1)),
         "outcome": np.where(collided, "collision", "stopped").astype("U16"),
         "collision_speed": np.where(collided, -values, np.nan),

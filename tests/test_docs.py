@@ -10,7 +10,7 @@ import json
 import re
 import shlex
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from click.testing import CliRunner
@@ -31,7 +31,7 @@ PROGRAM = "python -m safevar_sumo "
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
 def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)  # coarse limits, to save time
-    names: dict[str, Any] = {}
+    names = {}
     for block in blocks(page):
         if block.title:
             Path(block.title).write_text(block.text)

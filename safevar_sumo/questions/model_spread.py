@@ -55,16 +55,6 @@ class ModelSpread(NamedTuple):
     upper: float | None
     collisions: int
 
-    def __str__(self) -> str:
-        """One sentence on the band and the collisions."""
-        if self.lower is None or self.upper is None:
-            return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
-        return (
-            f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets "
-            "that fit the published data equally well, of repeats and of the model's error); a collision with "
-            f"{self.collisions or 'none'} of them"
-        )
-
 
 def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
     """The model's uncertainty for each of M settings, shape (M, n); the filter is not applied.

@@ -114,7 +114,7 @@ def test_evaluate_is_simulate_row_by_row() -> None:
 
 def test_a_value_that_is_missing_is_the_originals() -> None:
     """Mappings name only what is changed; an empty mapping is the original vehicle."""
-    asked: list[dict[str, float | None]] = [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}]
+    asked = [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}]
     frame = sv.evaluate("sun", asked, jobs=1)
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]

@@ -10,7 +10,6 @@ import subprocess
 import sys
 from io import StringIO
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import click
@@ -52,14 +51,14 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
-    found: Any = commands.get_command(None, command)  # type: ignore[arg-type]
+    found = commands.get_command(None, command)  # type: ignore[arg-type]
     assert CliRunner().invoke(commands, [command, "--help"]).exit_code == 0
     for one in (found, *(option for option in found.params if not isinstance(option, click.Argument))):
         assert str(one.help).strip().endswith((".", "]")), one.name
 
 
 def test_there_are_at_most_20_commands_and_110_different_options() -> None:
-    found: Any = [commands.get_command(None, name) for name in COMMANDS]  # type: ignore[arg-type]
+    found = [commands.get_command(None, name) for name in COMMANDS]  # type: ignore[arg-type]
     options = {
         flag for command in found for one in command.params if isinstance(one, click.Option) for flag in one.opts
     }

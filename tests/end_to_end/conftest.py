@@ -28,7 +28,7 @@ evaluations = 150
 """
 TIMEOUT = 60.0  # s
 Process = subprocess.Popen[str]
-running: list[Process] = []
+running = []
 """Processes that a test has started."""
 
 
@@ -71,7 +71,7 @@ def workers_of(process: Process) -> list[psutil.Process]:
 
 def left_of_group(process: Process) -> list[str]:
     """Command lines of the processes in a command's process group that still run."""
-    command_lines: list[str] = []
+    command_lines = []
     for member in psutil.process_iter() if os.name == "posix" else ():
         try:
             if os.getpgid(member.pid) == process.pid and member.status() != psutil.STATUS_ZOMBIE:

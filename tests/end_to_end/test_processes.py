@@ -121,7 +121,7 @@ Start = Callable[..., Process]
 @pytest.fixture
 def start(small: None) -> Iterator[Start]:
     """Starts a program of Dask's in a process group of its own; all are ended with the test."""
-    running: list[Process] = []
+    running = []
 
     def begin(program: str, *arguments: str) -> Process:
         command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments, "--no-dashboard"]

@@ -82,7 +82,7 @@ def _digest(text: str) -> str:
 def platform_here() -> dict[str, str]:
     """The platform as a manifest records it."""
     study = small("native")
-    platform: dict[str, str] = identity_of(study, assemble(study))["platform"]
+    platform = identity_of(study, assemble(study))["platform"]
     return platform
 
 

@@ -156,7 +156,7 @@ def test_a_printed_command_asks_the_same() -> None:
     typed = shlex.split(ask.command_line(["its results"], "CPNA, night", values))
     assert typed[:5] == ["python", "-m", "safevar_sumo", "tolerance", "its results"]
     assert "--fits" not in typed
-    command: Any = commands.get_command(None, "tolerance")  # type: ignore[arg-type]
+    command = commands.get_command(None, "tolerance")  # type: ignore[arg-type]
     given = command.make_context("tolerance", typed[4:]).params
     assert given["point"] == "CPNA, night"
     assert {name: given[name] for name in values} == values

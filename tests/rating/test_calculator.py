@@ -150,7 +150,7 @@ class CalculatorScores:
             self.points.setdefault(test, []).append(float(row[6]))
         self.verified: list[dict[str, object]] = []
         for sheet in ("FC - Car & PTW verif.", "FC - Ped & Cyc verif."):
-            heads: tuple[object, ...] = ()
+            heads = ()
             for values in book[sheet].iter_rows(values_only=True):
                 if "Test point" in values:
                     heads = values
@@ -188,7 +188,7 @@ def fill_drawn_cells(preprocessed: Path, output: Path, rater: Rater, results: Ce
     passes = passing_cells(protocol, rater.points(results).colours)[0]
     numbers, matrices = {cell.name: number for number, cell in enumerate(protocol.cells)}, protocol.matrices
     for sheet in dict.fromkeys(matrix.sheet.removesuffix("pred.") for matrix in matrices):
-        headings: list[str] = []
+        headings = []
         for row in book[f"{sheet}verif."].iter_rows():
             values = [str(cell.value or "").strip() for cell in row]
             if "Test point" in values:

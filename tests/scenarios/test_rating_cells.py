@@ -60,7 +60,7 @@ def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
     """A cell and its layers; the target arrives after 6 s, or as soon as it can."""
     row = CROSSING[test]
     width = Crossing().vut_width
-    layers: list[dict[str, float]] = [
+    layers = [
         {},
         {"start_share": 0.75},
         *({"heading": float(turn)} for turn in row.headings),
@@ -200,7 +200,7 @@ def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direc
         corner = 40 * KMH * before + reach - 1.0
         y = 10 * KMH * before * math.cos(turned)
         hidden = (corner > 0) & (y * corner / x > scenario.vut_width / 2 + 1.0)
-        gaps: list[float] = []
+        gaps = []
         driven(scenario, Pedals(lambda seen: (gaps.append(seen.gap[0]) or seen.throttle, seen.brake)))  # noqa: B023
         assert np.isinf(gaps).tolist() == hidden[: len(gaps)].tolist()
         assert 0.5 < before[np.argmin(hidden)] < 3.0

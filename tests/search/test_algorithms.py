@@ -27,7 +27,7 @@ from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
-REQUIRED: dict[str, dict[str, Any]] = {
+REQUIRED = {
     "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
     "pymoo:RNSGA3": {"ref_points": [[0.5, 0.3, 6.0]], "pop_per_ref_point": 21},
 }
@@ -63,7 +63,7 @@ def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluat
 
 def steps_of(search: Search, evaluate: Callable[[FloatArray], Evaluations]) -> Iterator[Any]:
     """The requests of a search, then its result."""
-    answer: Any = None
+    answer = None
     try:
         while True:
             asked = search.send(answer)
@@ -94,7 +94,7 @@ def begun(
 
 def built(name: str, **arguments: Any) -> Algorithm:
     """An algorithm of ours or of pymoo."""
-    kind: Any = ALGORITHMS.get(name) or pymoo_algorithm(name, "study")
+    kind = ALGORITHMS.get(name) or pymoo_algorithm(name, "study")
     return msgspec.convert(REQUIRED.get(name, {}) | arguments, kind)  # type: ignore[no-any-return]
 
 

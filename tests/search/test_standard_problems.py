@@ -89,7 +89,7 @@ def standard_problem(
             for i in range(standard.variables)
         )
     )
-    scoring: Any = StandardScoring(standard)
+    scoring = StandardScoring(standard)
     return Problem(
         characteristics=unit,
         original=evaluated(unit, unit.original[np.newaxis], np.zeros(1)),

@@ -42,7 +42,7 @@ WEATHER = {
     "visibility": domain(0.5, 1, "-", 1),
     "recognition_delay": domain(0, 0.3, "s"),
 }
-CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+CASES = {
     "walker": (
         "sun",
         {"model": "pedestrian_crossing"},

@@ -94,7 +94,7 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
     check_network(network, "study")
     with open_world(copied_network(open_network(network), 2), 2) as world:
         world.enter(None)
-        seen: set[str] = set()
+        seen = set()
         for _ in range(60):
             world.api.simulationStep()
             there = world.actor_poses()

@@ -110,7 +110,7 @@ def refuse_difference(runs: System, traffic: Path, step: Callable[[Any, str], No
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
-    space: dict[str, Any] = {}
+    space = {}
     exec(CONTROLLERS, space)
     runs = system(name, CONTROLLERS, vehicle=NO_DELAYS)
     refuse_difference(runs, NET / "traffic.rou.xml", space[name])

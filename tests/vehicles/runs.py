@@ -9,12 +9,12 @@ import numpy as np
 
 from safevar_sumo.records import Command, FloatArray
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import slope_of
 
 STEP = 0.05
 STUDY_OF = {"carla": "sun", "lgsvl": "lgsvl", "sumo": "native", "worn": "wear"}
-SYSTEMS: dict[str, System] = {model: assemble(load_study(study)) for model, study in STUDY_OF.items()}
+SYSTEMS = {model: assemble(load_study(study)) for model, study in STUDY_OF.items()}
 Pedals = Callable[[float], tuple[Any, Any]]
 
 

@@ -15,7 +15,7 @@ from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
 from tests.made_up import seen
 from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original, prepare
 
-CARLA: Any = SYSTEMS["carla"].vehicle
+CARLA = SYSTEMS["carla"].vehicle
 
 
 def prepared(model: str, **changes: float) -> Any:

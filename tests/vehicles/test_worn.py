@@ -7,7 +7,6 @@ import sys
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -177,7 +176,7 @@ def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at
 
 WET_ROAD = {"name": "wet", "road_friction": 0.71, "visibility": 1.0, "water": 1.0}
 LATE = ("brakeResponse", "sensorLatency")
-ASSUMPTIONS: dict[str, Any] = {
+ASSUMPTIONS = {
     "as shipped": {},
     "grip of the road 20 % lower": {"weather": {**WET_ROAD, "road_friction": 0.8 * 0.71}},
     "water 20 % deeper": {"weather": {**WET_ROAD, "water": 1.2}},
