@@ -81,15 +81,10 @@ MAX_POINTS_NAMED = 6
 """Maximum number of failing test points that a sentence names."""
 
 
-def points_named(points: Sequence[str]) -> str:
-    """The names of test points in a sentence: `CPNA, speed 40, clear; CPLA, speed 60, clear and 3 more`."""
-    rest = len(points) - MAX_POINTS_NAMED
-    return "; ".join(points[:MAX_POINTS_NAMED]) + (f" and {rest} more" if rest > 0 else "")
-
-
 def points_in_words(failing_points: Sequence[str], point_count: int) -> str:
     """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25; CPLA, speed 60, clear.`"""
-    names = points_named(failing_points)
+    names, rest = "; ".join(failing_points[:MAX_POINTS_NAMED]), len(failing_points) - MAX_POINTS_NAMED
+    names += f" and {rest} more" if rest > 0 else ""
     return f"Fails at {len(failing_points)} of {point_count} points{names and f': {names}'}."
 
 

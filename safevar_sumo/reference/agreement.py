@@ -12,7 +12,7 @@ import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.case import Case
 
-COLUMNS = {
-    "metric": Column("", "safety metric; TET and TIT of the settings that collide neither here nor in the reference"),
-    "unit": Column("", "unit of the metric and of its errors"),
+COLUMNS: Columns = {
+    "metric": "safety metric; TET and TIT of the settings that collide neither here nor in the reference",
+    "unit": "unit of the metric and of its errors",
     "spearman": Column("-", "Spearman's rank correlation", ".3f"),
     "mean_absolute_error": Column("as in column unit", "mean of |here - reference|", ".3f"),
     "bias": Column("as in column unit", "mean of here - reference", ".3f"),

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -33,7 +33,7 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import contact_degree, point_record, simulate_all_points, study_at, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet
 
 REMARKS: Columns = {"remark": "what to know about this simulation"}
 CHARACTERISTICS: Columns = {
@@ -282,11 +282,8 @@ def _remark_table(remarks: list[str]) -> pd.DataFrame:
 
 
 def _characteristics(simulation: Simulation) -> pd.DataFrame:
-    def row(item: Characteristic) -> tuple[Any, ...]:
-        value = simulation.setting[item.name]
-        return item.name, item.unit, item.original, value, value != item.original, item.words
-
-    rows = map(row, CharacteristicSet.of(simulation.study))
+    pairs = zip(CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True)
+    rows = ((item.name, item.unit, item.original, value, value != item.original, item.words) for item, value in pairs)
     return tabulate(simulation.study.title, CHARACTERISTICS, rows)
 
 

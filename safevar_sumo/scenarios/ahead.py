@@ -42,6 +42,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     Heading,
     Metres,
     Seconds,
+    Speed,
     SpeedProfile,
     VehicleMover,
     change_target_lanes,
@@ -286,7 +287,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     """
 
     test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
-    speed: Annotated[float, Meta(gt=0, le=250)] = 50.0
+    speed: Speed = 50.0
     target_speed: Annotated[float, Meta(ge=0, le=250)] | None = None
     headway: Seconds | None = None
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0

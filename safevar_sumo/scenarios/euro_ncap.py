@@ -36,6 +36,8 @@ VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 """Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
 Seconds = Annotated[float, Meta(gt=0, le=60)]
+Speed = Annotated[float, Meta(gt=0, le=250)]
+"""Speed of a vehicle under test [km/h]."""
 ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
 """Point on or beside the vehicle's front [% of its width]."""
 Heading = Annotated[float, Meta(ge=-30, le=30)]

@@ -190,7 +190,7 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
     """
 
     network: str = "lead_vehicle_stopped"
-    duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
+    duration: Positive = 16.0
     distance: Positive | None = None
     grade: Grade = 0.0
     reactive_actors = False

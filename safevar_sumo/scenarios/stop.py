@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import STANDSTILL, Encounter, Trace
 from safevar_sumo.scenarios.base import VUT, Frame, Grade, Roads, Scenario, Scene, World, XmlChanges
-from safevar_sumo.scenarios.euro_ncap import KMH
+from safevar_sumo.scenarios.euro_ncap import KMH, Speed
 
 
 class Stop(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -27,7 +27,7 @@ class Stop(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         Rise of the road over its length, negative downhill [%].
     """
 
-    speed: Annotated[float, Meta(gt=0, le=250)] = 80.0
+    speed: Speed = 80.0
     duration: Annotated[float, Meta(gt=0, le=3600)] = 120.0
     grade: Grade = 0.0
     network: str = "along"

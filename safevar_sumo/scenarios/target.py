@@ -22,6 +22,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     ImpactLocation,
     PersonMover,
     Seconds,
+    Speed,
     VehicleMover,
 )
 
@@ -135,7 +136,7 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     test: str
-    speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
+    speed: Speed = 40.0
     impact_location: ImpactLocation = 50.0
     time_after: Seconds = 4.0
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH

@@ -77,6 +77,10 @@ POINTS: Columns = {
 }
 
 
+NUMBERS_OF_BOX = {"samples": "samples", "failures": "unsafe", "at_most": "at_most", "not_simulated": "failed"}
+"""The fields of `JointLimits` by their names among the numbers."""
+
+
 @question
 def tolerance(
     subject: Study | Case,
@@ -140,13 +144,10 @@ def tolerance(
         "unsafe": str(criterion),
         "margin": criterion.keep,
         "kept": not broken,
-        "samples": None if box is None else box.samples,
-        "failures": None if box is None else box.unsafe,
-        "at_most": None if box is None else box.at_most,
-        "not_simulated": None if box is None else box.failed,
+        **{name: getattr(box, field, None) for name, field in NUMBERS_OF_BOX.items()},
     }
     tables = {
-        "limits": tabulate("Limits, rounded to the safe side", LIMITS, pd.DataFrame(rows)),
+        "limits": tabulate("Limits, rounded to the safe side", LIMITS, rows),
         "intervals": tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans)),
     }
     if others:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator, Interval
 from safevar_sumo.questions.tolerance.joint import JointLimits
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
-from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
+from safevar_sumo.records import KMH_PER_MS, FloatArray
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.encounters import encounter
@@ -29,7 +30,7 @@ def limit_rows(
     box: JointLimits | None,
     limits: Mapping[str, Limit],
     unsafe: Unsafe,
-) -> tuple[list[JsonObject], list[str]]:
+) -> tuple[list[tuple[Any, ...]], list[str]]:
     """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept.
 
     `box` is None in a rated study, and around an unsafe original.
@@ -52,22 +53,13 @@ def limit_rows(
                 fails = _failures_alone(evaluator, {name: end}, unsafe).get(name, "the car fails in other encounters")
                 why = f"{fails} (outside by {by:.3g}{item.suffix})"
             broken.append(f"{name} {end:.5g}{item.suffix}: {why}")
-        (alone_low, alone_high), (low, high) = _rounded(one) or NOWHERE, together or NOWHERE
         rows.append(
-            {
-                "characteristic": name,
-                "unit": item.unit,
-                "original": item.original,
-                "alone_low": alone_low,
-                "alone_high": alone_high,
-                "together_low": low,
-                "together_high": high,
-                "specified_low": specified[0],
-                "specified_high": specified[1],
-                "kept": is_kept,
-                "fails_first": beyond.get(name) or beyond_alone.get(name),
-                "sentence": _sentence(item, together, specified, beyond.get(name)) if is_sought else None,
-            }
+            (
+                *(name, item.unit, item.original),
+                *(*(_rounded(one) or NOWHERE), *(together or NOWHERE), *specified),
+                *(is_kept, beyond.get(name) or beyond_alone.get(name)),
+                _sentence(item, together, specified, beyond.get(name)) if is_sought else None,
+            )
         )
     return rows, broken
 
