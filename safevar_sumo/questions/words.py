@@ -83,8 +83,8 @@ MAX_POINTS_NAMED = 6
 
 def points_in_words(failing_points: Sequence[str], point_count: int) -> str:
     """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25; CPLA, speed 60, clear.`"""
-    names, rest = "; ".join(failing_points[:MAX_POINTS_NAMED]), len(failing_points) - MAX_POINTS_NAMED
-    names += f" and {rest} more" if rest > 0 else ""
+    rest = len(failing_points) - MAX_POINTS_NAMED
+    names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (f" and {rest} more" if rest > 0 else "")
     return f"Fails at {len(failing_points)} of {point_count} points{names and f': {names}'}."
 
 
@@ -109,9 +109,8 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     if not study.scenario.search:
         return []
     names, those = join_phrases(study.scenario.search), "those" if left_out is None else f"{left_out:,}"
-    return [
-        f"Each vehicle drives in an encounter of its own ({names}); left out: {those} in which the original is not safe."
-    ]
+    left_out_in_words = f"left out: {those} in which the original is not safe"
+    return [f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}."]
 
 
 def constraints_in_words(study: Study) -> list[str]:
