@@ -115,5 +115,6 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 
 
 def one_of(names: Iterable[str]) -> str:
-    """The text `one of`, with all legal names, for an error message."""
-    return "one of " + ", ".join(sorted(names))
+    """The text `one of`, with all legal names, for an error message; `none` without any."""
+    listed = ", ".join(sorted(names))
+    return f"one of {listed}" if listed else "none"

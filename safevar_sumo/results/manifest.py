@@ -149,16 +149,25 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
-    """Those of a study's tables that affect evaluations."""
-    vehicle, search = tables["vehicle"], tables["search"]
-    characteristics = {
-        name: {key: value for key, value in row.items() if key not in DESCRIPTION_KEYS}
-        for name, row in vehicle["characteristics"].items()
-    }
+    """Those of a study's tables that affect evaluations; the model's error is the margin that originals have to keep
+    in a study that searches its scenario.
+    """
+    vehicle, search, scenario = tables["vehicle"], tables["search"], tables["scenario"]
+    searched = {}
+    if "search" in scenario:
+        searched["scenario"] = {**scenario, "search": _without_descriptions(scenario["search"])}
+        searched["model_error"] = tables.get("model_error", {})
     return {
         **{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS},
-        "vehicle": {**vehicle, "characteristics": characteristics},
+        **searched,
+        "vehicle": {**vehicle, "characteristics": _without_descriptions(vehicle["characteristics"])},
         "search": {key: value for key, value in search.items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS},
+    }
+
+
+def _without_descriptions(rows: JsonObject) -> JsonObject:
+    return {
+        name: {key: value for key, value in row.items() if key not in DESCRIPTION_KEYS} for name, row in rows.items()
     }
 
 

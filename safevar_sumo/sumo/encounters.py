@@ -18,7 +18,7 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.scenarios import SEARCHABLE, Point, Scenario, searchable_in
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Track
 from safevar_sumo.sumo.network import stage_networks
 from safevar_sumo.sumo.recording import Recording
@@ -38,7 +38,8 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
                 raise InputError(source, f"{key}.unit = {domain.unit!r}", repr(widest.unit))
             if domain.lower < widest.lower or domain.upper > widest.upper:
                 problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
-                raise InputError(source, problem, f"a part of [{widest.lower:g}, {widest.upper:g}] {widest.unit}")
+                part = f"[{widest.lower:g}, {widest.upper:g}]{unit_text(widest.unit)}"
+                raise InputError(source, problem, f"a part of {part}")
             first, other = points[0].weather, point.weather
             if name in SEARCHABLE["weather"] and getattr(first, name) != getattr(other, name):
                 problem = f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"

@@ -117,8 +117,9 @@ class Characteristic:
             Naming the value and what is expected.
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
+            sign = " above 0" if self.lower > 0 else " from 0" if self.is_scenario else ""
             expected = (
-                f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.largest_plausible:g}"
+                f"a finite number{sign}, up to {self.largest_plausible:g}"
                 if beyond
                 else f"a number in [{self.lower:g}, {self.upper:g}]"
             )
@@ -133,10 +134,12 @@ class Characteristic:
     def is_legal(self, values: Any, *, beyond: bool) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
-        A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0 if the domain is.
+        A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0 if the domain is,
+        and never below 0 in the scenario.
         """
         if beyond:
-            return (np.abs(values) <= self.largest_plausible) & ((values > 0) | (self.lower <= 0))
+            is_positive = (values > 0) | (self.lower <= 0) & ((values >= 0) | (not self.is_scenario))
+            return (np.abs(values) <= self.largest_plausible) & is_positive
         return (values >= self.lower) & (values <= self.upper)
 
 

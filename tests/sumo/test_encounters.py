@@ -247,6 +247,7 @@ MISTAKES = {
     "empty": ({"speed": {**SPEED, "upper": 30}}, "lower < upper"),
     "unit": ({"speed": {**SPEED, "unit": "m/s"}}, r"scenario\.search\.speed\.unit = 'm/s'"),
     "wide": ({"speed": TOO_WIDE}, r"a part of \[10, 80\] km/h"),
+    "pure": ({"road_friction": domain(0, 1, "-", 1)}, r"a part of \[0\.1, 1\.2\]$"),
     "fixed": ({"impact_location": PLACE}, r"scenario\.parameters\.impact_location = 25\.0 fixes it"),
     "impossible": ({"target_speed": domain(3, 8, "km/h")}, "needs .* s to the impact"),
     "vehicle": ({"payload": domain(3, 8, "kg")}, "a characteristic of the vehicle"),
@@ -272,5 +273,7 @@ def test_a_matrix_and_a_search_over_one_parameter_are_refused() -> None:
         load_study("wear", ads={"search": {"speed": SPEED}})
     with pytest.raises(InputError, match="weathers clear and night of the matrix set visibility, too"):
         assemble(load_study("euro_ncap_pedestrian", scenario={"search": {"visibility": WEATHER["visibility"]}}))
+    with pytest.raises(InputError, match="Stop has no such parameter to search\nexpected: none"):
+        assemble(load_study("stop", scenario={"search": {"road_friction": WEATHER["road_friction"]}}))
     with pytest.raises(InputError, match="the cells of euro_ncap_2026 are fixed"):
         load_study("euro_ncap_rating", scenario={"search": {"speed": SPEED}})
