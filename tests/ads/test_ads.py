@@ -5,6 +5,7 @@ Commands of the shipped ADSs are those of their formulas.
 from __future__ import annotations
 
 import copy
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -163,44 +164,32 @@ def test_an_ads_of_ones_own_warns() -> None:
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)
 
 
-def world_on_rails(**changes: object) -> WorldOnRails:
-    return WorldOnRails(
-        **{
-            **{
-                "first_command": 0.0,
-                "latency": 0.0,
-                "corridor": 2.5,
-                "brake_gap": 9.0,
-                "brake_gap_per_speed": 0.0,
-                "brake_place": 0.0,
-                "brake_gap_before": 0.0,
-                "brake_gap_past": 0.0,
-                "throttle": (0.9, 0.7, 0.4),
-            },
-            **changes,
-        }
-    )  # type: ignore[arg-type]
-
-
-def apollo(**changes: float) -> Apollo:
-    return Apollo(
-        **{
-            **{
-                "first_command": 0.0,
-                "cruise_speed": 8.0,
-                "cruise_gain": 1.0,
-                "cruise_acceleration": 1.5,
-                "jerk": 5.0,
-                "stop_gap": 5.0,
-                "comfortable_deceleration": 2.0,
-                "largest_deceleration": 3.0,
-                "creep_speed": 0.5,
-                "creep_time": 1.0,
-                "pedal_lag": 0.1,
-            },
-            **changes,
-        }
-    )
+world_on_rails = partial(
+    WorldOnRails,
+    first_command=0.0,
+    latency=0.0,
+    corridor=2.5,
+    brake_gap=9.0,
+    brake_gap_per_speed=0.0,
+    brake_place=0.0,
+    brake_gap_before=0.0,
+    brake_gap_past=0.0,
+    throttle=(0.9, 0.7, 0.4),
+)
+apollo = partial(
+    Apollo,
+    first_command=0.0,
+    cruise_speed=8.0,
+    cruise_gain=1.0,
+    cruise_acceleration=1.5,
+    jerk=5.0,
+    stop_gap=5.0,
+    comfortable_deceleration=2.0,
+    largest_deceleration=3.0,
+    creep_speed=0.5,
+    creep_time=1.0,
+    pedal_lag=0.1,
+)
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     monkeypatch.setattr(Evaluator, "simulate_cells", lambda self, settings, stage: None)
     monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
     original = evaluator.characteristics.original[np.newaxis]
-    ((endings, worse_cells),) = compare_at_cells(evaluator, original, original)
+    ((endings, worse_cells),) = compare_at_cells(evaluator, original)
     assert worse_cells == (matrix[0].name, matrix[4].name)
     assert endings.startswith(f"At {matrix[4].name}: ")
 

@@ -200,11 +200,11 @@ def _solutions_frame(population: Population, evaluator: Evaluator, reasons: Reas
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
     study, failures = evaluator.study, population.evaluations.take(list(reasons))
-    settings, original, unsafe = failures.settings, population.original.settings, population.unsafe
+    settings, unsafe = failures.settings, population.unsafe
     if is_rated(study):  # each neighbour is simulated in all cells
-        factors, comparisons = STEP_FACTORS[:1], compare_at_cells(evaluator, original, settings)
+        factors, comparisons = STEP_FACTORS[:1], compare_at_cells(evaluator, settings)
     else:
-        factors, comparisons = STEP_FACTORS, compare_at_points(assemble(study), original, settings, unsafe)
+        factors, comparisons = STEP_FACTORS, compare_at_points(assemble(study), settings, unsafe)
     is_judged = failures.collided & (not is_rated(study))
     judged = iter(judge_collisions(evaluator, failures.take(is_judged)).to_dict("records"))
     columns = {

@@ -171,51 +171,44 @@ original's), in the study's order.
 """
 
 
-def _endings_in_words(system: System, point: str, evaluations: Evaluations, row: int) -> str:
-    """How the runs of the original vehicle, in row 0, and of another vehicle end at a point."""
-    contact = contact_degree(system)
-    original, changed = (
-        ending_in_words(str(evaluations.outcome[k]), float(evaluations.f_safe[k]), contact) for k in (0, row)
-    )
+def _endings_in_words(system: System, point: str, both: Evaluations) -> str:
+    """How the runs of the original vehicle and of another vehicle end at a point."""
+    contact, pairs = contact_degree(system), zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
+    original, changed = (ending_in_words(outcome, degree, contact) for outcome, degree in pairs)
     return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 
 
-def compare_at_points(
-    system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe
-) -> list[PointComparison]:
-    """Compare settings, shape (M, n), with the original, shape (1, n), each in its own encounter."""
-    if len(system.characteristics.scenario) and len(settings) > 1:
-        groups = (compare_at_points(system, original, settings[[row]], unsafe) for row in range(len(settings)))
-        return [comparison for group in groups for comparison in group]
-    original = system.characteristics.with_original_vehicle(settings[:1]) if len(settings) else original
-    results = simulate_all_points(system, np.concatenate([original, settings]))
+def compare_at_points(system: System, settings: FloatArray, unsafe: Unsafe) -> list[PointComparison]:
+    """Compare M settings, shape (M, n), with the original vehicle, each in its own encounter."""
+    originals = system.characteristics.with_original_vehicle(settings)
+    results = simulate_all_points(system, np.concatenate([originals, settings]))
     at_points = [result.evaluations for result in results]
     is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)
     comparisons = []
-    for vehicle in range(1, len(worst)):  # vehicle 0 is the original
+    for original, vehicle in enumerate(range(len(settings), len(worst))):
         names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
         at_worst = results[worst[vehicle]]
-        sentence = _endings_in_words(system, at_worst.point.name, at_worst.evaluations, vehicle)
+        sentence = _endings_in_words(system, at_worst.point.name, at_worst.evaluations.take([original, vehicle]))
         comparisons.append((sentence, tuple(filter(None, names))))  # without a matrix, the only point has no name
     return comparisons
 
 
-def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> list[PointComparison]:
+def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointComparison]:
     """Compare settings with the original as `compare_at_points` does, for a rated study: at the cell whose colour
     worsens most.
 
     An unknown colour is neither better nor worse.
     """
-    system = assemble(evaluator.study)
+    system, original = assemble(evaluator.study), evaluator.characteristics.original
     assert system.rater is not None
-    cells = evaluator.simulate_cells(np.concatenate([original, settings]), "cells whose colour is worse")
+    cells = evaluator.simulate_cells(np.vstack([original, settings]), "cells whose colour is worse")
     colours = system.rater.points(cells).colours.astype(int)
     # Steps by which a colour is worse; the original is in row 0.
     losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
     comparisons = []
     for setting, loss in zip(settings, losses, strict=True):
         point = system.matrix[int(np.argmax(loss))]
-        evaluations = evaluate(system.at(point), np.stack([original[0], setting]))
+        evaluations = evaluate(system.at(point), np.stack([original, setting]))
         worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
-        comparisons.append((_endings_in_words(system, point.name, evaluations, 1), worse_cells))
+        comparisons.append((_endings_in_words(system, point.name, evaluations), worse_cells))
     return comparisons
