@@ -89,7 +89,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
-        reaction: Reaction = ReferenceDriver.start(self, n, nominal, step)
+        reaction = ReferenceDriver.start(self, n, nominal, step)
         return _Perceiving(reaction, np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0), np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:

@@ -274,7 +274,7 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
         is_seen = (np.abs(lateral) <= self.corridor) & (gap > self.release_gap)
         starts_braking = (gap <= braking_gap) & (gap > PASSED_GAP)
-        is_braking: BoolArray = is_seen & (starts_braking | was_braking)
+        is_braking = is_seen & (starts_braking | was_braking)
         return is_braking
 
     def _throttle(self, speed: FloatArray) -> FloatArray:

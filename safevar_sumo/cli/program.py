@@ -66,7 +66,7 @@ class LazyCommands(click.Group):
             if ":" in name:  # a question of the user's
                 from safevar_sumo.questions.ask import find_question
 
-                function: Any = find_question(name)
+                function = find_question(name)
             elif name in COMMANDS:
                 module, _, attribute = COMMANDS[name].partition(":")
                 function = getattr(importlib.import_module(f"safevar_sumo.{module}"), attribute)

@@ -243,7 +243,7 @@ def checked_class(code: UserCode, base: type) -> type:
 
         return method
 
-    methods: dict[str, Any] = {
+    methods = {
         name: checked_method(name, returned)
         for name, returned in getattr(base, "RETURNS", {}).items()
         if getattr(candidate, name, getattr(base, name)) is not getattr(base, name)

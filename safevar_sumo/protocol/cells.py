@@ -160,7 +160,7 @@ class Cell(NamedTuple):
         """The simulation of the cell: scenario model, parameters, and whether it is by night."""
         test = self.matrix.test_name
         model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
-        parameters: Parameters = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
+        parameters = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
         if self.impact_location is not None:
             parameters["impact_location"] = self.impact_location
         is_night = self.matrix.light == "night" or self.range_or_layer == NIGHT

@@ -281,7 +281,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]
-        value: Any = option.kind is bool or next(waiting, None)
+        value = option.kind is bool or next(waiting, None)
         try:
             value = value if option.kind is bool else option.kind(value)
         except (TypeError, ValueError):

@@ -76,9 +76,7 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
         remark = f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N draws more)."
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
-    cells: list[tuple[Any, ...]] = [
-        (conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes
-    ]
+    cells = [(conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes]
     table = tabulate("Where failures lie", COLUMNS, sorted(cells, key=lambda row: -row[4]))
     low, high = clopper_pearson(failures, total)
     verdict = (

@@ -213,7 +213,7 @@ def write_imported(
         raise InputError(path, "holds results of a campaign", "another directory")
     runs = (((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items())
     frame = solutions_frame(study.vehicle.characteristics, runs).drop(columns="run")
-    manifest: JsonObject = {
+    manifest = {
         "format": FORMAT,
         "study": tables_of(study),
         "imported": {"files": dict(files)},

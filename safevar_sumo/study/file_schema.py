@@ -7,7 +7,7 @@ import json
 import msgspec
 
 from safevar_sumo.shipped import STUDY_SCHEMA
-from safevar_sumo.study.schema import Parameters, Study
+from safevar_sumo.study.schema import Study
 
 EXTENDS = {"type": "string", "description": "The study that this file extends, by its name or the path of its file."}
 
@@ -16,7 +16,7 @@ def schema_text() -> str:
     """The content of the shipped file: the records' schema, in which a file that extends a study may leave out any key;
     the tables of algorithms and of a repair's parameters have names of their own.
     """
-    schema: Parameters = msgspec.json.schema(Study)
+    schema = msgspec.json.schema(Study)
     tables = schema["$defs"]
     for table in tables.values():
         table.pop("required", None)

@@ -103,7 +103,7 @@ def traci_api() -> Api:
 
 def sumo_options(files: CopiedNetwork) -> list[str]:
     """The options with which SUMO simulates copies of a network."""
-    options: dict[str, object] = {
+    options = {
         "-c": files.options,
         "-n": files.network,
         "-r": files.traffic,

@@ -5,7 +5,7 @@ would a reference driver have avoided it?
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import pandas as pd
@@ -155,7 +155,7 @@ def explain(
         **_statistics(evaluator, needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
         "distinct_causes": _distinct_table(evaluator, [causes[row] for row in sample]),
     }
-    numbers: JsonObject = {
+    numbers = {
         **_counts(population, subject),
         "analysed": len(sample),
         "explained": len(solutions),
@@ -335,7 +335,7 @@ def draw_needed(answer: Answer) -> Figure:
     frame = answer.tables["characteristics"].iloc[::-1]  # bars are drawn from the bottom up
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
     figure, ((axis,),) = new_figure(f"{answer.study.name}: changed and needed", 1, 1, size)
-    names: Any = [escape_dollars(name) for name in frame["characteristic"]]
+    names = [escape_dollars(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
         ("changed", "changed", GREY, 0.8),
         ("in_some", "in some minimal cause", SKY_BLUE, 0.5),

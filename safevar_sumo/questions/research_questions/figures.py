@@ -258,7 +258,7 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
         If no figure can be drawn.
     """
     figures, errors = {}, []
-    drawings: dict[str, Callable[[], Figure]] = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
+    drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
         drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)
     for name, draw_figure in drawings.items():

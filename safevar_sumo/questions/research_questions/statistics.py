@@ -119,7 +119,7 @@ def effect_interval(effect: float, m: int, n: int | None, alpha: float = ALPHA) 
     limit = float(scipy.stats.norm.isf(alpha / 2)) ** 2
 
     def excess(value: float) -> float:
-        variance: float = value * (1 - value) / m
+        variance = value * (1 - value) / m
         if n is not None:
             variance *= (1 + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))) / n
         return (effect - value) ** 2 - limit * variance

@@ -5,7 +5,7 @@ tables.toml beside this module.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -32,7 +32,7 @@ class PaperTable(NamedTuple):
     def of(cls, name: str, compute: Compute) -> PaperTable:
         """A table as the file has it."""
         table, columns = DATA["tables"][name], dict[str, Column]()
-        known: dict[str, Any] = DATA["columns"] | table.get("own", {})
+        known = DATA["columns"] | table.get("own", {})
         for key in table["columns"]:
             facts = {"meaning": known[key]} if isinstance(known[key], str) else dict(known[key])
             has_interval = facts.pop("interval", False)

@@ -26,7 +26,7 @@ from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limit
 from safevar_sumo.questions.tolerance.rows import limit_rows
 from safevar_sumo.questions.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, scan
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study, limits_of
 from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
@@ -140,7 +140,7 @@ def tolerance(
         limits_of_box = {**specified, **everywhere}
         box = find_joint_limits(evaluator, all_columns, criterion, limits_of_box, scans, np.concatenate(known))
     rows, broken = limit_rows(evaluator, scans, box, specified, criterion)
-    numbers: JsonObject = {
+    numbers = {
         "unsafe": str(criterion),
         "margin": criterion.keep,
         "kept": not broken,

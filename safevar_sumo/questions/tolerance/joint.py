@@ -147,7 +147,7 @@ class _BoxSearch:
 
     def unsafe_inside(self, sides: FloatArray) -> FloatArray:
         """The known unsafe settings that a box holds."""
-        inside: FloatArray = self.unsafe_settings[(self.extents(self.unsafe_settings) <= sides).all(axis=(1, 2))]
+        inside = self.unsafe_settings[(self.extents(self.unsafe_settings) <= sides).all(axis=(1, 2))]
         return inside
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
@@ -174,7 +174,7 @@ class _BoxSearch:
         if len(known):
             return known
         points = self.points(sides, SEARCH_POINTS)
-        found: FloatArray = points[self.are_unsafe(points)]
+        found = points[self.are_unsafe(points)]
         return found
 
     def learn(self, settings: FloatArray) -> None:
