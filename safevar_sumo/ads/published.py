@@ -9,8 +9,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Ads, DelayLine, interpolate_tables
-from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.ads.base import Ads, DelayLine, Trim, pedals_for
+from safevar_sumo.records import KMH_PER_MS, ZERO, BoolArray, Command, FloatArray, Nominal, Observation
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -153,16 +153,9 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def _pedals(self, seen: Observation, memory: _ApolloMemory) -> Command:
         """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
-        nominal = memory.nominal
-        coasting, full_throttle = interpolate_tables(
-            nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle
-        )
-        excess = memory.commanded_acceleration + coasting
-        throttle = np.minimum(np.maximum(excess / (full_throttle + coasting), 0.0), 1.0)
-        brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
-        throttle[memory.has_begun_to_stop] = 0.0
-        brake[~memory.has_begun_to_stop] = 0.0
-        return Command(throttle, brake)
+        pedals = pedals_for(memory.nominal, seen.speed, memory.commanded_acceleration, Trim(ZERO, ZERO))
+        stops = memory.has_begun_to_stop
+        return Command(np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0))
 
 
 UpTo60 = Annotated[float, Meta(ge=0, le=60)]
