@@ -19,7 +19,6 @@ from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.simulate import load_target
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.network import Network, built_network, run_program
 from safevar_sumo.sumo.system import assemble
 
@@ -211,14 +210,13 @@ def export(
     """
     if out.exists() or out.is_symlink():
         raise InputError("out", f"{out} exists", "a new directory")
-    target = load_target(directory, solution, [], as_it_is_now)
-    study = target.study if point is None else study_at(target.study, point, source="point")
-    system = assemble(study, directory)
+    target = load_target(directory, solution, [], as_it_is_now, point)
+    system = assemble(target.study, directory)
     setting = target.setting(system)
     vehicle, of_vehicle = system.characteristics.vehicle, setting[system.characteristics.of_vehicle]
     values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
     physics = carla_physics(values, directory) if to == "carla" else {}
-    write_files(compare_setting(study, system, setting), to, out, solution, physics)
+    write_files(compare_setting(target.study, system, setting), to, out, solution, physics)
     return f"{to}: {out}"
 
 

@@ -144,9 +144,7 @@ def simulate(
     """
     choices = {"most_severe": most_severe, "fewest": fewest, "smallest": smallest}
     chosen = [name for name, given in choices.items() if given]
-    target = load_target(source, solution, chosen, as_it_is_now)
-    if point is not None:
-        target = target._replace(study=study_at(target.study, point, source="point"))
+    target = load_target(source, solution, chosen, as_it_is_now, point)
     system = assemble(target.study, source)
     values = read_changes(set, system.characteristics, "set", beyond=beyond)
     requested = _combine(values, target.setting(system), system)
@@ -205,13 +203,14 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     )
 
 
-def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_now: bool) -> Target:
-    """The study by name or path, or that of a results directory, with the solution that is named or chosen.
+def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_now: bool, point: str | None) -> Target:
+    """The study by name or path, or that of a results directory, at a point or as a whole, with the solution that is
+    named or chosen.
 
     Raises
     ------
     InputError
-        If there is no such study, directory or solution, or two options choose one.
+        If there is no such study, directory, solution or point, or two options choose a solution.
     """
     wanted = [*chosen, *([] if solution is None else [f"solution {solution}"])]
     if len(wanted) > 1:
@@ -219,8 +218,10 @@ def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_n
     subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=bool(wanted))
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
+    whole = study_in(subject)
+    study = whole if point is None else study_at(whole, point, source="point")
     if isinstance(subject, Study) or not wanted:
-        return Target(study_in(subject), source)
+        return Target(study, source)
     subject.require_solutions()
     handle = (
         choose_handle(subject.solutions, subject.unsafe, chosen[0], source)
@@ -228,7 +229,7 @@ def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_n
         else SolutionId.parse(str(solution))
     )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
-    return Target(subject.study, source, handle, {str(name): value for name, value in row.items()})
+    return Target(study, source, handle, {str(name): value for name, value in row.items()})
 
 
 def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -> FloatArray:

@@ -45,6 +45,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     Speed,
     SpeedProfile,
     VehicleMover,
+    approach,
     change_target_lanes,
     lateral_offset,
     target_type,
@@ -104,7 +105,7 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
         direction = self.direction
         if direction == SAME_DIRECTION:
             return {}
-        frame, length = Frame.of(roads.lane(VUT_LANE)), self._body.length
+        frame, length = approach(roads), self._body.length
         rear_along, rear_left = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
         entry, exit_ = (
             (rear_along + distance * direction.along, rear_left + distance * direction.left)
@@ -131,7 +132,7 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
                     "departSpeed": as_text(self.target_speed_at(0.0)),
                 },
             }
-        exit_along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
+        exit_along, _ = approach(roads).lane_coordinates(roads.lane(EXIT_LANE).start)
         rotated = {"type": name, "route": "beyond", "departPos": repr(FRONT_POSITION)}
         return {
             **self._vehicle_at(exit_along + FRONT_POSITION * direction.along - self._depth - self.gap),

@@ -20,7 +20,6 @@ from safevar_sumo.scenarios.euro_ncap import (
     STOP_DISTANCE,
     TARGET,
     TESTS,
-    VUT_LANE,
     BodySize,
     Direction,
     Heading,
@@ -29,6 +28,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     Seconds,
     SpeedProfile,
     VehicleMover,
+    approach,
     lateral_offset,
 )
 from safevar_sumo.scenarios.target import (
@@ -216,11 +216,11 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the target's lanes: their direction."""
-        return _Start.of(self).mover.lanes(Frame.of(roads.lane(VUT_LANE)), roads)
+        return _Start.of(self).mover.lanes(approach(roads), roads)
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle before the target's path, the target beside the vehicle's lane, and the parked cars, if any."""
-        frame, start = Frame.of(roads.lane(VUT_LANE)), _Start.of(self)
+        frame, start = approach(roads), _Start.of(self)
         impact_position = start.mover.impact_position(frame, roads, start.impact_left)
         return {
             **self._vehicle_at(self._front(start, impact_position)),
@@ -233,7 +233,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return impact_position - start.extent.length / 2 - self.test_speed * start.time_to_impact
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        frame, start, times = Frame.of(roads.lane(VUT_LANE)), _Start.of(self), np.arange(samples)[:, np.newaxis] * step
+        frame, start, times = approach(roads), _Start.of(self), np.arange(samples)[:, np.newaxis] * step
         impact_position = start.mover.impact_position(frame, roads, start.impact_left)
         front = self._front(start, impact_position)
         if isinstance(start.mover, PersonMover):
@@ -261,7 +261,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return changes
 
     def _motion(self, world: World) -> TargetMotion:
-        frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
+        frame, start = approach(world), _Start.of(self)
         constants = EncounterConstants(
             passed_gap=-start.extent.length - self.vut_length,
             hidden=self.parameter("hidden"),

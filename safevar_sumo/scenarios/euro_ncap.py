@@ -104,6 +104,11 @@ TARGET_LANE_LENGTH = 300.0
 """Length of the target's lanes before the junction and beyond it [m]."""
 
 
+def approach(roads: Roads | World) -> Frame:
+    """The coordinates of the vehicle's lane before the junction."""
+    return Frame.of(roads.lane(VUT_LANE))
+
+
 def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction) -> XmlChanges:
     """Changes that make the target's lanes straight in a direction, from `entry` to `exit_` on the junction.
 

@@ -25,7 +25,7 @@ from safevar_sumo.scenarios.base import (
     XmlChanges,
     as_text,
 )
-from safevar_sumo.scenarios.euro_ncap import VUT_LANE
+from safevar_sumo.scenarios.euro_ncap import approach
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
@@ -95,7 +95,7 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         if self.distance is not None:
             changes["vehicle[@id='vut']"] = {"departPos": as_text(self._front(roads))}
         if self.lateral_start is not None:
-            _, left = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
+            _, left = approach(roads).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
             changes["person[@id='pedestrian']"] = {"departPos": as_text(-left - self.lateral_start)}
         if self.walking_speed is not None:
             changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
@@ -105,10 +105,10 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         """Position of the vehicle's front on its lane at the start [m]; None as in the traffic file."""
         if self.distance is None:
             return None
-        return Frame.of(roads.lane(VUT_LANE)).crossing_position(roads, CROSSING_LANE) - self.distance
+        return approach(roads).crossing_position(roads, CROSSING_LANE) - self.distance
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        frame, times = Frame.of(roads.lane(VUT_LANE)), np.arange(samples)[:, np.newaxis]
+        frame, times = approach(roads), np.arange(samples)[:, np.newaxis]
         speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
         start = LATERAL_START if self.lateral_start is None else self.lateral_start
         lateral, turned = speed * step * times - start, np.zeros((samples, 1), dtype=bool)

@@ -58,9 +58,7 @@ def test_a_study_that_simulates_alike_shares_the_shipped_agreement() -> None:
     assert shipped_agreement(load_study(sun, ads={"parameters": {"brake_gap": 7.0}})).empty
 
 
-def test_rank_correlation_of_known_orders() -> None:
-    assert rank_correlation(np.array([1.0, 2, 3]), np.array([10.0, 20, 30])) == pytest.approx(1)
-    assert rank_correlation(np.array([1.0, 2, 3]), np.array([3.0, 2, 1])) == pytest.approx(-1)
+def test_equal_values_and_too_few_have_no_rank_correlation() -> None:
     for undefined in ([1.0, 1, 1], [1.0], []):
         assert np.isnan(rank_correlation(np.arange(len(undefined)), np.array(undefined)))
 
