@@ -176,6 +176,7 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
 
 
+@pytest.mark.slow
 def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
     Path("mine.py").write_text(
         "class Mine:\n    title = 'My own search'\n\n    def search(self, problem, rng):\n"

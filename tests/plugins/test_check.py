@@ -178,7 +178,7 @@ DEFECTS = {
         "traci", "contract", CONTROLLER, "BODY", "traci.vehicle.setSpeed('parked_ahead', 0)", "parked_ahead"
     ),
 }
-FAST = ("random", "mean over vehicles", "out of range", "scenario undeclared reaction", "algorithm learns")
+FAST = ("random", "mean over vehicles", "out of range", "scenario undeclared reaction")
 
 
 @pytest.mark.parametrize(

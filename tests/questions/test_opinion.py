@@ -166,6 +166,7 @@ class Made(WornVehicle, frozen=True, kw_only=True):
 ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
 
 
+@pytest.mark.slow
 def test_the_gap_stands_beside_a_safety_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
     frame, ends = judge_causes(load_study("native"), causes(("nsga2:0:0", {"maxSpeed": 12.0}, 0.99, 1.0)), Unsafe())

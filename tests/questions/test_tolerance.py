@@ -81,6 +81,7 @@ def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: lis
         assert alone.safe == ((0.0, pytest.approx(low, abs=1e-4)) if low > 5 else (pytest.approx(high, abs=1e-4), 10.0))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     answer = answer_of(2, two_islands, lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75), unsafe="collision")
     frame = answer.tables["intervals"]
@@ -260,6 +261,7 @@ def test_a_car_that_keeps_all_printed_limits_keeps_the_margin_at_every_point(nam
         assert np.nanmin(result.evaluations.f_safe) >= margin + contact, result.point.name
 
 
+@pytest.mark.slow
 def test_the_margin_is_added_to_a_collision_alone() -> None:
     """Safety degrees are 8 - |a - 5|, and 1 m less than 5 m is left from a = 8 on."""
 

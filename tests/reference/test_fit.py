@@ -36,6 +36,7 @@ def data() -> ReferenceData:
     return ReferenceData(settings, dict(evaluate(system, settings).metrics))
 
 
+@pytest.mark.slow
 def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
     data: ReferenceData, in_tmp: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,6 +165,7 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
     assert not other.model_error
 
 
+@pytest.mark.slow
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("SCAN_VALUES", "COARSE_SCAN_VALUES"):
         monkeypatch.setattr(scans, name, 21)
