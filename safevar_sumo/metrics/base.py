@@ -162,11 +162,6 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
     objectives: tuple[Objective, ...]
     safe_original: float | None = None
 
-    @property
-    def is_constrained(self) -> bool:
-        """Whether settings can be infeasible, which their evaluation tells."""
-        return self.safe_original is not None
-
     def violation(self, evaluations: Evaluations) -> FloatArray:
         """By how much the original vehicle is not safe in each setting's encounter, shape (M,); 0 if it is, infinite if
         it could not be simulated.

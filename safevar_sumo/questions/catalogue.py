@@ -58,12 +58,14 @@ FINDINGS: Columns = {
 
 def list_models(kind: str | None = None) -> Answer:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with KIND only these."""
+    effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
+    weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
     tables = {
         "studies": tabulate("Studies", STUDIES, _studies()),
         "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
         "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
         "scenarios": tabulate("Scenarios", SCENARIO, _scenarios()),
-        "weathers": tabulate("Weathers", WEATHER, _weathers()),
+        "weathers": tabulate("Weathers", WEATHER, weathers),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
         "metrics": tabulate(
             "Metrics", DESCRIBED, ((name, one.description) for name, one in {**METRICS, **OPTIONAL_METRICS}.items())
@@ -101,11 +103,6 @@ def _scenarios() -> Iterator[tuple[str, ...]]:
         parameters = searchable_in(SCENARIOS[name]).items()
         domains = (f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in parameters)
         yield name, description, "; ".join(domains)
-
-
-def _weathers() -> pd.DataFrame:
-    effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
-    return pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
 
 
 def check(name: str) -> Answer:

@@ -176,7 +176,12 @@ def simulate(
 def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of a matrix."""
     study, setting = target.study, simulation.evaluation.settings[0]
-    remarks = [*_remarks(system), *_resets(simulation)]
+    remarks = _remarks(system)
+    remarks += (
+        f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
+        f"{simulation.setting[name]:g}; --no-filter keeps it."
+        for name, value in simulation.reset_values.items()
+    )
     tables = {"characteristics": _characteristics(simulation), "results": _results(simulation)}
     verdict = [simulation.no_verdict, *_verdict(simulation)]
     if system.rater is not None:
@@ -323,11 +328,3 @@ def _remarks(system: System) -> list[str]:
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     types = pre_crash_sentence(system.points)
     return [*remarks, *system.remarks, *vehicle_remarks(system), *([types] if types else [])]
-
-
-def _resets(simulation: Simulation) -> list[str]:
-    return [
-        f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
-        f"{simulation.setting[name]:g}; --no-filter keeps it."
-        for name, value in simulation.reset_values.items()
-    ]

@@ -151,7 +151,7 @@ class _Ranges:
 
     def _originals(self, window: Evaluations) -> FloatArray:
         """The first objective of the original vehicle; in its own encounter, if that is a safety degree there."""
-        if self._scoring.is_constrained and self._scoring.objectives[0] == F_SAFE:
+        if self._scoring.safe_original is not None and self._scoring.objectives[0] == F_SAFE:
             return window.column(ORIGINAL_DEGREE)
         return np.full(len(window), self._original_objective)
 

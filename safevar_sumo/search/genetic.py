@@ -76,7 +76,8 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         reproduction = Reproduction(self, problem, rng)
-        offspring, survivors, used = initial_population(problem, rng), list[Individual](), 0
+        first = problem.uniform(min(problem.population, problem.evaluations), rng)
+        offspring, survivors, used = [*map(Individual, first.tolist())], list[Individual](), 0
         while offspring:
             used += yield from request_evaluations(offspring, problem)
             alive = survivors + [individual for individual in offspring if not individual.has_failed]
@@ -148,13 +149,6 @@ class Reproduction:
             child, self._operators.mutation_index, self._lower, self._upper, self._mutation_probability
         )
         return child
-
-
-def initial_population(problem: Problem, rng: np.random.Generator) -> list[Individual]:
-    """The first population, uniform in the domains."""
-    return [
-        Individual(values) for values in problem.uniform(min(problem.population, problem.evaluations), rng).tolist()
-    ]
 
 
 def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
