@@ -144,7 +144,7 @@ def usual_questions(case: Case, directory: Path, point: str | None = None) -> li
         handle = choose_handle(case.solutions, case.unsafe, "fewest", directory) if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]
     promises = case.study.repair.promise or case.study.limits
-    return [*USUAL_QUESTIONS, *(["repair"] if promises and not case.study.scenario.search else [])]
+    return [*USUAL_QUESTIONS, *(["repair"] if promises else [])]
 
 
 def answer_to(
