@@ -182,7 +182,9 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         f"{simulation.setting[name]:g}; --no-filter keeps it."
         for name, value in simulation.reset_values.items()
     )
-    tables = {"characteristics": _characteristics(simulation), "results": _results(simulation)}
+    original, simulated, units = simulation.original.numbers, simulation.numbers, {"outcome": "", **simulation.units}
+    results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
+    tables = {"characteristics": _characteristics(simulation), "results": tabulate("Results", RESULTS, results)}
     verdict = [simulation.no_verdict, *_verdict(simulation)]
     if system.rater is not None:
         verdict.append(f"The command `rating` simulates all {len(system.matrix)} cells and variations.")
@@ -291,12 +293,6 @@ def _characteristics(simulation: Simulation) -> pd.DataFrame:
     pairs = zip(CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True)
     rows = ((item.name, item.unit, item.original, value, value != item.original, item.words) for item, value in pairs)
     return tabulate(simulation.study.title, CHARACTERISTICS, rows)
-
-
-def _results(simulation: Simulation) -> pd.DataFrame:
-    original, simulated = simulation.original.numbers, simulation.numbers
-    names = {"outcome": "", **simulation.units}
-    return tabulate("Results", RESULTS, [(name, unit, original[name], simulated[name]) for name, unit in names.items()])
 
 
 def _verdict(simulation: Simulation) -> list[str]:

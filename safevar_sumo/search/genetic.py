@@ -114,12 +114,15 @@ class Reproduction:
 
     def draw_offspring(self, population: list[Individual], number: int) -> list[Individual]:
         """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
-        offspring = list[Individual]()
+        offspring, operators, domains = list[Individual](), self._operators, (self._lower, self._upper)
         with self._randomness():
             while population and len(offspring) < number:
-                size = self._operators.tournament_size
-                parents = run_tournament(population, size), run_tournament(population, size)
-                offspring += self._feasible_children([self._mutate(child) for child in self._crossover(*parents)])
+                pair = [Individual(run_tournament(population, operators.tournament_size)) for _ in range(2)]
+                if random.random() <= operators.crossover_probability:
+                    tools.cxSimulatedBinaryBounded(*pair, operators.crossover_index, *domains)
+                for child in pair:
+                    tools.mutPolynomialBounded(child, operators.mutation_index, *domains, self._mutation_probability)
+                offspring += self._feasible_children(pair)
         return offspring[:number]
 
     def _feasible_children(self, children: list[Individual]) -> list[Individual]:
@@ -137,18 +140,6 @@ class Reproduction:
             self._misses = 0
             return [Individual(values) for values in self._problem.repaired(np.array(children)).tolist()]
         return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
-
-    def _crossover(self, first: Individual, second: Individual) -> tuple[Individual, Individual]:
-        children = Individual(first), Individual(second)
-        if random.random() <= self._operators.crossover_probability:
-            tools.cxSimulatedBinaryBounded(*children, self._operators.crossover_index, self._lower, self._upper)
-        return children
-
-    def _mutate(self, child: Individual) -> Individual:
-        tools.mutPolynomialBounded(
-            child, self._operators.mutation_index, self._lower, self._upper, self._mutation_probability
-        )
-        return child
 
 
 def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
