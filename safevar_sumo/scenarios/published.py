@@ -35,6 +35,14 @@ WALKING_SPEED, LATERAL_START = 1.8, 5.16
 """The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic file."""
 
 
+def _place(position: float, name: str) -> str:
+    """A place at the start [m], which a parameter decides, as text; SUMO counts one below 0 from the lane's end."""
+    if position < 0:
+        problem = f"{name} is {-position:.2f} m longer than the lane before the encounter"
+        raise InputError("scenario.parameters", problem, f"a smaller {name}")
+    return as_text(position)
+
+
 class _Memory(NamedTuple):
     """What the scenario remembers of a run.
 
@@ -93,10 +101,10 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         """The vehicle, the pedestrian's start and speed, as far as the study sets them."""
         changes = {}
         if self.distance is not None:
-            changes["vehicle[@id='vut']"] = {"departPos": as_text(self._front(roads))}
+            changes["vehicle[@id='vut']"] = {"departPos": _place(self._front(roads), "distance")}
         if self.lateral_start is not None:
             _, left = approach(roads).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
-            changes["person[@id='pedestrian']"] = {"departPos": as_text(-left - self.lateral_start)}
+            changes["person[@id='pedestrian']"] = {"departPos": _place(-left - self.lateral_start, "lateral_start")}
         if self.walking_speed is not None:
             changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
         return changes
@@ -199,7 +207,7 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle at its distance from the parked one, if the study sets it."""
-        return {} if self.distance is None else {"vehicle[@id='vut']": {"departPos": as_text(self._front)}}
+        return {} if self.distance is None else {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
 
     @property
     def _front(self) -> Any:

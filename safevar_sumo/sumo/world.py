@@ -47,6 +47,9 @@ class SumoWorld:
         """Copies whose vehicle under test is on the road, by the vehicle's id."""
         self._speeds, self._fronts = np.zeros(n), np.zeros((n, 2))
         """Speeds and fronts of the vehicles under test; the last ones of those that have left the road."""
+        self._persons: dict[str, FloatArray] = {}
+        """Places of persons by actor; beside vehicles that have left the road the last ones, if a person has left, too.
+        """
         self._commanded_speeds = np.full(n, np.nan)
         self._struck_ids: dict[int, str] = {}
         """Ids of the actors that the vehicles under test collided with last, by copy."""
@@ -178,7 +181,14 @@ class SumoWorld:
         return np.array([*map(self._get_position, self.ids(actor))])
 
     def person_positions(self, actor: str) -> FloatArray:
-        return np.array([*map(self._get_person_position, self.ids(actor))])
+        ids, copies = self.ids(actor), [*self.driving.values()]
+        try:
+            positions = np.array([*map(self._get_person_position, ids)])
+        except self.api.TraCIException:  # one has left the road
+            positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()
+            positions[copies] = [self._get_person_position(ids[copy]) for copy in copies]
+        self._persons[actor] = positions
+        return positions
 
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """All actors on the road, by id: x and y of front or person [m], heading clockwise from north [degrees]."""

@@ -4,6 +4,7 @@ refused.
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
+from safevar_sumo.scenarios import SEARCHABLE
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.engine import Engine
@@ -134,6 +136,20 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
     np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
     assert settings_per_batch(system, Engine.RECORDED) > len(settings)
+
+
+@pytest.mark.parametrize("case", ["walker", "parked"])
+def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
+    """In some, a pedestrian has left the road while other copies go on."""
+    base, scenario, _ = CASES[case]
+    widest = SEARCHABLE[scenario["model"]]
+    search = {name: domain(one.lower, one.upper, one.unit) for name, one in widest.items()}
+    system = assemble(load_study(base, matrix=None, scenario={**scenario, "search": search}))
+    corners = product(*((one.lower, one.upper) for one in widest.values()))
+    settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
+    recorded, in_sumo = (evaluate(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+    assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
+    np.testing.assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
 
 
 def planted(**changes: Any) -> Study:
