@@ -48,6 +48,8 @@ PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 PARKED_WIDTH = 1.8
 TIME_TO_IMPACT = 6.0
 """Time from the start to the impact, unless the target needs longer [s]."""
+FASTEST_PERSON = 25 * KMH
+"""Speed of a fast runner [m/s]; SUMO moves persons above some 34 km/h in other steps than the recorded scene has."""
 LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
 ROUNDING_STEP = 0.5
@@ -91,6 +93,9 @@ class _Start(NamedTuple):
         """
         target, lateral_start = test.parameter("target"), test.parameter("lateral_start")
         speed = test.parameter("target_speed") * KMH
+        if test.is_on_foot and np.max(speed) > FASTEST_PERSON:
+            problem = f"target_speed = {np.max(speed) / KMH:g} km/h of a person on foot"
+            raise InputError("scenario.parameters", problem, f"at most {FASTEST_PERSON / KMH:g} km/h")
         sign = 1.0 if test.parameter("side") == "near" else -1.0  # 1 for a target that moves to the left
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         direction = (FROM_RIGHT if sign > 0 else FROM_LEFT).turned(test.heading)

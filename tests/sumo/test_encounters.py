@@ -266,6 +266,7 @@ MISTAKES = {
     "pure": ({"road_friction": domain(0, 1, "-", 1)}, r"a part of \[0\.1, 1\.2\]$"),
     "fixed": ({"impact_location": PLACE}, r"scenario\.parameters\.impact_location = 25\.0 fixes it"),
     "impossible": ({"target_speed": domain(3, 8, "km/h")}, "needs .* s to the impact"),
+    "runner": ({"target_speed": domain(20, 30, "km/h")}, "target_speed = 30 km/h of a person on foot"),
     "vehicle": ({"payload": domain(3, 8, "kg")}, "a characteristic of the vehicle"),
     "key": ({"speed": {**SPEED, "weight": 2}}, "there is no such key"),
 }
