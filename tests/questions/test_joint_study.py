@@ -64,7 +64,9 @@ def _few_encounters(joint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluator, "CANDIDATES", 64)
 
 
-@pytest.mark.parametrize("typed", QUESTIONS)
+@pytest.mark.parametrize(
+    "typed", [pytest.param(typed, marks=pytest.mark.slow if "explain tiny" in typed else ()) for typed in QUESTIONS]
+)
 def test_a_question_says_which_encounters_count(typed: str) -> None:
     assert re.search(QUESTIONS[typed], json_of(*typed.split())["verdict"])
 
@@ -117,6 +119,7 @@ def test_changes_are_those_of_the_vehicle(case: Case) -> None:
     assert "distance" not in {one["characteristic"] for one in tables["rq3.2"]["rows"]}
 
 
+@pytest.mark.slow
 def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path) -> None:
     (joint / "wider.toml").write_text(STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20"))
     answer = json_of("compare", "results", "wider.toml", "--samples", "64")

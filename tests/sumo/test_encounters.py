@@ -172,7 +172,7 @@ def planted(**changes: Any) -> Study:
         "search": {
             "algorithms": ["nsga2", "rs", "safe_fuzzer"],
             "population": 30,
-            "evaluations": 300,
+            "evaluations": 150,
             "runs": 1,
             "seed": 1,
         },
