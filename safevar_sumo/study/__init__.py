@@ -14,6 +14,7 @@ from safevar_sumo.study.file import (
     fmus_of as fmus_of,
     load_study as load_study,
     plain_values as plain_values,
+    study_names as study_names,
     user_code as user_code,
     user_code_names as user_code_names,
     user_modules as user_modules,
@@ -40,8 +41,6 @@ from safevar_sumo.study.schema import (
     Weather as Weather,
     label_of as label_of,
     locate_parameter as locate_parameter,
-    study_names as study_names,
-    study_path as study_path,
     tables_of as tables_of,
 )
 from safevar_sumo.study.validation import convert_table as convert_table

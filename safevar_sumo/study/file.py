@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.schema import (
@@ -28,7 +28,6 @@ from safevar_sumo.study.schema import (
     StudyLike,
     Tables,
     locate_parameter,
-    study_path,
     tables_of,
 )
 from safevar_sumo.study.validation import convert_table
@@ -49,6 +48,27 @@ class _RawStudy(NamedTuple):
     source: object
     tables: Parameters
     origin: Origin = Origin()
+
+
+def study_names() -> list[str]:
+    """Names of the shipped studies."""
+    return sorted(path.stem for path in STUDIES.glob("*.toml"))
+
+
+def study_path(study: str) -> Path:
+    """The file of a study given by name or path.
+
+    Raises
+    ------
+    InputError
+        If there is neither such a study nor such a file.
+    """
+    if study in study_names():
+        return STUDIES / f"{study}.toml"
+    if os.path.exists(study):
+        return Path(study)
+    problem = f"there is no study or file {study!r}"
+    raise unknown_name("study", problem, study, study_names(), ", or the path of a study file (TOML)")
 
 
 def load_study(study: StudyLike, **changes: Any) -> Study:

@@ -1,8 +1,7 @@
-"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search; and the folders of its files."""
+"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -10,8 +9,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.shipped import STUDIES
+from safevar_sumo.errors import InputError
 from safevar_sumo.study.characteristics import (
     CharacteristicTable,
     Constraint,
@@ -384,24 +382,3 @@ def _key_or_index(table: Any, name: str) -> int | str:
 
 StudyLike = str | Path | Tables | Study
 """A study as its name, the path of its file, its tables, or a `Study`."""
-
-
-def study_names() -> list[str]:
-    """Names of the shipped studies."""
-    return sorted(path.stem for path in STUDIES.glob("*.toml"))
-
-
-def study_path(study: str) -> Path:
-    """The file of a study given by name or path.
-
-    Raises
-    ------
-    InputError
-        If there is neither such a study nor such a file.
-    """
-    if study in study_names():
-        return STUDIES / f"{study}.toml"
-    if os.path.exists(study):
-        return Path(study)
-    problem = f"there is no study or file {study!r}"
-    raise unknown_name("study", problem, study, study_names(), ", or the path of a study file (TOML)")
