@@ -8,12 +8,15 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from safevar_sumo.questions import evaluator
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, refused, run, searched
 
 STUDY = """
@@ -98,6 +101,27 @@ def test_limits_together_are_not_wider_than_those_alone() -> None:
     assert any(one["alone_low"] > 30 for one in rows)
     for one in rows:
         assert one["alone_low"] <= one["together_low"] <= one["together_high"] <= one["alone_high"]
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody_drew_before() -> None:
+    """All corners of what is printed, each in a thousand new encounters in which the original vehicle is safe."""
+    names = "tireFric,maxBrakeTorque,dampRateZeroT_CE"
+    answer = json_of("tolerance", "sun_joint", "--fits", "0", "--characteristics", names)
+    rows = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
+    assert all(row["together_low"] < row["together_high"] for row in rows.values())
+    system = assemble(load_study("sun_joint"))
+    members, rng = system.characteristics, np.random.default_rng(99)
+    settings = members.lower + rng.random((8000, len(members))) * (members.upper - members.lower)
+    settings[:, members.of_vehicle] = members.original[members.of_vehicle]
+    for name, row in rows.items():
+        ends = row["together_low"], row["together_high"]
+        settings[:, members.names.index(name)] = np.where(rng.random(len(settings)) < 0.5, *ends)
+    evaluations = evaluate(system, settings)
+    counts = system.measuring.scoring.violation(evaluations) == 0
+    assert counts.sum() > 4000
+    assert (evaluations.collided & counts).sum() <= 1
+    assert "no corner in 32,768 encounters" in answer["verdict"]
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator
 from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
-from safevar_sumo.questions.tolerance.boxes import random_settings
+from safevar_sumo.questions.tolerance.boxes import MET_BY_CORNERS, random_settings
 from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
 from safevar_sumo.questions.tolerance.rows import limit_rows
 from safevar_sumo.questions.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, scan
@@ -159,7 +159,7 @@ def tolerance(
         study=study,
         verdict=" ".join(
             [
-                *_verdict(scans, box, criterion, broken, bool(specified)),
+                *_verdict(scans, box, criterion, broken, bool(specified), bool(everywhere)),
                 *counted_in_words(study),
                 *constraints_in_words(study),
             ]
@@ -207,7 +207,12 @@ def _unsafe_solutions(subject: Study | Case, columns: Sequence[int], unsafe: Uns
 
 
 def _verdict(
-    scans: Sequence[OneAtATimeScan], box: JointLimits | None, unsafe: Unsafe, broken: list[str], has_limits: bool
+    scans: Sequence[OneAtATimeScan],
+    box: JointLimits | None,
+    unsafe: Unsafe,
+    broken: list[str],
+    has_limits: bool,
+    is_searched: bool,
 ) -> Iterator[str]:
     """The decision, how sure it is, and what is unsafe alone."""
     if any(one.safe is None for one in scans):
@@ -218,15 +223,15 @@ def _verdict(
     if box is not None and not box.kept and not has_limits:
         yield f"No box around the original is safe ({unsafe.description})."
     elif box is not None:
-        yield _box_in_words(box, unsafe, has_limits)
+        yield _box_in_words(box, unsafe, has_limits, f" in {MET_BY_CORNERS:,} encounters" if is_searched else "")
     if names := [one.characteristic.name for one in scans if one.of_state("unsafe")]:
         yield f"Unsafe alone, all others as in the original: {join_phrases(names)}."
     else:
         yield "No single characteristic makes it unsafe."
 
 
-def _box_in_words(box: JointLimits, unsafe: Unsafe, has_limits: bool) -> str:
-    """The result of the test of all limits together."""
+def _box_in_words(box: JointLimits, unsafe: Unsafe, has_limits: bool, met: str) -> str:
+    """The result of the test of all limits together; `met` says in how many encounters the corners drive."""
     failed = f", and {box.failed} could not be simulated" if box.failed else ""
     bound = f"at most {100 * box.at_most:.2f} % are, with {100 * CONFIDENCE:.0f} % confidence"
     if not box.kept:
@@ -235,7 +240,8 @@ def _box_in_words(box: JointLimits, unsafe: Unsafe, has_limits: bool) -> str:
     between = " between bumpers" if unsafe.contact else ""
     kept = f" with at least {unsafe.keep:.3g} m left{between}" if unsafe.keep else f" (unsafe: {unsafe.description})"
     decision = "Keeps all limits" if has_limits else "All may go to their limits together"
-    return f"{decision}{kept}: no corner and none of {box.samples:,} vehicles drawn within is unsafe{failed}; {bound}."
+    tested = f"no corner{met} and none of {box.samples:,} vehicles drawn within is unsafe"
+    return f"{decision}{kept}: {tested}{failed}; {bound}."
 
 
 def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:

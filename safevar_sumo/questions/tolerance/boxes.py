@@ -18,6 +18,8 @@ MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 MAX_CORNERS = 4096
 """Largest number of corners of a box that are simulated."""
+MET_BY_CORNERS = 32_768
+"""Number of encounters that the corners meet together, in a study that searches its scenario."""
 
 
 def settings_in_box(
@@ -34,21 +36,33 @@ def settings_in_box(
 def sobol_and_corners(
     evaluator: Evaluator, columns: Sequence[int], ends: tuple[FloatArray, FloatArray], number: int, seed: int
 ) -> FloatArray:
-    """Settings at Sobol points of a box, and at as many of its corners, where all changes add up."""
-    sobol = sobol_points(number, len(columns), seed)
-    points = np.concatenate([sobol, np.round(sobol)])  # a rounded point is a corner
+    """Settings at Sobol points of a box, and at as many of its corners, where all changes of the vehicle add up."""
+    sobol, is_vehicle = sobol_points(number, len(columns), seed), evaluator.characteristics.of_vehicle[columns]
+    points = np.concatenate([sobol, np.where(is_vehicle, np.round(sobol), sobol)])  # a rounded point is a corner
     return settings_in_box(evaluator, columns, *ends, points)
 
 
-def corners_of(evaluator: Evaluator, columns: Sequence[int], ends: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Settings at all corners of a box; at `MAX_CORNERS` random ones if it has more."""
-    size, rng = len(columns), np.random.default_rng(evaluator.study.search.seed)
+def corners_of(
+    evaluator: Evaluator, columns: Sequence[int], ends: tuple[FloatArray, FloatArray], attempt: int
+) -> FloatArray:
+    """Settings at all corners of a box; at `MAX_CORNERS` random ones if it has more.
+
+    In a study that searches its scenario, each corner of the vehicle's characteristics meets equally many encounters,
+    drawn anew in each attempt.
+    """
+    characteristics, (lower, upper) = evaluator.characteristics, ends
+    worn = [column for column in columns if characteristics.of_vehicle[column]]
+    size, seed = len(worn), evaluator.study.search.seed
+    rng = np.random.default_rng(seed)
     numbers = np.arange(2**size) if 2**size <= MAX_CORNERS else rng.integers(2**size, size=MAX_CORNERS)
-    lower, upper = ends
-    settings = np.tile(evaluator.characteristics.original, (len(numbers), 1))
+    settings = np.tile(characteristics.original, (len(numbers), 1))
     bits = numbers[:, np.newaxis] >> np.arange(size) & 1
-    settings[:, columns] = np.where(bits, upper[columns], lower[columns])
-    return settings
+    settings[:, worn] = np.where(bits, upper[worn], lower[worn])
+    if len(worn) == len(columns):
+        return settings
+    settings = np.tile(settings, (MET_BY_CORNERS // len(settings), 1))
+    places = np.random.default_rng((seed, 3, attempt)).random(settings.shape)
+    return np.where(characteristics.of_vehicle, settings, lower + places * (upper - lower))
 
 
 def random_settings(

@@ -97,7 +97,7 @@ class _BoxSearch:
         Settings that no box may hold.
     corners
         Corners that were unsafe in some box: for each characteristic -1, the lower end of the box, 0, the original, or
-        1, the upper end.
+        1, the upper end; for each parameter of the scenario its place between original and end.
     batch
         Number of settings that are simulated at once.
     """
@@ -160,7 +160,7 @@ class _BoxSearch:
     def corner_settings(self, boxes: FloatArray) -> FloatArray:
         """Settings at the C known corners of B boxes, shape (B, C, n)."""
         corners, below, above = np.array(self.corners), boxes[:, :1], boxes[:, 1:]
-        return self.original + np.where(corners > 0, above, corners * below)  # a corner of 0 is the original
+        return self.original + corners * np.where(corners > 0, above, below)  # a corner of 0 is the original
 
     def points(self, sides: FloatArray, number: int) -> FloatArray:
         """New Sobol points and corners of a box."""
@@ -196,7 +196,11 @@ class _BoxSearch:
                 for bit in bits:
                     chosen += bit * is_unsafe[chosen + bit]
                 cause[:] = of_cause[chosen]
-        known = {corner.tobytes(): corner for corner in [*self.corners, *np.sign(causes - self.original)]}
+        changes, is_vehicle = causes - self.original, self.evaluator.characteristics.of_vehicle
+        sides = np.where(changes > 0, self.domain[1], self.domain[0])
+        shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
+        corners = np.where(is_vehicle, np.sign(changes), shares)  # of the vehicle, in the encounter of the cause
+        known = {corner.tobytes(): corner for corner in [*self.corners, *corners]}
         self.corners = list(known.values())
         # A box that holds a setting with more than a cause's changes holds the cause.
         needs = np.maximum(self.extents(self.unsafe_settings), 0.0)
@@ -346,7 +350,7 @@ def find_joint_limits(
         sides = search.best(start) if kept and attempt < MAX_ATTEMPTS else search.fixed
         ends, stream = search.printed_ends(sides), (evaluator.study.search.seed, 1, attempt)
         stage = "test of the limits together"
-        corners = corners_of(evaluator, columns, ends)
+        corners = corners_of(evaluator, columns, ends, attempt)
         unsafe_corners = corners[unsafe.of(evaluator.evaluate(corners, stage))]
         unsafe_samples, count, failed, at_most = sample_box(evaluator, columns, unsafe, ends, attempt, stream, stage)
         unsafe_inside = np.concatenate([unsafe_corners, unsafe_samples])
