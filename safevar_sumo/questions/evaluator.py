@@ -308,6 +308,14 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     return np.asarray(points[:number])
 
 
+def proof_size(attempt: int, share: float) -> tuple[float, int]:
+    """The probability alpha / 2^k with which attempt k at a proof may be wrong, alpha = 1 - `CONFIDENCE`, and the
+    number of settings of which none may be unsafe, so that at most this share of all is.
+    """
+    error = (1 - CONFIDENCE) / 2**attempt
+    return error, math.ceil(math.log(error) / math.log1p(-share))
+
+
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
     """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
     lower, upper = characteristics.lower, characteristics.upper

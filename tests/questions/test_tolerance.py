@@ -97,6 +97,14 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     assert f"{failed} could not be simulated" in answer.verdict
 
 
+def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joint, "MAX_ATTEMPTS", 1)
+    answer = answer_of(2, two_islands, unsafe="collision")
+    assert answer.verdict.startswith("No safe box around the original was found (")
+    assert answer.tables["limits"]["together_low"].isna().all()
+    assert "Keeps all limits" in answer_of(2, two_islands, unsafe="collision", limits=("b <= 8",)).verdict
+
+
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain
     hits it.

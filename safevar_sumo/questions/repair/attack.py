@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.evaluator import CONFIDENCE
+from safevar_sumo.questions.evaluator import proof_size
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.records import FloatArray
 
@@ -64,8 +64,7 @@ def prove(problem: RepairProblem, change: FloatArray, number: int, attempt: int)
     After k attempts that failed this one may be wrong with probability alpha / 2^k, alpha = 1 - `CONFIDENCE`, so that
     it draws more. `number` counts the attacks, for the random numbers.
     """
-    error = (1 - CONFIDENCE) / 2**attempt
-    draws = math.ceil(math.log(error) / math.log1p(-MAX_UNSAFE_SHARE))
+    error, draws = proof_size(attempt, MAX_UNSAFE_SHARE)
     fresh = problem.draw(draws, np.random.default_rng((problem.study.search.seed, 7, number)))
     unsafe = fresh[problem.degrees_with(change, fresh, "proof on fresh wear") < problem.margin]
     is_repairable = problem.repairable(unsafe)

@@ -221,7 +221,7 @@ def _verdict(
     if broken:
         yield f"Do not release: {'; '.join(broken)}."
     if box is not None and not box.kept and not has_limits:
-        yield f"No box around the original is safe ({unsafe.description})."
+        yield f"No safe box around the original was found ({unsafe.description})."
     elif box is not None:
         yield _box_in_words(box, unsafe, has_limits, f" in {MET_BY_CORNERS:,} encounters" if is_searched else "")
     if names := [one.characteristic.name for one in scans if one.of_state("unsafe")]:

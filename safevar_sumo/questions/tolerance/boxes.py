@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +9,7 @@ import scipy
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
+from safevar_sumo.questions.evaluator import Evaluator, proof_size, sobol_points
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles.region import REJECTIONS
 
@@ -116,8 +115,7 @@ def sample_box(
     passes, is at most sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `MAX_UNSAFE_SHARE`
     if all of them are safe.
     """
-    error_probability = (1 - CONFIDENCE) / 2**attempt
-    count = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
+    error_probability, count = proof_size(attempt, MAX_UNSAFE_SHARE)
     settings = random_settings(evaluator, columns, *ends, count, np.random.default_rng(seed))
     evaluations = evaluator.evaluate(settings, stage)
     unsafe_settings = settings[unsafe.of(evaluations)]

@@ -59,7 +59,8 @@ class JointLimits(NamedTuple):
     at_most
         With 95 % confidence, at most this share of all settings in the box is unsafe or cannot be simulated.
     kept
-        False if no box is safe: settings within the limits are unsafe, all other characteristics as in the original.
+        False if no box is safe: settings within the limits are unsafe, all other characteristics as in the original, or
+        without limits no box but the original was found.
         In the box, the other characteristics then keep their original values.
     beyond
         By the name of a characteristic, an unsafe setting whose value of it is just beyond the box; all its other
@@ -360,6 +361,9 @@ def find_joint_limits(
         search.learn(unsafe_inside)
     else:
         kept = False
+    of_vehicle = evaluator.characteristics.of_vehicle
+    if np.isnan(search.limits[:, of_vehicle]).all():  # the original alone is no box
+        kept = kept and bool((sides[:, of_vehicle] > 0).any())
     lower, upper = (values.tolist() for values in ends)
     return JointLimits(
         box=dict(zip(evaluator.characteristics.names, zip(lower, upper, strict=True), strict=True)),
