@@ -2,13 +2,15 @@
 
 The first line names the study, the run and the characteristics. A batch is a table: a list for each column of
 `solutions.csv`, the number of each evaluation in its run, the collision's speed and the reason of a failure; an
-undefined value is null. The last line of a finished run lists its solutions. What follows the first line that cannot be
-read was lost with a process, a disk or a power supply, and is simulated again.
+undefined value is null. The last line of a finished run lists its solutions. Each line after the first ends with a
+checksum of the journal up to there. What follows the first line that cannot be read, or that the checksum contradicts,
+was lost with a process, a disk or a power supply, or was altered, and is simulated again.
 """
 
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,13 +23,18 @@ import portalocker
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.results.manifest import FORMAT, disk_errors
+from safevar_sumo.results.manifest import disk_errors
 
+FORMAT = 6
+"""Version number of the format of journals."""
+FORMAT_WITHOUT_CHECKSUMS = 5
+"""Version number of the format of older journals, which are read and continued as they are."""
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
-POSITION, OUTCOME, REASON, SOLUTIONS = "evaluation", "outcome", "reason", "solutions"
+POSITION, OUTCOME, REASON, SOLUTIONS, CHECKSUM = "evaluation", "outcome", "reason", "solutions", "crc32"
+CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
@@ -49,11 +56,17 @@ class JournalContent(NamedTuple):
         The evaluations, in the order in which they were written.
     results
         By budget, the positions of the run's solutions.
+    size
+        Size of the lines that were read [bytes].
+    checksum
+        The CRC-32 of these lines without their checksums and ends; None in a journal of the format without checksums.
     """
 
     positions: list[int]
     evaluations: Evaluations
     results: Mapping[int, list[int]]
+    size: int
+    checksum: int | None
 
     def take_positions(self, positions: Sequence[int]) -> Evaluations:
         """The evaluations at `positions`, in this order."""
@@ -100,21 +113,24 @@ class Journal:
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
-                self.content, size = _read(self._file.read(), path, head, until_failure=retry_failed)
-                self._file.truncate(size)
-            if not size:
-                self._write(head)
+                self.content = _read(self._file.read(), path, head, until_failure=retry_failed)
+                self._file.truncate(self.content.size)
+            self._checksum = self.content.checksum
+            if not self.content.size:
+                text = msgspec.json.encode(head)
+                self._checksum = zlib.crc32(text)
+                self._write(text)
         except BaseException:
             self._file.close()
             raise
 
     def append(self, positions: Sequence[int], evaluations: Evaluations) -> None:
         """Add a batch."""
-        self._write(_batch_line(positions, evaluations, self._characteristics))
+        self._add(_batch_line(positions, evaluations, self._characteristics))
 
     def finish(self, positions: Sequence[int], budget: int) -> None:
         """Add the result, the positions of the solutions and the allowed number of evaluations; sync all."""
-        self._write({SOLUTIONS: list(positions), "budget": budget})
+        self._add({SOLUTIONS: list(positions), "budget": budget})
         with disk_errors(self.path, "written"):
             os.fsync(self._file.fileno())
 
@@ -122,8 +138,15 @@ class Journal:
         """Release the lock."""
         self._file.close()
 
-    def _write(self, line: JsonObject) -> None:
-        remainder = memoryview(msgspec.json.encode(line) + b"\n")
+    def _add(self, line: JsonObject) -> None:
+        text = msgspec.json.encode(line)
+        if self._checksum is not None:
+            self._checksum = zlib.crc32(text, self._checksum)
+            text = text[:-1] + CHECKSUM_MARK + b"%d}" % self._checksum
+        self._write(text)
+
+    def _write(self, text: bytes) -> None:
+        remainder = memoryview(text + b"\n")
         with disk_errors(self.path, "written"):
             while remainder:
                 remainder = remainder[self._file.write(remainder) :]
@@ -141,7 +164,7 @@ def read_journal(path: Path, head: JsonObject) -> JournalContent:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
-    return _read(data, path, head)[0]
+    return _read(data, path, head)
 
 
 class _Progress(msgspec.Struct):
@@ -188,19 +211,22 @@ def _open_and_lock(path: Path) -> IO[bytes]:
             raise SafevarError(f"{path}: cannot be locked: {error}; results need a disk that locks files") from None
 
 
-def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = False) -> tuple[JournalContent, int]:
-    """The contents of a journal, and the size of the lines that were read [bytes]; with `until_failure`, without the
-    first batch that failed and all that came after it.
+def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = False) -> JournalContent:
+    """The contents of a journal; with `until_failure`, without the first batch that failed and all that came after
+    it.
     """
     positions, batches, results = [], [], {}
     first, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(first)
-    if lines and owner != head:
+    has_checksums = owner.get("format") != FORMAT_WITHOUT_CHECKSUMS
+    is_own = owner == (head if has_checksums else {**head, "format": FORMAT_WITHOUT_CHECKSUMS})
+    if lines and not is_own:
         legal = "the manifest.json and journals of one study, as it was run; or another `out`"
         raise InputError(path, "belongs to another study, version or run, or is no journal", legal)
-    size = len(first) if owner == head else 0
+    size = len(first) if lines or owner == head else 0
+    checksum = zlib.crc32(first.rstrip()) if has_checksums else None
     for text in lines:
-        line = _decoded(text)
+        line, checksum_of_line = _checked(text, checksum)
         try:
             if SOLUTIONS in line:
                 results[line["budget"]] = line[SOLUTIONS]
@@ -213,8 +239,22 @@ def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = Fa
         except (KeyError, TypeError, ValueError):
             break
         size += len(text)
+        checksum = checksum_of_line
     empty = Evaluations.none(len(head["characteristics"]), METRICS)
-    return JournalContent(positions, Evaluations.concatenate(batches or [empty]), results), size
+    return JournalContent(positions, Evaluations.concatenate(batches or [empty]), results, size, checksum)
+
+
+def _checked(text: bytes, checksum: int | None) -> tuple[JsonObject, int | None]:
+    """A line after the first, and the checksum of the journal up to it; empty if the line is torn, damaged or altered.
+
+    `checksum` is that of the lines before, None in a journal of the format without.
+    """
+    if checksum is None:
+        line = _decoded(text)
+        return {} if CHECKSUM in line else line, None
+    content, _, stated = text.rpartition(CHECKSUM_MARK)
+    checksum = zlib.crc32(content + b"}", checksum)
+    return _decoded(content + b"}\n") if stated == b"%d}\n" % checksum else {}, checksum
 
 
 def _decoded(text: bytes) -> JsonObject:

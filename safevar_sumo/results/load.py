@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.journal import journal_head, read_journal
@@ -95,6 +95,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
     evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], [], []
+    has_checksums = True
     search, digest = manifest["study"]["search"], identity_digest(manifest)
     budget = search["evaluations"]
     for algorithm, run in product(dict.fromkeys(map(label_of, search["algorithms"])), range(search["runs"])):
@@ -102,12 +103,15 @@ def load_runs(directory: str | Path) -> StoredResults:
         if not path.exists():
             continue
         content = read_journal(path, journal_head(digest, path.stem, characteristics))
+        has_checksums &= content.checksum is not None
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
         failures += failures_of((algorithm, run), positions, evaluations)
         if budget in content.results:
             solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget])))
+    if not has_checksums:
+        warn(f"{folder}: has journals of an earlier version, without checksums: altered lines go unnoticed")
     frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)  # behind algorithm and run
     solutions = solutions_frame(characteristics, solutions_of_runs)

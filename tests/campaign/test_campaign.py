@@ -140,7 +140,7 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
     carried_out(study, tmp_path, batch=3)
     path = journal_file(tmp_path, "rs-00")
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
-    monkeypatch.setattr("safevar_sumo.campaign.runs.zlib.crc32", lambda name: 7)  # another random sequence
+    monkeypatch.setattr("safevar_sumo.campaign.share.random_generator_of", lambda study, key: np.random.default_rng(7))
     with pytest.raises(SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"):
         carried_out(study, tmp_path)
 

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -137,6 +138,99 @@ def test_a_damaged_line_and_all_after_it_are_lost(line: int, tmp_path: Path) -> 
     assert path.read_bytes() == damaged, "a reader leaves the file as it is"
     Journal(path, HEAD).close()
     assert path.stat().st_size == ends[line - 1]
+
+
+def edited(line: bytes, **columns: object) -> bytes:
+    """The line with other columns and its checksum as it was; None leaves a column out."""
+    table = {**json.loads(line), **columns}
+    return json.dumps({name: column for name, column in table.items() if column is not None}).encode() + b"\n"
+
+
+ALTERATIONS: dict[str, Callable[[bytes], bytes]] = {
+    "an outcome that does not exist": lambda line: line.replace(b"stopped", b"exploded"),
+    "another outcome": lambda line: line.replace(b'"collision"', b'"stopped"'),
+    "a digit": lambda line: line.replace(b"11.1", b"11.2"),
+    "a digit at the end of a number": lambda line: line.replace(b"3.6666666666666665", b"3.6666666666666664"),
+    "an undefined value": lambda line: line.replace(b'"tet":[10.', b'"tet":[null,10.'),
+    "a value out of its domain": lambda line: line.replace(b'"a":[10.0', b'"a":[1e99'),
+    "a missing column": lambda line: edited(line, tet=None),
+    "a new column": lambda line: edited(line, tat=[1.0] * ROWS),
+    "positions": lambda line: edited(line, evaluation=[90, 91, 92]),
+    "a reason": lambda line: edited(line, reason=["why", None, None]),
+    "spaces": edited,
+    "no checksum": lambda line: edited(line, crc32=None),
+    "another checksum": lambda line: edited(line, crc32=1),
+    "its checksum as text": lambda line: edited(line, crc32=str(json.loads(line)["crc32"])),
+    "nothing": lambda line: b"",
+    "twice": lambda line: 2 * line,
+}
+
+
+@pytest.mark.parametrize("alteration", ALTERATIONS)
+def test_an_altered_line_and_all_after_it_are_not_believed(alteration: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    write(path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    before = lines[2]
+    lines[2] = ALTERATIONS[alteration](before)
+    assert lines[2] != before
+    path.write_bytes(b"".join(lines))
+    intact = 2 if alteration == "twice" else 1
+    content = read_journal(path, HEAD)
+    assert holds_the_first(intact, content)
+    assert content.results == {}
+    journal = Journal(path, HEAD)
+    for number in range(intact, BATCHES):
+        journal.append(places(number), batch(number))
+    journal.close()
+    assert holds_the_first(BATCHES, read_journal(path, HEAD)), "simulated again"
+
+
+def test_other_solutions_and_lines_in_another_order_are_not_believed(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    write(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b'"solutions":[1,5]', b'"solutions":[1,4]'))
+    assert read_journal(path, HEAD).results == {}
+    head, first, second, *rest = whole.splitlines(keepends=True)
+    path.write_bytes(b"".join([head, second, first, *rest]))
+    assert holds_the_first(0, read_journal(path, HEAD))
+
+
+def test_a_checksum_is_that_of_all_lines_up_to_there_without_their_checksums(tmp_path: Path) -> None:
+    write(tmp_path / "a.jsonl")
+    head, *lines = (tmp_path / "a.jsonl").read_bytes().splitlines()
+    for line in lines:
+        content, _, checksum = line.rpartition(b',"crc32":')
+        head += content + b"}"
+        assert checksum == b"%d}" % zlib.crc32(head)
+
+
+def without_checksums(path: Path) -> None:
+    """Make a journal one of the format before checksums."""
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        line.pop("crc32", None)
+    lines[0]["format"] = 5
+    path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
+
+
+def test_a_journal_of_the_format_without_checksums_is_read_and_goes_on_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    write(path)
+    whole = path.read_bytes()
+    write(path, 2, finished=False)
+    without_checksums(path)
+    with pytest.raises(InputError, match="belongs to another study"):
+        read_journal(path, journal_head("other", "nsga2-00", ("a", "b")))
+    journal = Journal(path, HEAD)
+    assert holds_the_first(2, journal.content)
+    for number in range(2, BATCHES):
+        journal.append(places(number), batch(number))
+    journal.close()
+    assert holds_the_first(BATCHES, read_journal(path, HEAD))
+    path.write_bytes(whole.replace(b'"format":6', b'"format":5'))
+    assert holds_the_first(0, read_journal(path, HEAD)), "it has checksums"
 
 
 def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from safevar_sumo.results import (
 from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
 from safevar_sumo.study import Study, load_study, tables_of
 from tests.campaign.formulas import with_search
-from tests.in_process import json_of, refused
+from tests.in_process import json_of, refused, run
 from tests.made_up import made_up_evaluations
 
 NAMES = ("a", "b")
@@ -264,6 +265,21 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
         message = (f"in format {number}", f"the release that wrote them, safevar_sumo {release}")
         refused(*command, message=message)
     assert contents(copied) == before
+
+
+def test_altered_journals_are_simulated_again_and_those_without_checksums_are_read_with_a_note(
+    copied: Path, slippery: Path
+) -> None:
+    journal, whole = copied / "runs/nsga2-00.jsonl", (slippery / "runs/nsga2-00.jsonl").read_bytes()
+    journal.write_bytes(whole.replace(b'"collision"', b'"exploded"', 1))
+    assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout
+    run("study", str(slippery.parent / "slippery.toml"), "--out", str(copied))
+    assert journal.read_bytes() == whole
+    assert (copied / "solutions.csv").read_bytes() == (slippery / "solutions.csv").read_bytes()
+    journal.write_bytes(re.sub(rb',"crc32":\d+}\n', b"}\n", whole.replace(b'"format":6', b'"format":5')))
+    tables = run("tables", str(copied))
+    assert "without checksums: altered lines go unnoticed" in tables.stderr
+    assert tables.stdout == run("tables", str(slippery)).stdout.replace(str(slippery), str(copied))
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
