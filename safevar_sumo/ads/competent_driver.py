@@ -9,6 +9,7 @@ import numpy as np
 from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter, is_in_the_way, time_to_reach
 from safevar_sumo.ads.car_following import KEEPING_GAINS
 from safevar_sumo.ads.reference_drivers import (
+    ANY_BRAKING,
     DECELERATION_ROUNDING,
     HARDEST_BRAKING,
     JERK,
@@ -33,6 +34,8 @@ class _Perceiving(NamedTuple):
         Time since the obstacle strayed from this position [s], negative before.
     braking_time
         Time since a leader began to brake harder than `leader_braking` [s], negative before.
+    first_gap
+        Gap at which the driver first saw who is in the way now [m]; infinite for nobody.
     """
 
     reaction: Reaction
@@ -40,22 +43,24 @@ class _Perceiving(NamedTuple):
     appeared_in_way: BoolArray
     stray_time: FloatArray
     braking_time: FloatArray
+    first_gap: FloatArray
 
 
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
 
-    Holds its speed or a headway, perceives a danger, reacts, and brakes with up to 0.774 g. The danger is
+    Holds the speed with which it began, and so the gap to a steady leader; perceives a danger, reacts, and brakes with
+    up to 0.774 g. The danger is
 
     - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a standing car this is a
       time headway of 2 s;
     - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
       by the letter the driver does not react.
 
-    While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
-    Behind a moving leader it keeps its headway by the accelerator only:
-    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`,
-    with the speeds u and v of leader and vehicle.
+    While it reacts it releases the accelerator. After a stop it waits until the way is clear. Behind a leader that
+    drives on after braking it does not accelerate while the gap g is shorter than the one g_0 with which it began to
+    follow: a <= max(0.07 (u - v) + 0.23 (g - g_0), 0), the gap control of Milanes and Shladover (2014), with the speeds
+    u and v of leader and vehicle.
 
     Parameters
     ----------
@@ -70,9 +75,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         Deceleration of a leader above which its braking is a danger [m/s^2], perceived `perception_time` after it
         begins; 5 by the letter of the regulation, 0.5 for any braking.
     lets_go
-        Largest deceleration by which it lets its gap to a leader grow to the headway [m/s^2].
-    headway
-        Time headway at which it follows [s].
+        Deceleration with the accelerator released, while it reacts [m/s^2]; a vehicle that coasts with less is braked.
     corridor
         Half the width of the corridor that it watches [m].
     start_throttle
@@ -85,35 +88,39 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     perception_time: NonNegativeParameter = 0.4
     leader_braking: NonNegativeParameter = 5.0
     lets_go: NonNegativeParameter = 0.4
-    headway: PositiveParameter = 2.0
     start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
-        reaction = ReferenceDriver.start(self, n, nominal, step)
-        return _Perceiving(reaction, np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0), np.full(n, -1.0))
+        reaction, never = ReferenceDriver.start(self, n, nominal, step), np.full(n, -1.0)
+        nowhere = np.full(n, np.inf)
+        return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere)
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         is_perceived, memory = self._perceive(seen, memory)
         is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
         deceleration, reaction = self.watch_leader(seen, memory.reaction, is_in_way)
         brakes_now = deceleration > self.leader_braking + DECELERATION_ROUNDING
-        begun = np.where(brakes_now, 0.0, -1.0)
+        begun = np.where(brakes_now, reaction.step, -1.0)  # it is seen a step after it began
         braking_time = np.where(memory.braking_time >= 0, memory.braking_time + reaction.step, begun)
-        brakes = braking_time >= self.perception_time - TIME_ROUNDING
+        still_brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
+        brakes = (braking_time >= self.perception_time - TIME_ROUNDING) & ((seen.closing_speed > 0) | still_brakes)
         is_near = time_to_reach(seen) < self.critical_ttc
         danger = is_in_way & np.where(reaction.leader_has_braked, brakes, is_near)
-        following = self._following(seen, is_in_way)
+        first_gap = np.where(is_in_way, np.where(np.isfinite(memory.first_gap), memory.first_gap, seen.gap), np.inf)
         command, reaction = self.react(
-            seen, reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following
+            seen,
+            reaction,
+            danger,
+            HARDEST_BRAKING,
+            self.reaction_time,
+            JERK,
+            self.start_throttle,
+            self.lets_go,
+            still_brakes,
+            _following(seen, is_in_way, first_gap),
         )
-        return command, memory._replace(reaction=reaction, braking_time=np.where(is_in_way, braking_time, -1.0))
-
-    def _following(self, seen: Observation, is_in_way: BoolArray) -> FloatArray:
-        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite if no leader is in the way."""
-        gap = np.where(is_in_way, seen.gap, 0.0)
-        by_speed, by_gap = KEEPING_GAINS
-        gap_control = by_speed * (seen.obstacle_speed - seen.speed) + by_gap * (gap - self.headway * seen.speed)
-        return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
+        braking_time = np.where(is_in_way, braking_time, -1.0)
+        return command, memory._replace(reaction=reaction, braking_time=braking_time, first_gap=first_gap)
 
     def _perceive(self, seen: Observation, memory: _Perceiving) -> tuple[BoolArray, _Perceiving]:
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
@@ -132,3 +139,11 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
         )
+
+
+def _following(seen: Observation, is_in_way: BoolArray, first_gap: FloatArray) -> FloatArray:
+    """Upper limit of the acceleration behind a moving leader [m/s^2], at least 0; infinite if none is in the way."""
+    gained = np.where(is_in_way, seen.gap, 0.0) - np.where(is_in_way, first_gap, 0.0)
+    by_speed, by_gap = KEEPING_GAINS
+    gap_control = by_speed * (seen.obstacle_speed - seen.speed) + by_gap * gained
+    return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, 0.0), np.inf)

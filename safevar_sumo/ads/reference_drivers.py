@@ -66,7 +66,7 @@ class Reaction(NamedTuple):
     danger_time
         Time since the driver first saw the danger [s]; negative without a danger.
     felt_deceleration, intended_deceleration
-        The vehicle's deceleration while the driver did not brake yet, and the one that the driver aims at [m/s^2].
+        The vehicle's deceleration without the driver's braking, and the one that the driver aims at [m/s^2].
     leader_speed, leader_has_braked
         Speed of who was in the way at the last call [m/s], 0 for nobody; whether he has braked there.
     """
@@ -120,11 +120,13 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         reaction_time: float,
         jerk: float = JERK,
         start: StartThrottle = (),
+        lets_go: float = 0.0,
+        still_brakes: BoolArray | bool = False,
         following: FloatArray | float = np.inf,
     ) -> tuple[Command, Reaction]:
         """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
 
-        A danger lasts while an obstacle ahead approaches, or keeps its distance and blocks the way.
+        A danger lasts while an obstacle ahead approaches or still brakes, or keeps its distance and blocks the way.
 
         Parameters
         ----------
@@ -136,6 +138,11 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             Time from the first sight of the danger to braking [s].
         start
             Throttle in the first steps without a danger.
+        lets_go
+            Deceleration with the accelerator released, until the reaction time is over [m/s^2]; a vehicle that coasts
+            with less is braked.
+        still_brakes
+            Whether a leader still brakes, shape (N,).
         following
             Upper limit of the acceleration when following a leader [m/s^2].
         """
@@ -145,14 +152,19 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         speed_to_hold, initial_trim, initial_brake = cruise
         is_ahead = np.isfinite(seen.gap) & (seen.gap > 0)
         still_blocks = (seen.closing_speed == 0) & blocks_the_way(seen, self.corridor)
-        danger_lasts = is_ahead & ((seen.closing_speed > 0) | still_blocks)
+        danger_lasts = is_ahead & ((seen.closing_speed > 0) | still_brakes | still_blocks)
         is_aware = memory.danger_time >= 0
         is_reacting = np.where(is_aware, danger_lasts, danger)
         danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, 0.0), -1.0)
         was_braking, is_braking = (time >= reaction_time - TIME_ROUNDING for time in (memory.danger_time, danger_time))
-        felt = np.where(was_braking, memory.felt_deceleration, np.maximum(-memory.acceleration(seen), 0.0))
-        rising = np.minimum(np.maximum(memory.intended_deceleration, felt) + jerk * step, deceleration)
-        intended = np.where(is_braking, rising, 0.0)
+        intended_before, felt_before = memory.intended_deceleration, memory.felt_deceleration
+        braked = np.maximum(intended_before - felt_before, 0.0)
+        felt = np.where(was_braking, felt_before, np.maximum(-memory.acceleration(seen) - braked, 0.0))
+        # A step has the mean of the deceleration that rises within it.
+        rise = np.where(was_braking, jerk * step, jerk * step / 2)
+        rising = np.minimum(np.maximum(intended_before, felt) + rise, deceleration)
+        # In its first step it feels how the vehicle coasts.
+        intended = np.where(is_braking, rising, np.where(is_reacting & is_aware, lets_go, 0.0))
         brake = np.minimum(initial_brake + np.maximum(intended - felt, 0.0) / nominal.braking, 1.0)
         if (step_index := round(seen.time / step)) < len(start):
             calm = Command(np.full_like(brake, start[step_index]), np.zeros_like(brake))
@@ -223,8 +235,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         least_gap = seen.speed * (1 + seen.speed * KMH_PER_MS / 100 - memory.step)
         is_near = np.where(memory.leader_has_braked, seen.gap >= least_gap, time_to_reach(seen) < critical_ttc)
         danger = is_in_way & is_near
-        jerk = self.deceleration / memory.step  # reaches the deceleration within a step
-        return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk)
+        return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk=np.inf)
 
 
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
