@@ -29,7 +29,7 @@ from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
-"""Number of settings to verify in SUMO: of a study in questions; of each run of a campaign, besides its solutions."""
+"""Number of settings of a study to verify in SUMO in questions."""
 COMMAND_PREFIX = "; to reproduce it: "
 
 

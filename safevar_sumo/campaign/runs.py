@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import VERIFIED_SETTINGS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -148,15 +147,9 @@ class Run:
             positions=[*self._content.positions, *positions], evaluations=Evaluations.concatenate([known, evaluations])
         )
 
-    def sample_for_sumo(self, rng: np.random.Generator) -> FloatArray:
-        """Sample the settings to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
-        _, requested = self._content.requested_within(self._budget)
-        solutions = {setting.tobytes() for setting in self.solutions.settings}
-        is_solution = np.array([setting.tobytes() in solutions for setting in requested.settings], dtype=bool)
-        other_rows = np.flatnonzero(~requested.failed & ~is_solution)
-        sample = other_rows[rng.permutation(len(other_rows))[:VERIFIED_SETTINGS]]
-        rows = np.concatenate([np.flatnonzero(~requested.failed & is_solution), sample])
-        return requested.take(rows).settings
+    def requested(self) -> Evaluations:
+        """Evaluations of the distinct settings that the search has requested."""
+        return self._content.requested_within(self._budget)[1]
 
     def finish(self) -> RunResult:
         """Journal the result of a search that has ended, and close the journal."""

@@ -16,7 +16,8 @@ from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of,
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, random_generator_of
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import (
     MANIFEST,
     Journal,
@@ -31,6 +32,8 @@ from safevar_sumo.vehicles import region_of
 
 MAX_NAMES = 6
 """Largest number of runs that the name of a share lists."""
+VERIFIED_OTHERS = 200
+"""Number of settings of a share to verify in SUMO besides its unsafe solutions."""
 
 
 class Share(NamedTuple):
@@ -90,7 +93,7 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
                 evaluations = evaluate_settings(task, np.stack([missing[row][1] for row in rows]))
                 for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
                     run.receive(evaluations.take([*rows_of_run]))
-        remark = _verify(task, [run for run in runs if not run.is_finished]) if share.verifies else ""
+        remark = _verify(task, share, [run for run in runs if not run.is_finished]) if share.verifies else ""
         refuse_other_inputs(task, share)
         return [run.finish() for run in runs], remark
 
@@ -123,10 +126,23 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     return Run(key, search, Journal(path, head, retry_failed=share.retry_failed), study.search.evaluations)
 
 
-def _verify(task: Task, runs: Sequence[Run]) -> str:
-    """Verify all solutions of runs, and a sample of their other settings, in SUMO."""
-    samples = [
-        run.sample_for_sumo(random_generator_of(task.study, run.key._replace(algorithm=f"verify {run.key.algorithm}")))
-        for run in runs
-    ]
-    return verify_settings(task, np.concatenate(samples)) if any(map(len, samples)) else ""
+def _verify(task: Task, share: Share, runs: Sequence[Run]) -> str:
+    """Verify results of runs in SUMO; returns a remark, "" without any."""
+    if not runs:
+        return ""
+    requested = Evaluations.concatenate([run.requested() for run in runs])
+    solutions = Evaluations.concatenate([run.solutions for run in runs])
+    return verify_settings(task, settings_to_verify(requested, solutions, share.original))
+
+
+def settings_to_verify(requested: Evaluations, solutions: Evaluations, original: Evaluations) -> FloatArray:
+    """Every distinct unsafe solution, by the criterion that questions about these solutions have by default, and
+    `VERIFIED_OTHERS` of the other settings that the searches requested, spread evenly over all; shape (k, n).
+    """
+    criterion = Unsafe.default({name: float(values[0]) for name, values in original.metrics.items()}, solutions.outcome)
+    unsafe = solutions.settings[criterion.of(solutions) & ~solutions.failed]
+    known = {setting.tobytes() for setting in unsafe}
+    is_known = np.array([setting.tobytes() in known for setting in requested.settings], dtype=bool)
+    others = np.flatnonzero(~is_known & ~requested.failed)
+    spread = others[np.linspace(0, len(others) - 1, min(VERIFIED_OTHERS, len(others))).astype(int)]
+    return np.unique(np.concatenate([unsafe, requested.settings[spread]]), axis=0)

@@ -18,13 +18,15 @@ from safevar_sumo.campaign import RunKey, evaluation
 from safevar_sumo.campaign.campaign import deal, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.runs import Run
+from safevar_sumo.campaign.share import VERIFIED_OTHERS, settings_to_verify
 from safevar_sumo.errors import SafevarError
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
 from tests.in_process import searched
+from tests.made_up import made_up_evaluations
 
 
 @pytest.fixture
@@ -152,6 +154,31 @@ def test_the_speed_of_a_study_is_that_of_all_workers(workers: int, monkeypatch: 
     monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
     assert measure_speed(Task(study=load_study("smoke"), batch_size=200), pool) == workers * 200 / 4
     assert sorted(pool.sizes) == [1] * workers + [200] * workers
+
+
+def test_sumo_repeats_each_unsafe_solution_of_a_share_once_and_200_other_settings() -> None:
+    """Of 5,000 settings half collide, and those are solutions twice; without a collision, less than half of the
+    original's safety degree is unsafe.
+    """
+    rng = np.random.default_rng(1)
+    requested = made_up_evaluations(rng.uniform(-1, 1, 5000), settings=rng.random((5000, 3)))
+    solutions = Evaluations.concatenate([requested, requested]).take(np.arange(0, 10_000, 2))
+    original = made_up_evaluations([1.0], settings=np.zeros((1, 3)))
+    unsafe = solutions.take(np.flatnonzero(solutions.collided)).settings
+    verified = {row.tobytes() for row in settings_to_verify(requested, solutions, original)}
+    assert verified >= {row.tobytes() for row in unsafe}
+    assert len(verified - {row.tobytes() for row in unsafe}) == VERIFIED_OTHERS == 200
+    safe = requested.take(np.flatnonzero(~requested.collided))
+    verified = {row.tobytes() for row in settings_to_verify(safe, safe, original)}
+    assert verified >= {row.tobytes() for row in safe.settings[safe.f_safe < 0.5]}
+
+
+def test_what_sumo_refused_and_searches_without_a_solution_are_not_repeated() -> None:
+    settings = np.arange(6.0).reshape(3, 2)
+    requested = made_up_evaluations([1.0, 1.0, 1.0], settings=settings)
+    failed = dataclasses.replace(requested, outcome=np.array(["stopped", "stopped", Outcome.SIMULATOR_ERROR.value]))
+    assert np.array_equal(settings_to_verify(failed, failed.take([]), requested.take([0])), settings[:2])
+    assert settings_to_verify(failed.take([2]), failed.take([2]), requested.take([0])).shape == (0, 2)
 
 
 ROOT = Path(__file__).parents[2]
