@@ -17,8 +17,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import IO, Any
 
-from safevar_sumo.plugins import added_import_folders, inherit_import_folders
+from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.shipped import PACKAGE
 
 TIMEOUT_MARK = "Timeout ("
 """What the interpreter writes first when a process exceeds its time limit."""
@@ -37,9 +38,9 @@ class ProcessWorker:
 
     def __init__(self, last_words: Path) -> None:
         self._last_words = last_words
-        context, arguments = multiprocessing.get_context("spawn"), (added_import_folders(), last_words)
+        context, arguments = multiprocessing.get_context("spawn"), (ImportPath.here(), last_words)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
-        with _hide_main(), _block_interrupts():
+        with _hide_main(), _show_package(), _block_interrupts():
             self._executor.submit(os.getpid)  # starts the process
         (self._process,) = self._executor._processes.values()
         # Otherwise the result of a process that dies while it sends it is waited for until the end of time.
@@ -87,8 +88,8 @@ def say_last_words(file: IO[str] | None) -> None:
     _last_words = file
 
 
-def _begin_work(folders: list[str], last_words: Path) -> None:
-    inherit_import_folders(folders)
+def _begin_work(path: ImportPath, last_words: Path) -> None:
+    path.inherit()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
@@ -115,6 +116,16 @@ def _hide_main() -> Iterator[None]:
         yield
     finally:
         sys.modules["__main__"] = main
+
+
+@contextmanager
+def _show_package() -> Iterator[None]:
+    """Let a spawned process find this package, even if its folder is not on Python's path."""
+    sys.path.append(str(PACKAGE.parent))
+    try:
+        yield
+    finally:
+        sys.path.pop()
 
 
 @contextmanager

@@ -28,11 +28,11 @@ from safevar_sumo.plugins.files import (
     is_shipped as is_shipped,
 )
 from safevar_sumo.plugins.lookup import (
+    ImportPath as ImportPath,
     Lookup as Lookup,
     Member as Member,
     add_import_folders as add_import_folders,
-    added_import_folders as added_import_folders,
-    inherit_import_folders as inherit_import_folders,
     instance_of as instance_of,
+    only_from as only_from,
     unload_user_modules as unload_user_modules,
 )

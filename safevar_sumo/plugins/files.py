@@ -23,7 +23,10 @@ CACHE = "__pycache__"
 """Name of Python's cache folders."""
 LIBRARY_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders of installed libraries; such folders may be anywhere."""
-KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in (PACKAGE, *map(sysconfig.get_path, ("stdlib", "platstdlib"))))
+KNOWN_FOLDERS = tuple(
+    f"{folder}{os.sep}"
+    for folder in (PACKAGE, *map(sysconfig.get_path, ("stdlib", "platstdlib")), Path(sys.base_prefix, "DLLs"))
+)
 """The folders of this package and of the interpreter."""
 
 

@@ -10,7 +10,8 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
@@ -168,14 +169,47 @@ def add_import_folders(folders: Iterable[str]) -> None:
     sys.path[start:start] = _added_folders
 
 
-def added_import_folders() -> list[str]:
-    """The folders that `add_import_folders` has added to Python's path."""
-    return list(_added_folders)
+class ImportPath(NamedTuple):
+    """Python's path, and those of its folders that `add_import_folders` has added."""
+
+    folders: list[str]
+    added: list[str]
+
+    @classmethod
+    def here(cls) -> ImportPath:
+        """The path of this process."""
+        return cls(sys.path[:], _added_folders[:])
+
+    def inherit(self) -> None:
+        """Make this the path of this process."""
+        sys.path[:], _added_folders[:] = self
 
 
-def inherit_import_folders(folders: Iterable[str]) -> None:
-    """Record the folders that `add_import_folders` added in the process from which this one inherited Python's path."""
-    _added_folders[:] = folders
+@contextmanager
+def only_from(folder: str) -> Iterator[None]:
+    """Within the block, also in processes that start in it, user code and files that it names without their folder are
+    those of one folder, the working directory; only libraries are imported from elsewhere.
+    """
+    place, path, modules = os.getcwd(), ImportPath.here(), dict(sys.modules)
+    own = {name for name in modules if name != "__main__" and is_user_file(file_of_module(name))}
+    for name in own:
+        del sys.modules[name]
+    ImportPath([folder, *(entry for entry in path.folders if _is_of_libraries(entry))], []).inherit()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(place)
+        path.inherit()
+        for name in sys.modules.keys() - modules.keys():
+            if is_user_file(file_of_module(name)):
+                del sys.modules[name]
+        sys.modules.update({name: modules[name] for name in own})
+
+
+def _is_of_libraries(entry: str) -> bool:
+    """Whether an entry of Python's path, "" for the working directory, holds no user code."""
+    return bool(entry) and not is_user_file(os.path.join(entry, ""))
 
 
 def instance_of(member: Member, parameters: Parameters, name: str, key: str, source: str) -> Any:

@@ -235,13 +235,15 @@ def find_question(name: str) -> Question:
     InputError
         If there is no such question.
     """
-    module, _, function = name.partition(":") if ":" in name else (QUESTIONS.get(name, name), "", name)
+    legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
+    if not (":" in name or name in QUESTIONS):
+        raise InputError("question", f"there is no {name!r}", legal)
+    module, _, function = name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
     invalidate_caches()  # the module may have been written a moment ago
     try:
         with user_errors(name):
             imported = import_module(module)
     except ModuleNotFoundError:
-        legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
         raise InputError("question", f"there is no {name!r}", legal) from None
     found = getattr(imported, function, None)
     if not isinstance(found, Question):

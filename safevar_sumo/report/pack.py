@@ -7,7 +7,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
-from hashlib import file_digest
+from hashlib import file_digest, sha256
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Annotated, NoReturn
@@ -42,9 +42,10 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Description(Struct, frozen=True, forbid_unknown_fields=True):
-    """The file `pack.json`."""
+    """The file `pack.json`; `files` are the sha256 of all other files of the pack, by name."""
 
     versions: dict[str, str]
+    files: dict[str, str]
     studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
 
@@ -52,13 +53,18 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
     """Write a pack; equal contents give equal bytes."""
     packages = (*PACKAGES, "matplotlib")  # which draws the pictures of the page
     versions = {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
-    described = msgspec.json.encode(Description(versions, studies))
+    described = msgspec.json.encode(Description(versions, digests_of(files), studies))
     texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
             entry = zipfile.ZipInfo(name)  # with the same date on every day, in 1980
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << UNIX_MODE_SHIFT
             archive.writestr(entry, texts[name])
+
+
+def digests_of(files: Mapping[str, bytes]) -> dict[str, str]:
+    """The sha256 of files, by name."""
+    return {name: sha256(files[name]).hexdigest() for name in sorted(files)}
 
 
 def digest_of(path: Path) -> str:
@@ -73,7 +79,8 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     Raises
     ------
     InputError
-        If the file is no pack, damaged, too large, written by another version, or holds paths that leave it.
+        If the file is no pack, damaged, too large, written by another version, or holds paths that leave it or other
+        files than its description names.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -89,6 +96,8 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         described = msgspec.json.decode(files.pop(DESCRIPTION), type=Description)
     except (msgspec.MsgspecError, RecursionError) as error:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
+    for name in sorted(files.keys() ^ described.files.keys()):
+        _refuse(path, f"{name} {f'is not named in {DESCRIPTION}' if name in files else 'is missing'}")
     here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
     other = [f"{name} {described.versions.get(name)}" for name in here if described.versions.get(name) != here[name]]
     if other:

@@ -12,14 +12,16 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.subject import load
-from safevar_sumo.report import evidence
-from safevar_sumo.report.pack import DESCRIPTION, _check_entries, read_pack
+from safevar_sumo.report import claims
+from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, read_pack
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import json_of, refused, run
 from tests.questions.test_repair import planted as planted
@@ -72,18 +74,28 @@ def mine(in_tmp: Path) -> Path:
     return there / "results"
 
 
+def texts_of(pack: Path) -> dict[str, bytes]:
+    """The files of a pack."""
+    with zipfile.ZipFile(pack) as archive:
+        return {entry.filename: archive.read(entry) for entry in archive.infolist()}
+
+
 def changed(source: Path, target: Path, name: str, change: Callable[[str], str]) -> str:
-    """Change a file of a pack; returns the path of the changed pack."""
-    with zipfile.ZipFile(source) as archive:
-        texts = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+    """Change a file of a pack, and its digest; returns the path of the changed pack."""
+    texts = texts_of(source)
     (path,) = [path for path in texts if path.endswith(name)]
     before = texts[path].decode()
     assert change(before) != before
     return written(target, {**texts, path: change(before).encode()})
 
 
-def written(target: Path, files: dict[str, bytes]) -> str:
-    """Write an archive; returns its path."""
+def written(target: Path, files: dict[str, bytes], *, named: bool = True) -> str:
+    """Write an archive, whose pack.json names the files unless `named` is false; returns its path."""
+    with suppress(KeyError, ValueError, RecursionError):
+        described = json.loads(files[DESCRIPTION])
+        others = {name: content for name, content in files.items() if name != DESCRIPTION}
+        if named:
+            files = {**files, DESCRIPTION: json.dumps({**described, "files": digests_of(others)}).encode()}
     with zipfile.ZipFile(target, "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
@@ -139,7 +151,15 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
     assert shares is not None
     assert int(shares[1]) == len(load(slippery).evaluations), "the page is about the whole search"
 
-    claims = ["inputs", "study", "original vehicle", "solutions", *(f"answer {text}" for text in ask[1::2]), "report"]
+    claims = [
+        "files",
+        "inputs",
+        "study",
+        "original vehicle",
+        "solutions",
+        *(f"answer {text}" for text in ask[1::2]),
+        "report",
+    ]
     assert verified(str(pack)) == claims
     (claim,) = not_same(changed(pack, tmp_path / "it.zip", "answers.json", digit_of(r'"probability": 0\.(\d+)')))
     assert claim["claim"] == "answer risk --samples 300"
@@ -170,7 +190,7 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     refused("verify", "it.zip", message=("would run code", "my_questions.py, my_questions:ends", "--run-code"))
     command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)  # in a process that never had the module
-    assert done.stdout.startswith("6 of 6 claims are the same")
+    assert done.stdout.startswith("7 of 7 claims are the same")
 
 
 @pytest.mark.slow
@@ -197,14 +217,44 @@ def test_a_changed_digit_differs_and_is_named(
 
 
 @pytest.mark.slow
+def test_a_solution_that_was_removed_and_files_that_nobody_named_are_found(bare: Path, tmp_path: Path) -> None:
+    texts = texts_of(bare)
+    rows = texts["1-slippery/solutions.csv"].splitlines(keepends=True)
+    for name, content in (
+        ("solutions.csv", b"".join(rows[:-1])),
+        ("answers.json", texts["1-slippery/answers.json"] + b" "),
+    ):
+        path = written(tmp_path / "it.zip", {**texts, f"1-slippery/{name}": content}, named=False)
+        claims = {claim["claim"]: claim["packed"] for claim in not_same(path)}
+        assert f'"1-slippery/{name}": "' in claims["files"]
+    path = written(tmp_path / "it.zip", {**texts, "1-slippery/code/mine.py": b""}, named=False)
+    refused("verify", path, message=("it.zip", "1-slippery/code/mine.py is not named in pack.json"))
+    lines = written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": texts["1-slippery/report.html"] + b"\n"})
+    (claim,) = not_same(lines)
+    assert (claim["claim"], claim["packed"], claim["here"]) == ("report", "'\\n'", "nothing")
+
+
+@pytest.mark.slow
 def test_what_is_missing_torn_or_too_much_is_damage(bare: Path, tmp_path: Path) -> None:
-    with zipfile.ZipFile(bare) as archive:
-        texts = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+    texts = texts_of(bare)
+    nan = re.sub(rb": \d+", b": NaN", texts["1-slippery/answers.json"], count=1)
     for name, content, message in (
         ("1-slippery/risk.json", b"{}", "risk.json belongs to no claim"),
         ("2-other/manifest.json", b"{}", "2-other/manifest.json belongs to no study"),
         ("1-slippery/solutions.csv", b"[" * 100_000, "1-slippery is damaged"),
         ("1-slippery/answers.json", b"[]", "answers.json answers other questions"),
+        ("1-slippery/answers.json", nan, "NaN is no JSON"),
+        ("1-slippery/manifest.json", texts["1-slippery/manifest.json"].replace(b"2.", b"Infinity, 2.", 1), "damaged"),
+        ("1-slippery/report.html", b"\xff", "can't decode byte"),
+        ("1-slippery/solutions.csv", texts["1-slippery/solutions.csv"].replace(b"rs", b"r" * 200_000), "field limit"),
+        (
+            DESCRIPTION,
+            re.sub(rb'"collision": \d+', b'"collision": 99999999', texts[DESCRIPTION]),
+            "than 2 runs may have",
+        ),
+        (DESCRIPTION, texts[DESCRIPTION].replace(b'"collision":', b'"exploded":'), "no outcome 'exploded'"),
+        (DESCRIPTION, re.sub(rb'"rs",\s*0', b'"rs",7', texts[DESCRIPTION]), "no such runs"),
+        (DESCRIPTION, texts[DESCRIPTION].replace(b"rules --samples 20", b"repair --out /tmp/x"), "writes a file"),
         (DESCRIPTION, b"[" * 100_000, "pack.json is damaged"),
         (DESCRIPTION, texts[DESCRIPTION].replace(b"1-slippery", b"../slippery"), "is missing"),
         (DESCRIPTION, re.sub(rb'"libsumo": "', b'"libsumo": "0.', texts[DESCRIPTION]), "made with libsumo 0."),
@@ -254,11 +304,62 @@ def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(mine: 
     shutil.rmtree(mine.parent)
     code = ("mine.py", "limits.txt", "roads/scenario.sumocfg")  # SUMO's options may name outputs
     refused("verify", "it.zip", message=("would run code", *code, "--run-code"))
-    assert len(verified("it.zip", "--run-code")) == 6
+    assert len(verified("it.zip", "--run-code")) == 7
     path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
     claims = {claim["claim"]: claim["here"] for claim in not_same(path, "--run-code")}
     assert "limits.txt has changed since" in claims["inputs"]
     assert sorted(os.listdir()) == ["it.zip", "other.zip"]
+
+
+class Careless(NamedTuple):
+    """A change of the user's code with which it needs what no pack holds, and the error elsewhere."""
+
+    code: str
+    file: str
+    error: str
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "careless",
+    [
+        Careless(MINE.replace("Path(limits)", 'Path("secret.txt")'), "secret.txt", "No such file"),
+        Careless(
+            MINE.replace("Path(limits).read_text()", '__import__("helper").GAP'),
+            "helper.py",
+            "No module named 'helper'",
+        ),
+    ],
+    ids=["data", "code"],
+)
+def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
+    careless: Careless, mine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = mine.parent
+    monkeypatch.chdir(there)
+    monkeypatch.syspath_prepend(str(there))
+    Path(careless.file).write_text("6.0" if careless.file == "secret.txt" else "GAP = 6.0")
+    Path("mine.py").write_text(careless.code)
+    run("study", "mine.toml", "--out", "own", "--quiet", "--jobs", "1")
+    run("evidence", "own", "--ask", "rules --samples 20", "--out", "it.zip")
+    texts = {name: content for name, content in texts_of(Path("it.zip")).items() if not name.endswith(careless.file)}
+    manifest = json.loads(texts["1-mine/manifest.json"])
+    manifest["files"].pop(careless.file, None)
+    written(Path("it.zip"), {**texts, "1-mine/manifest.json": json.dumps(manifest, indent=2).encode() + b"\n"})
+    claims = {claim["claim"]: claim["here"] for claim in not_same("it.zip", "--run-code")}
+    assert careless.error in claims["solutions"]
+    command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
+    done = subprocess.run(command, capture_output=True, text=True)  # with processes of its own as workers
+    assert (done.returncode, done.stdout[:11]) == (1, "2 of 7 clai")
+    assert os.getcwd() == str(there)
+    assert "mine" not in sys.modules
+
+
+@pytest.mark.slow
+def test_a_pack_without_a_file_on_which_its_results_depend_is_damaged(mine: Path) -> None:
+    run("evidence", str(mine), "--ask", "rules --samples 20", "--out", "it.zip")
+    texts = {name: content for name, content in texts_of(Path("it.zip")).items() if not name.endswith("mine.py")}
+    refused("verify", written(Path("it.zip"), texts), "--run-code", message=("mine.py, on which the results depend",))
 
 
 @pytest.mark.slow
@@ -294,7 +395,7 @@ def test_what_cannot_be_run_has_its_reason() -> None:
     def fail() -> bytes:
         raise InputError("model", "is not installed", "an extra")
 
-    assert evidence._compare("mine", "answer", b"", fail)[2:] == (
+    assert claims.compare("mine", "answer", b"", fail)[2:] == (
         "cannot be run",
         "",
         "model: is not installed expected: an extra",

@@ -1,0 +1,225 @@
+"""What a pack claims about a study, and how each claim is computed again."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
+from itertools import zip_longest
+from pathlib import Path
+from shlex import split
+from typing import Any, NoReturn
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.api.evaluation import evaluate_settings
+from safevar_sumo.api.running import run
+from safevar_sumo.campaign import all_runs
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
+from safevar_sumo.plugins import add_import_folders
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.subject import changes_since
+from safevar_sumo.questions.tables import Column
+from safevar_sumo.questions.words import number_of
+from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.report.pack import PackedStudy
+from safevar_sumo.report.page import answer_to, make_page
+from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, record
+from safevar_sumo.study import Origin, Study, convert_table, user_code_names, write_study
+from safevar_sumo.terminal import Progress
+
+STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
+"""Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
+FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
+SAME, DIFFERS, CANNOT = "same", "differs", "cannot be run"
+MALFORMED = (LookupError, ValueError, TypeError, AttributeError, RecursionError, csv.Error, msgspec.MsgspecError)
+"""What reading a damaged file raises."""
+SURPLUS = 10
+"""How many times the evaluations that its runs may have a study can claim to be compared; one with more is damaged."""
+CONTEXT, SHOWN = 40, 200
+"""Characters of a long line that are shown before the first one that differs, and in all."""
+
+
+CLAIMS = {
+    "study": Column("", "study of the pack"),
+    "claim": Column("", "what the pack holds"),
+    "verdict": Column("", f"{SAME}, {DIFFERS} or {CANNOT}"),
+    "packed": Column("", "value in the pack, if it differs"),
+    "here": Column("", "value here, or the reason why there is none"),
+}
+Claim = tuple[str, str, str, str, str]
+"""A row of `CLAIMS`."""
+
+
+class Packed:
+    """A study of a pack: everything follows from its description, manifest, solutions and code.
+
+    The user's code is in the folders `places`, and runs from the first answer or simulation on.
+    """
+
+    def __init__(
+        self, packed: PackedStudy, files: dict[str, bytes], places: Sequence[str], jobs: int | None, progress: Progress
+    ) -> None:
+        self.packed, self.files, self._places, self._jobs, self._progress = packed, files, places, jobs, progress
+        self.manifest: JsonObject = json_of(files[MANIFEST])
+        study = convert_table(MANIFEST, self.manifest["study"], Study, "study")
+        study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
+        self._check_claims(study)
+        scoring = msgspec.convert(self.manifest["scoring"], Scoring) if "scoring" in self.manifest else None
+        solutions, outcomes = read_table(files[SOLUTIONS]), packed.outcomes
+        self._solution_rows = rows_of(files[SOLUTIONS])
+        codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
+        evaluations = pd.DataFrame({"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))})
+        original, scoring = self.manifest["original"], scoring or PUBLISHED_SCORING
+        self.case = build_case(study, original, solutions, evaluations, packed.runs, scoring=scoring)
+        self._directory = Path("results", study.name)
+        self._answers: dict[str, Answer] = {}
+
+    def _check_claims(self, study: Study) -> None:
+        """Refuse what no pack claims, before anything is computed."""
+        outcomes, runs = self.packed.outcomes, self.packed.runs
+        if unknown := outcomes.keys() - set(Outcome):
+            raise ValueError(f"there is no outcome {min(unknown)!r}")
+        if not set(runs) <= set(all_runs(study)) or len(runs) > len({*runs}):
+            raise ValueError(f"the study has no such runs: {runs[:3]}")
+        if (total := sum(outcomes.values())) > SURPLUS * len(runs) * study.search.evaluations:
+            raise ValueError(f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have")
+        for text in self.packed.questions:
+            if "--out" in split(text):
+                raise InputError("ask", f"{text!r} writes a file", "a question without --out")
+
+    def answer(self, text: str) -> Answer:
+        if text not in self._answers:
+            add_import_folders(self._places)
+            self._answers[text] = answer_to(text, [self.case], [self._directory], None, self._jobs, self._progress)
+        return self._answers[text]
+
+    def _answer_json(self, text: str) -> bytes:
+        return json_bytes(packed_answer(self.answer(text)))
+
+    def page(self) -> bytes:
+        answers = [self.answer(text) for text in self.packed.questions]
+        versions = self.manifest["versions"]
+        study = ReportedStudy(directory=self._directory, case=self.case, versions=versions, answers=answers)
+        return make_page([study], progress=self._progress).encode()
+
+    def study_file(self) -> bytes:
+        """A study file with all that the study extends."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"{self.case.study.name}.toml")
+            write_study(path, self.case.study, "The study as it was run, with all that it extends.")
+            return path.read_bytes().partition(b"\n")[2]  # without the path of the schema on this machine
+
+    @cached_property
+    def simulated(self) -> tuple[bytes, bytes]:
+        """The original vehicle's evaluation, and the table of solutions, all simulated again."""
+        characteristics, solutions = self.case.characteristics, self.case.solutions
+        settings = np.vstack([characteristics.original, solutions[list(characteristics.names)].to_numpy(float)])
+        evaluations = evaluate_settings(self.case.study, settings, jobs=self._jobs, progress=self._progress)
+        frame = evaluations_frame(characteristics.names, [(("", 0), evaluations.take(range(1, len(settings))))])
+        frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
+        return json_bytes(record(evaluations, row=0)), rows_of(csv_of(frame))
+
+    @cached_property
+    def searched(self) -> tuple[bytes, bytes]:
+        """The outcomes of all evaluations, and the table of solutions, of the same runs again."""
+        with tempfile.TemporaryDirectory() as folder:
+            study, runs = self.case.study, self.packed.runs
+            results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs)
+            return json_bytes(count_outcomes(results.case)), rows_of(csv_of(results.solutions))
+
+    def checks(self, folder: Path, search: bool) -> Iterator[tuple[str, bytes, Callable[[], bytes]]]:
+        """What the pack claims, and the functions that compute it again; the manifest is in `folder`."""
+        solutions = self._solution_rows
+        yield "inputs", b"", lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode()
+        yield "study", self.files[STUDY], self.study_file
+        yield "original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0]
+        yield "solutions", solutions, lambda: self.simulated[1]
+        for text, answer in zip(self.packed.questions, json_of(self.files[ANSWERS]), strict=True):
+            yield f"answer {text}", json_bytes(answer), partial(self._answer_json, text)
+        yield "report", self.files[PAGE], self.page
+        if search:
+            yield "search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0]
+            yield "search: solutions", solutions, lambda: self.searched[1]
+
+    @property
+    def code(self) -> list[str]:
+        """The user code that would run: files of the pack, and what the study and the questions name.
+
+        Networks count, since SUMO's options beside them may name files to write.
+        """
+        study, prefix = self.case.study, f"{CODE}/"
+        files = [name.removeprefix(prefix) for name in self.files if name.startswith(prefix)]
+        named = [name for name in (*study.search.algorithms, *self.packed.questions) if ":" in name.partition(" ")[0]]
+        return [*files, *user_code_names(study), *named]
+
+
+def read_table(content: bytes) -> pd.DataFrame:
+    """Read a table of solutions to the last bit; raises ValueError or KeyError if a cell is no number."""
+    frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
+    numbers = [name for name in frame if name not in ("algorithm", "outcome")]
+    frame = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
+    return frame.astype({"run": int, "f_num_diff": int})
+
+
+def packed_answer(answer: Answer) -> JsonObject:
+    """An answer as a pack holds it: with its command."""
+    return {"command": answer.command, **answer.to_dict()}
+
+
+def json_of(content: bytes) -> Any:
+    """The value of a JSON text; raises ValueError if it is none, or holds NaN or an infinity."""
+
+    def refuse(name: str) -> NoReturn:
+        raise ValueError(f"{name} is no JSON")
+
+    return json.loads(content, parse_constant=refuse)
+
+
+def json_bytes(value: Any) -> bytes:
+    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
+
+
+def csv_of(frame: pd.DataFrame) -> bytes:
+    return frame.to_csv(index=False, lineterminator="\n").encode()
+
+
+def rows_of(table: bytes) -> bytes:
+    """The rows of a CSV table as JSON."""
+    return json_bytes(list(csv.DictReader(io.StringIO(table.decode()))))
+
+
+def count_outcomes(case: Case) -> dict[str, int]:
+    """The number of evaluations of all finished runs, by outcome."""
+    runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
+    outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
+    return {str(outcome): int(count) for outcome, count in outcomes.value_counts(sort=False).sort_index().items()}
+
+
+def compare(study: str, claim: str, packed: bytes, compute: Callable[[], bytes]) -> Claim:
+    """A claim, computed again; the lines shown are the first that differ."""
+    try:
+        here = compute()
+    except SafevarError as error:
+        return study, claim, CANNOT, "", " ".join(str(error).split())
+    if packed == here:
+        return study, claim, SAME, "", ""
+    lines, lines_here = (content.decode().splitlines(keepends=True) for content in (packed, here))
+    pairs = zip_longest(lines, lines_here, fillvalue="nothing")
+    first, second = next((_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1)
+    same = next(index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1)
+    start = max(same - CONTEXT, 0) if max(len(first), len(second)) > SHOWN else 0
+    return study, claim, DIFFERS, first[start : start + SHOWN], second[start : start + SHOWN]
+
+
+def _shown(line: str, other: str) -> str:
+    """A line without spaces around it, unless the other line differs in them alone."""
+    return repr(line) if line.strip() in ("", other.strip()) else line.strip()
