@@ -7,10 +7,14 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, run_campaign
+from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, problem_of, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import warn
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
+from safevar_sumo.records import Evaluations
+from safevar_sumo.search import PymooAlgorithm
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.system import System
@@ -72,7 +76,10 @@ def run(
         run_campaign(
             loaded_study, system, keys, directory, workers, show, warn, batch, engine, retry_failed=retry_failed
         )
-    return load(directory)
+    results = load(directory)
+    if remark := few_evaluations(results.case):
+        warn(remark)
+    return results
 
 
 def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
@@ -84,6 +91,10 @@ def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
         If one of its names or parameters cannot be used.
     """
     loaded_study, system = load_and_assemble(study, source)
+    characteristics = system.characteristics
+    problem = problem_of(loaded_study, system, Evaluations.none(len(characteristics), METRICS))
     for name in loaded_study.search.labels:
-        algorithm_of(name, loaded_study)
+        algorithm = algorithm_of(name, loaded_study)
+        if isinstance(algorithm, PymooAlgorithm):
+            algorithm.try_out(problem, loaded_study.source)
     return loaded_study, system

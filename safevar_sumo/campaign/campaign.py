@@ -83,6 +83,7 @@ def run_campaign(
     results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
     algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
     results.manifest["titles"] = {name: one.title for name, one in algorithms.items() if one.title}
+    results.manifest["stop_by_themselves"] = [name for name, one in algorithms.items() if one.stops_by_itself]
     task = Task(study=study, engine=engine_used, batch_size=batch_size or settings_per_batch(system, engine_used))
     show_journals = journal_progress(study, keys, directory, progress)
     show_journals([])

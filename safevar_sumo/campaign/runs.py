@@ -13,8 +13,10 @@ from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import Failure, Journal, failures_of, run_name
-from safevar_sumo.search import ALGORITHMS, DESCRIPTIONS, PYMOO_ALGORITHMS, Algorithm, Search, pymoo_algorithm
+from safevar_sumo.search import ALGORITHMS, DESCRIPTIONS, PYMOO_ALGORITHMS, Algorithm, Problem, Search, pymoo_algorithm
 from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
+from safevar_sumo.sumo.system import System
+from safevar_sumo.vehicles import region_of
 
 
 class RunKey(NamedTuple):
@@ -77,6 +79,18 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
     algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     return algorithm
+
+
+def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
+    """What the searches of a study solve."""
+    return Problem(
+        characteristics=system.characteristics,
+        original=original,
+        evaluations=study.search.evaluations,
+        population=study.search.population,
+        scoring=system.measuring.scoring,
+        region=region_of(study),
+    )
 
 
 def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:

@@ -14,7 +14,7 @@ import numpy as np
 from safevar_sumo.campaign.cluster import has_caller
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of, verify_settings
 from safevar_sumo.campaign.identity import identity_of
-from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, random_generator_of
+from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, problem_of, random_generator_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -27,8 +27,6 @@ from safevar_sumo.results import (
     journal_head,
     manifest_of,
 )
-from safevar_sumo.search import Problem
-from safevar_sumo.vehicles import region_of
 
 MAX_NAMES = 6
 """Largest number of runs that the name of a share lists."""
@@ -114,14 +112,7 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     study, system = task.study, system_of(task.study)
     path = journal_file(share.directory, str(key))
     head = journal_head(identity_digest(share.manifest), str(key), system.characteristics.names)
-    problem = Problem(
-        characteristics=system.characteristics,
-        original=share.original,
-        evaluations=study.search.evaluations,
-        population=study.search.population,
-        scoring=system.measuring.scoring,
-        region=region_of(study),
-    )
+    problem = problem_of(study, system, share.original)
     search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
     return Run(key, search, Journal(path, head, retry_failed=share.retry_failed), study.search.evaluations)
 

@@ -5,7 +5,7 @@ vehicle.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -54,6 +54,8 @@ class Case:
         Settings that could not be simulated.
     titles
         Names of algorithms for readers, by label, as far as their classes have them.
+    stop_by_themselves
+        Labels of algorithms that may end before they have used their budget.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Case:
     failures: tuple[Failure, ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
     titles: Mapping[str, str] = field(default_factory=dict)
+    stop_by_themselves: Collection[str] = ("safe_fuzzer",)
 
     def title_of(self, algorithm: str) -> str:
         """The name of an algorithm for readers."""
@@ -191,7 +194,8 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
             case = build_case(
                 study, manifest["original"], solutions, evaluations, finished, has_runs, failures, scoring
             )
-            cases.append(replace(case, titles=manifest.get("titles", {})))
+            stop_by_themselves = manifest.get("stop_by_themselves", case.stop_by_themselves)
+            cases.append(replace(case, titles=manifest.get("titles", {}), stop_by_themselves=stop_by_themselves))
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
             raise InputError(
                 path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`"

@@ -105,12 +105,14 @@ def _checked_result(code: UserCode, result: Any, yielded: set[bytes], problem: P
 class Algorithm:
     """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2].
 
-    `title` is its name in tables and legends, by default its name in the study. `RETURNS` is what the method of a
-    user's class must return.
+    `title` is its name in tables and legends, by default its name in the study. `stops_by_itself` says that it may end
+    before it has used its budget: of others that do, the study's end and tables say so. `RETURNS` is what the method
+    of a user's class must return.
     """
 
     __slots__ = ()
     title: str = ""
+    stops_by_itself: ClassVar[bool] = False
     RETURNS: ClassVar[Mapping[str, Returned]] = {"search": Returned(like=0, then=check_search)}
 
     @abstractmethod

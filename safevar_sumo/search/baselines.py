@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import moocore
 import numpy as np
@@ -55,6 +55,7 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
         Weight of the first objective in the score; the other objectives have weight 1.
     """
 
+    stops_by_itself: ClassVar[bool] = True
     generation: PositiveCount = 50
     kept: PositiveCount = 50
     warm_up: Annotated[int, Meta(ge=0)] = 500

@@ -14,9 +14,9 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from safevar_sumo.errors import InputError, check_name, describe_error
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search.base import Algorithm, Problem, Search
-from safevar_sumo.study import PYMOO, label_of
+from safevar_sumo.study import ORIGINAL_DEGREE, PYMOO, label_of
 
 MODULES = {
     "moo.age": "AGEMOEA",
@@ -75,6 +75,8 @@ TYPES: dict[str, Any] = {
 """Types of arguments whose default value in pymoo does not tell them."""
 HIDDEN = {"verb_log", "cmaes_verbose", "maxfevals", "n_diffs", "advance_after_initial_infill"}
 """Arguments that write files, print, or are no choice of the user's."""
+TRIAL = 300
+"""Number of settings of a formula that an algorithm with arguments is tried with."""
 FAILED = 1e9
 """Objectives and violation, for pymoo, of a setting that could not be scored."""
 
@@ -121,6 +123,41 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         result = every.take([rows[setting.tobytes()] for setting in _settings(optimum, problem)])
         return result.take(problem.scoring.valid(result))
 
+    def try_out(self, problem: Problem, source: str) -> None:
+        """Search a formula in place of simulations, if the study gives arguments.
+
+        Raises
+        ------
+        InputError
+            Naming the arguments of the study `source` without which pymoo would not fail.
+        """
+        given = {name: value for name in self.__struct_fields__ if (value := getattr(self, name)) is not UNSET}
+        key, size = f"search.{self.name!r}", given.get("pop_size", 0)
+        if size > problem.evaluations:
+            legal = f"at most the {problem.evaluations} evaluations of a run"
+            raise InputError(source, f"{key}.pop_size = {size}", legal)
+        if not given or not (failure := self._failure(problem)):
+            return
+        without = {name: msgspec.structs.replace(self, **{name: UNSET}) for name in given}
+        blamed = [name for name, other in without.items() if not other._failure(problem)] or list(given)
+        named = " and ".join(f"{key}.{name} = {given[name]!r}" for name in blamed)
+        raise InputError(source, f"{named}: pymoo fails: {failure}", "another value, or none")
+
+    def _failure(self, problem: Problem) -> str:
+        """The error with which pymoo fails in a search of a formula, "" if it does not."""
+        try:
+            search = self.search(problem, np.random.default_rng(0))
+            settings = next(search)
+            asked = len(settings)
+            while asked < TRIAL:
+                settings = search.send(_formula(settings, problem))
+                asked += len(settings)
+        except StopIteration:
+            pass
+        except InputError as error:
+            return error.problem
+        return ""
+
     def begin(self, problem: Problem, seed: int) -> Any:
         """pymoo's algorithm before its first request."""
         from pymoo.core.problem import Problem as PymooProblem
@@ -153,8 +190,25 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
 def _settings(population: Any, problem: Problem) -> FloatArray:
     """The filtered settings of pymoo's individuals, shape (k, n)."""
     characteristics = problem.characteristics
-    values = np.clip(population.get("X").astype(float), characteristics.lower, characteristics.upper)
+    values = population.get("X").astype(float).reshape(-1, len(characteristics))
+    values = np.clip(values, characteristics.lower, characteristics.upper)
     return characteristics.filter(problem.repaired(values))
+
+
+def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
+    """Made-up evaluations of settings, shape (k, n): the nearer to the lower ends of the domains, the safer."""
+    characteristics, scoring = problem.characteristics, problem.scoring
+    share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
+    degree = np.add.accumulate(share**2, axis=1)[:, -1]
+    names = [metric.name for metric in scoring.metrics]
+    return Evaluations(
+        settings=settings,
+        outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
+        collision_speed=np.full(len(settings), np.nan),
+        metrics={**dict.fromkeys(names, degree), ORIGINAL_DEGREE: np.full(len(settings), scoring.safe_original or 0.0)},
+        f_diff=characteristics.largest_change(settings),
+        f_num_diff=characteristics.number_changed(settings),
+    )
 
 
 def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:

@@ -199,7 +199,7 @@ def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> Non
     answer = answer_questions([case])
     table = answer.tables["rq2"]
     assert table[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [[46, 40]]
-    note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it stops by its own rule)."
+    note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it ended early)."
     assert f"made-up: settings that a run simulates, mean: {note}" in [*answer.tables["remarks"]["remark"]]
     assert "46" in answer.only("evaluations").render("text")
     imported = answer_questions([made_up(*rows, has_runs=False)])

@@ -11,9 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.api.running import run
 from safevar_sumo.campaign.runs import algorithm_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import PUBLISHED_SCORING
+from safevar_sumo.questions.research_questions.answer import tables
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import load_runs, read_manifest
 from safevar_sumo.results.manifest import write_manifest
@@ -79,6 +81,10 @@ def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
     assert np.array_equal(ours.settings, theirs.X)
 
 
+STOPS: JsonObject = {"safe_fuzzer": {"generation": 5, "warm_up": 0, "generations_without_improvement": 1}}
+"""Options with which SafeFuzzer ends early."""
+
+
 def with_pymoo(algorithms: list[str], **search: Any) -> Study:
     return load_study("smoke", search={"algorithms": algorithms, **search})
 
@@ -116,6 +122,55 @@ def test_a_mistake_in_a_study_names_key_and_nearest_name(algorithm: str, table: 
 def test_what_pymoo_refuses_is_an_error_of_the_user(name: str, arguments: dict[str, Any], error: str) -> None:
     with pytest.raises(InputError, match=error):
         next(begun(built(name, **arguments), 1, 130))
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "error"),
+    [
+        (
+            "ES",
+            {"rule": -1.0, "phi": 2.0},
+            "search.'pymoo:ES'.rule = -1.0: pymoo fails: ValueError: negative dimensions",
+        ),
+        ("CMOPSO", {"elite_size": 0}, "search.'pymoo:CMOPSO'.elite_size = 0: pymoo fails"),
+        ("MOPSO_CD", {"w": 0.5, "max_velocity_rate": -1.0}, "search.'pymoo:MOPSO_CD'.max_velocity_rate = -1.0: pymoo"),
+        ("GDE3", {"de_repair": "nope", "CR": 0.3}, "search.'pymoo:GDE3'.de_repair = 'nope': pymoo fails"),
+        ("NRBO", {"max_iteration": 0}, "search.'pymoo:NRBO'.max_iteration = 0: pymoo fails: ZeroDivisionError"),
+        (
+            "ISRES",
+            {"alpha": 0.0, "phi": 0.0},
+            "search.'pymoo:ISRES'.alpha = 0.0 and search.'pymoo:ISRES'.phi = 0.0: pymoo",
+        ),
+        ("GA", {"pop_size": 500}, "search.'pymoo:GA'.pop_size = 500\nexpected: at most the 100 evaluations"),
+    ],
+)
+def test_an_option_with_which_pymoo_fails_is_named_before_anything_is_simulated(
+    name: str, table: JsonObject, error: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as refused:
+        run(with_pymoo([f"pymoo:{name}"], parameters={f"pymoo:{name}": table}), tmp_path / "out")
+    assert error in str(refused.value)
+    assert str(refused.value).count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_algorithm_that_simulates_little_of_its_budget_is_named_unless_it_says_that_it_stops_by_itself(
+    in_tmp: Path,
+) -> None:
+    options = {"pymoo:PSO": {"max_velocity_rate": 0.0}, "pymoo:CMAES": {"sigma": -1.0}}
+    study = with_pymoo(["pymoo:PSO", "pymoo:CMAES", "safe_fuzzer", "rs"], evaluations=60, runs=1, parameters=options)
+    study = msgspec.structs.replace(
+        study, search=msgspec.structs.replace(study.search, parameters={**options, **STOPS})
+    )
+    with pytest.warns(UserWarning, match="less than 90% of a run's evaluations are simulated") as warned:
+        results = run(study, in_tmp / "out", jobs=1)
+    counts = results.evaluations.groupby("algorithm").size()
+    assert max(counts[name] for name in ("pymoo_PSO", "pymoo_CMAES", "safe_fuzzer")) < 54 < counts["rs"]
+    remark = str(warned[-1].message)
+    assert f"PSO (pymoo) {counts['pymoo_PSO']} of 60 (equal settings are simulated once)" in remark
+    assert f"CMAES (pymoo) {counts['pymoo_CMAES']} of 60 (it ended early)" in remark
+    assert "SafeFuzzer" not in remark
+    assert remark in str(tables(results.directory).to_dict())
 
 
 def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_coll
 from safevar_sumo.questions.research_questions import changes
 from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choices, titles_of
 from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
-from safevar_sumo.questions.research_questions.fronts import count_evaluations
+from safevar_sumo.questions.research_questions.fronts import count_evaluations, describe_evaluations, few_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, TABLES, WEATHER
 from safevar_sumo.study import SAFETY_DEGREE, label_of
@@ -119,7 +119,8 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
         )
     if all(frame.empty for frame in frames.values()):
         raise errors[0]
-    remarks = [("all", remark) for case in cases for remark in case.remarks] + remarks
+    of_all = [remark for case in cases for remark in (*case.remarks, few_evaluations(case)) if remark]
+    remarks = [*(("all", remark) for remark in of_all), *remarks]
     frames["remarks"] = tabulate("Remarks", REMARKS, list(dict.fromkeys(remarks)))
     return Answer(
         question="tables",
@@ -142,18 +143,6 @@ def _verdict(case: Case) -> str:
     of_all = len(case.solutions_of(NSGA2))
     where = " in the same encounter" if case.study.scenario.search else ""
     return f"{text}; {critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle{where}."
-
-
-def describe_evaluations(case: Case) -> str:
-    """How many settings the algorithms' runs simulate, and why some simulate fewer than the budget."""
-    texts = []
-    for algorithm, rows in count_evaluations(case).groupby("algorithm", sort=False):
-        requested, simulated, budget = rows[["requested", "simulated", "budget"]].mean().round()
-        reasons = ["it stops by its own rule"] if requested < budget else []
-        reasons += ["equal settings are simulated once"] if simulated < requested else []
-        words = f" ({' and '.join(reasons)})" if reasons else ""
-        texts.append(f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}")
-    return f"settings that a run simulates, mean: {'; '.join(texts)}."
 
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
@@ -180,7 +169,8 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
                 "number of evaluations known."
             )
         elif table == "rq2" and len(case.evaluations):
-            yield prefix + describe_evaluations(case)
+            texts = describe_evaluations(case, count_evaluations(case))
+            yield f"{prefix}settings that a run simulates, mean: {texts}."
     if table in ("rq1-runs", "rq2-runs"):
         tests = frame.dropna(subset="effect_size")
         if few_count := len(tests) - tests["enough_runs"].sum():

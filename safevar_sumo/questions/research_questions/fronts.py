@@ -19,6 +19,8 @@ MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
 INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
 REFERENCE_COORDINATE = 1.1
 """Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
+USUAL_SHARE = 0.9
+"""Share of its budget from which on nobody asks why an algorithm simulates less."""
 CURVE_POINTS = 50
 """Maximum number of points of a run's convergence."""
 
@@ -123,6 +125,36 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     if not rows:
         raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.DataFrame(rows, columns=["algorithm", "run", "requested", "simulated", "budget"])
+
+
+def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
+    """How many settings a run of each algorithm simulates, the mean of `count_evaluations`, and why fewer than the
+    budget.
+    """
+    texts = []
+    for algorithm, rows in counts.groupby("algorithm", sort=False):
+        requested, simulated, budget = rows[["requested", "simulated", "budget"]].mean().round()
+        end = "it stops by its own rule" if algorithm in case.stop_by_themselves else "it ended early"
+        reasons = [end] if requested < budget else []
+        reasons += ["equal settings are simulated once"] if simulated < requested else []
+        words = f" ({' and '.join(reasons)})" if reasons else ""
+        texts.append(f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}")
+    return "; ".join(texts)
+
+
+def few_evaluations(case: Case) -> str:
+    """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget, without those that say that
+    they stop by themselves; "" without any.
+    """
+    if not case.has_runs or case.evaluations.empty or not case.finished_runs:
+        return ""
+    counts = count_evaluations(case)
+    sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform("sum")
+    is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts["algorithm"].isin([*case.stop_by_themselves])
+    if not is_few.any():
+        return ""
+    share, texts = f"{USUAL_SHARE:.0%}", describe_evaluations(case, counts[is_few])
+    return f"{case.name}: less than {share} of a run's evaluations are simulated: {texts}. Are the options as meant?"
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
