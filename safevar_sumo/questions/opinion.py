@@ -16,11 +16,11 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Criterion, question
-from safevar_sumo.questions.compare import SETTING_COLUMNS, SIDES, counts_of, draw_pairs, paired_test, table_of_pairs
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, draw_neighbours, robustness_in_words
 from safevar_sumo.questions.multi_body import load_bmw_parameters
+from safevar_sumo.questions.pairs import SETTING_COLUMNS, SIDES, counts_of, draw_pairs, paired_test, table_of_pairs
 from safevar_sumo.questions.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject
@@ -155,7 +155,8 @@ def _drive_both(
     ours = evaluate(system, both)
     theirs = evaluate(second_system, np.concatenate([both, scaled.reshape(-1, len(characteristics))]))
     names = ["", *(cause["solution"] for cause in causes)] * 2
-    frame = table_of_pairs(names, ours, theirs.take(range(len(both))), unsafe)
+    there = theirs.take(range(len(both)))
+    frame = table_of_pairs(names, ours, there, unsafe.of(ours), unsafe.of(there))
     endings = (
         [ending_in_words(*end, contact) for end in zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)]
         for side in SIDES

@@ -98,6 +98,14 @@ class Characteristic:
         is_beyond = rounded > original >= value if upwards else rounded < original <= value
         return original if is_beyond else rounded
 
+    def rounded_inwards(self, interval: tuple[float, float]) -> tuple[float, float]:
+        """An interval around the original, rounded inwards; ends of the domain stay."""
+        low, high = interval
+        return (
+            low if low <= self.lower else self.rounded(low, upwards=True),
+            high if high >= self.upper else self.rounded(high, upwards=False),
+        )
+
     @property
     def suffix(self) -> str:
         """The unit as text after a number; empty without a unit."""

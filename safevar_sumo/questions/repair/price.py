@@ -28,8 +28,8 @@ def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) 
     vehicle brakes nowhere. `encounters` are new vehicles in K encounters, shape (K, n).
     """
     today, changed = assemble(study), assemble(with_parameters(study, values))
-    onsets_today, _ = _drive_new_cars(today, encounters)
-    onsets, deceleration = _drive_new_cars(changed, encounters)
+    onsets_today, _ = drive_new_cars(today, encounters)
+    onsets, deceleration = drive_new_cars(changed, encounters)
     benign = benign_scenes(study, today)
     before, after = (needless_braking(system, benign) for system in (today, changed))
     metres, seconds = onsets_today - onsets
@@ -47,7 +47,7 @@ def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) 
     }
 
 
-def _drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, float]:
+def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, float]:
     """Where and when the new vehicle begins to brake at each of N points in each of K encounters, shape (2, N K), NaN
     if it does not [m, s]; its largest deceleration [m/s^2].
     """

@@ -1,0 +1,256 @@
+"""What changes from one system to another: another driving system, vehicle, weather or version?
+
+The same settings are simulated in both systems, A and B: all solutions of results on either side that both domains
+hold, and settings drawn on lines from the original vehicles into the common domain, near to where the systems begin to
+fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.metrics import RATING_POINTS, Unsafe, margin_of
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.ask import Count, Criterion, Margin, question
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.compare.differences import (
+    LIMIT_COLUMNS,
+    Difference,
+    compare_counts,
+    compare_limits,
+    compare_originals,
+    limits_of_both,
+)
+from safevar_sumo.questions.compare.settings import (
+    LINE,
+    RUN_COLUMNS,
+    SAMPLE,
+    CommonDomain,
+    Pairs,
+    in_order_of,
+    pairs_of,
+)
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.pairs import (
+    SETTING_COLUMNS,
+    SIDES,
+    UNSAFE_IN,
+    counts_of,
+    draw_pairs,
+    paired_test,
+    table_of_pairs,
+)
+from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
+from safevar_sumo.questions.subject import study_in
+from safevar_sumo.questions.words import counted_in_words, join_phrases, number_of
+from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
+from safevar_sumo.sumo.matrix import contact_degree
+from safevar_sumo.sumo.system import assemble
+
+
+@question
+def compare(
+    subject: Study | Case,
+    evaluator: Evaluator,
+    other: Study | Case,
+    *,
+    samples: Count = 2000,
+    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    margin: Margin = None,
+    unsafe: Criterion = None,
+) -> Answer:
+    """Compare two studies or results, A and B: what is better in B, and what is worse.
+
+    One criterion counts for both. Where the original vehicles differ, the same changes of each are compared. The filter
+    of small changes, whose thresholds are a search's, does not act.
+
+    Parameters
+    ----------
+    samples
+        Number of settings that are drawn in the common domain beside the solutions, near to where A and B begin to
+        fail: their counts are no shares of the domain.
+    limits
+        A limit in the characteristic's unit, such as "treadDepth >= 3", within which is compared; may be repeated.
+    margin
+        Distance to keep from a collision [m], as in `tolerance`; by default the larger error of the models that the two
+        studies state, else 0.3 m.
+    unsafe
+        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    """
+    study, second = evaluator.study, evaluator.for_study(in_order_of(evaluator.study, study_in(other)))
+    evaluators = evaluator, second
+    within = limits_of(limits, study.domains)
+    common = CommonDomain.of(evaluators, within)
+    stated = [one.parse_criterion(unsafe) for one in evaluators if unsafe is not None]
+    originals = [one.evaluate_original() for one in evaluators]
+    criteria = _criteria((subject, other), evaluators, originals, stated, margin)
+    pairs, outside = pairs_of((subject, other), common, criteria, samples)
+    is_valid = pairs.runs[0].valid & pairs.runs[1].valid
+    left_out = int(np.count_nonzero(pairs.runs[0].infeasible | pairs.runs[1].infeasible))
+    settings = _settings_frame(common, pairs, criteria)[is_valid]
+    metric = RATING_POINTS.name if all(is_rated(one.study) for one in evaluators) else SAFETY_DEGREE
+    a, b = (run.take(is_valid).column(metric) for run in pairs.runs)
+    p, a12, tested = _test(settings.assign(a=a, b=b))
+    counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
+    titles = tuple(one.study.name for one in evaluators)
+    titles = titles if len(set(titles)) == 2 else ("A", "B")
+    of_limits = limits_of_both(evaluators, criteria, within)
+    ends, of_originals = compare_originals(evaluators, originals, criteria, titles[0])
+    members = evaluator.characteristics.vehicle.members
+    differences = compare_counts(counts, titles[0]), compare_limits(of_limits, members), of_originals
+    better, worse = ([*chain(*kind)] for kind in list(zip(*differences, strict=True))[:2])
+    changes = [row[-1] for row in of_limits]
+    numbers: JsonObject = {
+        **({"driven": False} if second.no_verdict else {}),
+        "unsafe": str(criteria[0]),
+        "margin": criteria[0].keep,
+        "settings": sum(counts.values()),
+        **counts,
+        "p": p,
+        "a12": a12,
+        "better_in": len(better),
+        "worse_in": len(worse),
+        "limits_grown": changes.count("grown") + changes.count("both"),
+        "limits_shrunk": changes.count("shrunk") + changes.count("both"),
+        "outside": outside,
+        "not_simulated": len(is_valid) - int(np.count_nonzero(is_valid)) - left_out,
+        **ends,
+    }
+    sentences = [
+        *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
+        *_verdict(differences, titles, criteria[0], is_measured=bool(ends["benign_scenes"])),
+        _test_in_words("rating" if metric == RATING_POINTS.name else "safety degree", titles[1], p, a12, tested),
+        *_basis_in_words(common, limits),
+        *counted_in_words(study, left_out),
+    ]
+    return Answer(
+        question="compare",
+        study=study,
+        verdict=" ".join(sentences),
+        numbers=numbers,
+        tables={
+            "limits": tabulate("Limits of each alone, rounded to the safe side", LIMIT_COLUMNS, of_limits),
+            "settings": _settings_table(common, settings),
+        },
+        draw=partial(draw_pairs, titles=titles),
+    )
+
+
+def _criteria(
+    subjects: Sequence[Study | Case],
+    evaluators: Sequence[Evaluator],
+    originals: Sequence[Evaluations],
+    stated: Sequence[Unsafe],
+    margin: float | None,
+) -> list[Unsafe]:
+    """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its bodies touch.
+
+    Points count only if both are rated; a collision, if any vehicle of either collides.
+    """
+    if stated:
+        criterion = stated[0]
+    else:
+        chosen = list[Unsafe]()
+        for one, subject, original in zip(evaluators, subjects, originals, strict=True):
+            if Unsafe() not in chosen:
+                chosen.append(one.choose_criterion(None, subject, original))
+        without_points = [one for one in chosen if one.points is None]
+        criterion = Unsafe() if Unsafe() in chosen else [*without_points, *chosen][0]
+    # The original's margin is what wear may use up in an encounter that is searched.
+    has_margin = margin is not None or (not stated and not evaluators[0].study.scenario.search)
+    if criterion == Unsafe() and has_margin:
+        criterion = replace(criterion, keep=max(margin_of(one.study, margin) for one in evaluators))
+    return [replace(criterion, contact=contact_degree(assemble(one.study))) for one in evaluators]
+
+
+def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
+    """The settings with their values in A, B's values where they differ, and `SETTING_COLUMNS`."""
+    names, (frame, settings, runs) = common.evaluators[0].characteristics.names, pairs
+    is_unsafe = [unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)]
+    of_pairs = table_of_pairs(frame["solution"], *runs, *is_unsafe)
+    values = {name: settings[0][:, column] for column, name in enumerate(names)}
+    moved = {f"b_{names[column]}": settings[1][:, column] for column in np.flatnonzero(common.shift).tolist()}
+    return pd.concat([frame.drop(columns="solution"), of_pairs, pd.DataFrame({**values, **moved})], axis=1)
+
+
+def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
+    """The table of settings, those first that are unsafe in one system only."""
+    members = common.evaluators[0].characteristics.members
+    columns = {"source": Column("", "a or b, whose solution it is, or sample"), **SETTING_COLUMNS}
+    columns |= {item.name: Column(item.unit, item.words, is_shown=False) for item in members}
+    for column in np.flatnonzero(common.shift).tolist():
+        item = members[column]
+        meaning = f"{item.name} in B, the same change of another original"
+        columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
+    order = settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
+    return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
+
+
+def _test(frame: pd.DataFrame) -> tuple[float, float, str]:
+    """Test the columns `a` and `b` in pairs: the p-value, A12, and what the pairs are.
+
+    A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs, over the settings
+    that were drawn on a line.
+    """
+    frame = frame.dropna(subset=[*SIDES])
+    sample = frame[frame["source"] == SAMPLE]
+    pairs, unit = sample.groupby(LINE)[[*SIDES]].mean(), "line"
+    if "run" in frame:
+        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
+        if len(means) >= fewest_runs("RQ1"):
+            pairs, unit = means, "run"
+    p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
+    return p, a12, number_of(len(pairs), unit)
+
+
+def _verdict(
+    differences: Sequence[Difference], titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool
+) -> Iterator[str]:
+    """Whether B is better: in something and worse in nothing, needless braking included."""
+    a, b = titles
+    better, worse, facts = ("; ".join(chain(*kind)) for kind in zip(*differences, strict=True))
+    if worse and better:
+        yield f"Neither is better. {b} {worse}. But it {better}"
+    elif worse:
+        yield f"{b} is worse than {a}: it {worse}"
+    elif better and is_measured:
+        yield f"{b} is better than {a}: it {better}; nothing that was measured is worse"
+    elif better:
+        yield f"{b} is not called better than {a}, as needless braking was not measured: it {better}"
+    else:
+        yield f"No difference between {a} and {b} was found"
+    yield f"(unsafe: {unsafe.description})."
+    if facts:
+        yield f"Both new, {b} {facts}."
+    if not is_measured:
+        yield "Needless braking was not measured: no benign scenes are known for this scenario."
+
+
+def _test_in_words(quantity: str, b: str, p: float, a12: float, pairs: str) -> str:
+    if np.isnan(p):
+        return "There is no pair of results to test."
+    change = f"{'lower' if a12 > 0.5 else 'higher'} in {b}" if p < ALPHA else "not significantly different"
+    return f"The {quantity} is {change} (p = {p:.2g}, A12 = {a12:.2f}; {pairs})."
+
+
+def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
+    """Within which limits, and around which originals."""
+    if limits:
+        yield f"Compared within {join_phrases(limits)}."
+    members = [one.characteristics.members for one in common.evaluators]
+    texts = [
+        f"{item.name} {item.original:g} and {members[1][column].original:g}{item.suffix}"
+        for column, item in enumerate(members[0])
+        if common.shift[column]
+    ]
+    if texts:
+        yield f"The original vehicles differ ({join_phrases(texts)}): the same changes of each are compared."

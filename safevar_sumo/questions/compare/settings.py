@@ -1,0 +1,231 @@
+"""The settings with which two systems, A and B, are compared: the same changes of both original vehicles, in the same
+encounters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.evaluator import Evaluator, Interval, sobol_points
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.results import handles_of
+from safevar_sumo.study import Limit, Study
+from safevar_sumo.study.characteristics import Domain, check_limits
+
+MAX_FACTOR = 512
+"""Largest number of settings that are drawn for each one that satisfies the constraints of both studies."""
+SAMPLE = "sample"
+"""Source of the settings that are drawn."""
+RUN_COLUMNS = ["source", "algorithm", "run"]
+"""Columns that identify a run."""
+LINE = "line"
+"""Column with the number of a drawn setting's line."""
+ROUNDS = 4
+"""Number of settings on a line: at half of its changes, then each half as far from the last one as that from its own
+last one.
+"""
+
+
+class Pairs(NamedTuple):
+    """M settings in both systems.
+
+    Attributes
+    ----------
+    frame
+        Where each comes from: `source`, `solution`, `algorithm` and `run` of solutions, `line` of drawn settings.
+    settings
+        Their values in A and in B, each of shape (M, n).
+    runs
+        Their evaluations in A and in B.
+    """
+
+    frame: pd.DataFrame
+    settings: tuple[FloatArray, FloatArray]
+    runs: tuple[Evaluations, Evaluations]
+
+    @classmethod
+    def joined(cls, groups: Sequence[Pairs]) -> Pairs:
+        """All pairs of some groups, in their order."""
+        frames, settings, runs = zip(*groups, strict=True)
+        a, b = (np.concatenate(values) for values in zip(*settings, strict=True))
+        in_a, in_b = (Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True))
+        return cls(pd.concat(frames, ignore_index=True), (a, b), (in_a, in_b))
+
+
+class CommonDomain(NamedTuple):
+    """What two systems have in common.
+
+    Attributes
+    ----------
+    evaluators
+        Of A and B, whose characteristics have the same order.
+    shift
+        By how much B's original values are above A's, shape (n,); 0 for parameters of the scenario.
+    lower, upper
+        The ends in A and in B, within the limits, shape (2, n).
+    """
+
+    evaluators: tuple[Evaluator, Evaluator]
+    shift: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+    @classmethod
+    def of(cls, evaluators: tuple[Evaluator, Evaluator], limits: Mapping[str, Limit]) -> CommonDomain:
+        """The common domain, within limits that both original vehicles keep.
+
+        Raises
+        ------
+        InputError
+            If B's original vehicle does not keep a limit, or the domains of a searched parameter have nothing in
+            common.
+        """
+        members, rows = [one.characteristics for one in evaluators], [one.study.domains for one in evaluators]
+        check_limits(rows[1], limits, evaluators[1].study.source, "limits: ")
+        shift = np.where(members[0].of_vehicle, members[1].original - members[0].original, 0.0)
+        ends = np.array([[within(limits, name, of[name]) for name in members[0].names] for of in rows])
+        common = cls(evaluators, shift, ends[:, :, 0], ends[:, :, 1])
+        lower, upper = common.ends_in_a
+        if (lower > upper).any():
+            name = members[0].names[int(np.argmax(lower > upper))]
+            problem = f"{name}: the domains of the two studies do not overlap"
+            raise InputError(evaluators[1].study.source, problem, "studies with a common domain of each parameter")
+        return common
+
+    @property
+    def ends_in_a(self) -> tuple[FloatArray, FloatArray]:
+        """The lower and upper ends of A's settings that both domains hold, shape (n,)."""
+        lower, upper = ([ends[0], self.moved(ends[1], -1)] for ends in (self.lower, self.upper))
+        return np.max(lower, axis=0), np.min(upper, axis=0)
+
+    def moved(self, settings: FloatArray, sign: int = 1) -> FloatArray:
+        """A's settings as B's, or with -1 B's as A's: the same changes of the other original vehicle."""
+        return np.where(self.shift == 0, settings, settings + sign * self.shift)
+
+    def holds(self, settings: Sequence[FloatArray]) -> BoolArray:
+        """Which settings are in both domains, shape (M,)."""
+        inside = [
+            ((values >= lower) & (values <= upper)).all(axis=1)
+            for values, lower, upper in zip(settings, self.lower, self.upper, strict=True)
+        ]
+        return np.asarray(inside[0] & inside[1])
+
+    def in_both(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """A's settings, and the same in B; what rounding moves out of B's domain is put onto its end."""
+        return settings, np.clip(self.moved(settings), self.lower[1], self.upper[1])
+
+    def evaluate(self, settings: tuple[FloatArray, FloatArray]) -> tuple[Evaluations, Evaluations]:
+        """Evaluate settings in both systems."""
+        a, b = (
+            one.evaluate(values, f"settings in {side}")
+            for one, values, side in zip(self.evaluators, settings, "AB", strict=True)
+        )
+        return a, b
+
+
+def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
+    """The ends of a domain within the user's limits."""
+    return limits[name].interval(domain) if name in limits else (domain.lower, domain.upper)
+
+
+def in_order_of(a: Study, b: Study) -> Study:
+    """Study B with its characteristics in A's order.
+
+    Raises
+    ------
+    InputError
+        If B has other characteristics or searched parameters, or other units.
+    """
+    units_a, units_b = ({(name, row.unit) for name, row in study.domains.items()} for study in (a, b))
+    if units_a == units_b:
+        characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
+        return msgspec.structs.replace(
+            b,
+            vehicle=msgspec.structs.replace(b.vehicle, characteristics=characteristics),
+            scenario=msgspec.structs.replace(b.scenario, search={name: b.domains[name] for name in a.scenario.search}),
+        )
+    a_alone, b_alone = (
+        ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
+        for units in (units_a - units_b, units_b - units_a)
+    )
+    raise InputError(
+        b.source,
+        f"cannot be compared: characteristics of {a.name!r} alone: {a_alone}; of {b.name!r} alone: {b_alone}",
+        "studies with the same characteristics and searched parameters in the same units",
+    )
+
+
+def pairs_of(
+    subjects: Sequence[Study | Case], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
+) -> tuple[Pairs, int]:
+    """The solutions of both sides and the drawn settings, evaluated in both systems; and the number of solutions that
+    are not in both domains.
+    """
+    names = list(common.evaluators[0].characteristics.names)
+    groups, outside = [], 0
+    for side, case in zip("ab", subjects, strict=True):
+        if not isinstance(case, Case):
+            continue
+        own = case.solutions[names].to_numpy(float)
+        other = common.moved(own, 1 if side == "a" else -1)
+        settings = (own, other) if side == "a" else (other, own)
+        is_inside = common.holds(settings)
+        kept = [name for name in RUN_COLUMNS if name in case.solutions and case.has_runs]
+        frame = case.solutions[kept].assign(source=side, solution=list(map(str, handles_of(case.solutions))))
+        outside += int(np.count_nonzero(~is_inside))
+        inside = settings[0][is_inside], settings[1][is_inside]
+        groups.append(Pairs(frame[is_inside], inside, common.evaluate(inside)))
+    groups.append(_draw_on_lines(common, criteria, samples))
+    return Pairs.joined(groups), outside
+
+
+def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: int) -> Pairs:
+    """`samples` settings on lines from the original vehicles to Sobol points of the common domain, in the encounters of
+    these points: each nearer to where the systems begin to fail.
+
+    Nearly every vehicle with random changes of all characteristics fails in both systems, which says nothing. So a line
+    goes on with smaller changes after a failure in both, with larger ones after none, and beside a difference. Which of
+    both systems fails does not matter: without a difference between them, a line favours none.
+    """
+    members = common.evaluators[0].characteristics
+    ends = _common_sample(common, math.ceil(samples / ROUNDS))
+    starts = np.where(members.of_vehicle, members.original, ends)
+    shares, step = np.full(len(ends), 0.5), 0.5
+    rounds = list[Pairs]()
+    while (drawn := sum(len(one.frame) for one in rounds)) < samples and len(rounds) < ROUNDS and len(ends):
+        lines = np.arange(min(len(ends), samples - drawn))
+        share = shares[lines, np.newaxis]
+        settings = common.in_both(starts[lines] + share * (ends - starts)[lines])
+        runs = common.evaluate(settings)
+        frame = pd.DataFrame({"source": SAMPLE, "solution": "", LINE: lines})
+        rounds.append(Pairs(frame, settings, runs))
+        failures = np.sum([unsafe.of(one) for unsafe, one in zip(criteria, runs, strict=True)], axis=0)
+        step /= 2
+        beside = np.where(lines % 2, step, -step)
+        shares[lines] += np.choose(failures, [step, beside, -step])
+    return Pairs.joined(rounds)
+
+
+def _common_sample(common: CommonDomain, number: int) -> FloatArray:
+    """`number` settings of A that cover the common domain evenly and satisfy the constraints of both studies; fewer if
+    hardly any settings do.
+    """
+    lower, upper = common.ends_in_a
+    factor = 1
+    while True:
+        settings = lower + sobol_points(number * factor, len(lower), 0) * (upper - lower)
+        both = common.in_both(settings)
+        is_feasible = [one.region.feasible(values) for one, values in zip(common.evaluators, both, strict=True)]
+        settings = settings[is_feasible[0] & is_feasible[1]]
+        if len(settings) >= number or factor >= MAX_FACTOR:
+            return settings[:number]
+        factor *= 2
