@@ -13,7 +13,7 @@ import numpy as np
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, system_of
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code
+from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.runs import RunKey, RunResult, algorithm_of, all_runs
 from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.errors import InputError, SimulationError, one_of
@@ -87,6 +87,7 @@ def run_campaign(
     task = Task(study=study, engine=engine_used, batch_size=batch_size or settings_per_batch(system, engine_used))
     show_journals = journal_progress(study, keys, directory, progress)
     show_journals([])
+    compile_vehicle(study, pool, progress)
     check_code(study, pool)
     no_verdict = ask_why_no_verdict(study, pool)
     if no_verdict:

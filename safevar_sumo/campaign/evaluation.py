@@ -175,6 +175,7 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     time limit ends.
     """
     system = system_of(task.study)
+    system.vehicle.compile()  # outside the time limit
     with end_if_longer(task.study.search.time_limit):
         if task.cells is not None:
             return evaluate_cells(system, rows, task.cells, task.engine)

@@ -55,11 +55,14 @@ class Pool:
         Number of jobs that are carried out at the same time.
     verified
         Number of settings whose results were verified, by packed study; a study that it lacks is new to the pool.
+    compiled
+        Names of the vehicle models that workers find compiled.
     """
 
     def __init__(self, workers: int, start: Callable[[int], Worker]) -> None:
         self.workers, self._start = workers, start
         self._started, self.verified = dict[int, Worker](), Counter[bytes]()
+        self.compiled = set[str]()
 
     def map(
         self,

@@ -31,9 +31,13 @@ from safevar_sumo.results import manifest_of
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.terminal import Progress
+from safevar_sumo.vehicles import Vehicle
 
 BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the time left is known."""
+COMPILING = "compiling the vehicle model, for the first time"
+"""The stage of progress in which one worker compiles, and no simulation has begun."""
 ECONOMICAL_FRACTION = 1 / 4
 """Fraction of the most economical batch size from which on the steps of a simulation cost no more than its vehicles.
 Settings that fill only smaller batches make one batch for each worker.
@@ -88,6 +92,25 @@ def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
     task = Task(study=study, selection=selection)
     system = selection.of(system_of(study))
     return settings_per_batch(system, task.engine), is_recorded(system)
+
+
+def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
+    """Have one worker compile what a study's vehicle computes with, unless an earlier process has, and say so; the
+    other workers load it.
+    """
+    if study.vehicle.model in pool.compiled:
+        return
+    pool.compiled.add(study.vehicle.model)
+    if type(system_of(study).vehicle).compile is Vehicle.compile:
+        return  # it compiles nothing
+    task = Task(study=study)
+    if not carry_out(_compile_vehicle, [(task, True)], pool)[0]:
+        progress(COMPILING, 0, 1)
+        carry_out(_compile_vehicle, [(task, False)], pool)
+
+
+def _compile_vehicle(task: Task, only_load: bool) -> bool:
+    return bool(system_of(task.study).vehicle.compile(only_load=only_load))
 
 
 def ask_why_no_verdict(study: Study, pool: Pool) -> str:

@@ -20,7 +20,7 @@ from safevar_sumo.campaign.evaluation import (
     evaluate_settings,
 )
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
+from safevar_sumo.campaign.questions import ask_why_no_verdict, compile_vehicle, evaluate_all
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import cells_of_part
@@ -104,6 +104,7 @@ class Evaluator:
         """Evaluate settings while progress is shown."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
+        compile_vehicle(self.study, self._pool, self.progress)
         done, total = 0, len(np.unique(settings, axis=0))
         self.progress(stage, done, total)
 
@@ -186,6 +187,7 @@ class Evaluator:
         SimulationError
             If a setting cannot be simulated.
         """
+        compile_vehicle(self.study, self._pool, self.progress)
         rater = rater_of(self.study, self.study.source)
         assert rater is not None
         cell_count = len(rater.protocol.cells)
@@ -235,6 +237,7 @@ class Evaluator:
     @cached_property
     def no_verdict(self) -> str:
         """Why simulations tell nothing about the ADS, in a sentence with which every answer begins; "" if they do."""
+        compile_vehicle(self.study, self._pool, self.progress)
         return ask_why_no_verdict(self.study, self._pool)
 
     def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:

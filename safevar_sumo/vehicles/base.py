@@ -257,6 +257,12 @@ class Vehicle:
         """
         return None
 
+    def compile(self, *, only_load: bool = False) -> bool:
+        """Compile what `advance` calls, or with `only_load` take it only from an earlier process; returns whether it is
+        ready.
+        """
+        return True
+
     @abstractmethod
     def sense(self, prepared: Prepared, state: State, seen: Observation) -> tuple[Observation, State]:
         """What the vehicles' sensors report of an observation, and the state after it."""

@@ -76,7 +76,7 @@ def drive(
 
 def _rolling(state: Any, prepared: Any, speed: float) -> Any:
     """The state of the vehicle at rest, changed to rolling without slip in the same gear."""
-    wheels = {"wheel_speed": speed / prepared.radius} if hasattr(state, "wheel_speed") else {}
+    wheels = {"wheel_speed": speed / getattr(prepared, "car", prepared).radius} if hasattr(state, "wheel_speed") else {}
     return state._replace(speed=state.speed + speed, **wheels)
 
 

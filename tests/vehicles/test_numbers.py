@@ -43,7 +43,8 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
     # The values of sun are fitted.
     vehicle = replace(CARLA, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
-    p = prepared("carla")  # of which shifting reads the engine's maximum alone
+    names = SYSTEMS["carla"].characteristics
+    p = vehicle.prepare({one.name: np.full(1, float(one.original)) for one in names}, 1.0, 1 / 60)  # one substep
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
@@ -55,7 +56,7 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
             throttle=one,
             engine_speed=share * limit * one,
         )
-        return float(vehicle._shift(p, state, state.throttle)[1][0])
+        return float(vehicle.advance(p, state, Command(one, 0 * one)).target_gear[0])
 
     assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
     assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [

@@ -44,7 +44,7 @@ def kinetic_energy(model: str, run: Drive) -> FloatArray:
     p, states = run.prepared, run.states
     if isinstance(SYSTEMS[model].vehicle, Carla):
         wheels_and_engine = [
-            WHEELS * 0.5 * WHEEL_MASS * p.radius**2 * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2
+            WHEELS * 0.5 * WHEEL_MASS * p.car.radius**2 * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2
             for s in states
         ]
         return np.stack([(p.mass * s.speed**2 + spins) / 2 for s, spins in zip(states, wheels_and_engine, strict=True)])

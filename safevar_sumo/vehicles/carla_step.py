@@ -1,0 +1,263 @@
+"""One step of vehicle `carla`: the equations of one vehicle, compiled by Numba for many vehicles side by side.
+
+No operation is fused or reordered: a vehicle gets the bits that Python's own floats give, whatever unit computes it.
+Numba's cache notices changes in this file alone, so records are defined here and constants are arguments.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import FloatArray
+from safevar_sumo.vehicles.compiled import compiled, equation
+
+BLOCK = 64
+"""Number of vehicles side by side: LLVM computes several at once, and a block stays in the processor's first cache."""
+TYRE_STEPS = 3
+"""Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
+NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
+Number = float | FloatArray
+"""A number of one vehicle; in records outside the compiled step those of N, shape (N,)."""
+
+
+class Car(NamedTuple):
+    """Constants of a vehicle, SI.
+
+    Inertias are divided by the tyre step, in which the speed changes by `speed_by_force` per unit of force, and by
+    `speed_by_slope` on a slope. `grip` is the largest tyre force [N]. A shift ends after `shift_end` [s]. Below the
+    speed `standstill` the tyres hold a braked vehicle.
+    """
+
+    radius: Number
+    wheel_inertia: Number
+    wheel_damping: Number
+    brake_torque: Number
+    grip: Number
+    slip_stiffness: Number  # K / (3 |slip|)
+    clutch: Number
+    engine_limit: Number
+    damping_full: Number
+    damping_engaged: Number
+    damping_neutral: Number
+    shift_end: Number
+    air_drag: Number
+    speed_by_force: Number
+    speed_by_slope: Number
+    standstill: Number
+
+
+class Law(NamedTuple):
+    """Constants of all vehicles: the substep [s], in which pedals rise and fall so much, engine and gearbox, tyres.
+
+    Torque at full throttle is the lower of two lines over the engine's share of its highest speed: it rises from
+    `torque_idle`, and it falls through `torque_peak` at `peak_share` [N m].
+    """
+
+    substep: float
+    throttle_rise: float
+    throttle_fall: float
+    brake_rise: float
+    brake_fall: float
+    engine_inertia: float
+    engine_torque: float
+    torque_idle: float
+    torque_rise: float
+    torque_peak: float
+    torque_fall: float
+    peak_share: float
+    ratios: tuple[float, ...]
+    shift_up: float
+    shift_down: float
+    shift_latency: float
+    slip_offset: float
+
+
+class CarlaState(NamedTuple):
+    """A vehicle's speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-].
+
+    `gear` is neutral during a shift to `target_gear`. `since_shift` is minus infinity while the gear is held.
+    """
+
+    speed: Number
+    wheel_speed: Number
+    engine_speed: Number
+    gear: Number
+    target_gear: Number
+    since_shift: Number
+    throttle: Number
+    brake: Number
+
+
+class Gearbox(NamedTuple):
+    """Columns of `CarlaState`."""
+
+    gear: Number
+    target_gear: Number
+    since_shift: Number
+
+
+class Speeds(NamedTuple):
+    """Columns of `CarlaState`."""
+
+    speed: Number
+    wheel_speed: Number
+    engine_speed: Number
+
+
+def full_torque(car: Car, law: Law, engine_speed: Number) -> Number:
+    """Engine torque at full throttle [N m]: linear between the points of the curve."""
+    speed_share = engine_speed / car.engine_limit
+    rising_line = law.torque_idle + law.torque_rise * speed_share
+    falling_line = law.torque_peak - law.torque_fall * (speed_share - law.peak_share)
+    return law.engine_torque * np.minimum(rising_line, falling_line)
+
+
+_full_torque = equation(full_torque)
+
+
+@equation
+def pedal_position(command: Number, pedal: Number, fall: float, rise: float) -> Number:
+    """Position of a pedal that follows its command, with the largest fall and rise."""
+    return pedal + np.minimum(np.maximum(command - pedal, -fall), rise)
+
+
+@equation
+def ratio_of(law: Law, gear: Number) -> Number:
+    """Overall ratio of a gear; 0 in neutral."""
+    neutral, first, second, third, fourth = law.ratios
+    low = first if gear == 1.0 else second
+    high = third if gear == 3.0 else fourth
+    engaged = low if gear < 3.0 else high
+    return engaged if gear > NEUTRAL else neutral
+
+
+@equation
+def shift(car: Car, law: Law, s: CarlaState, throttle: Number) -> Gearbox:
+    """Automatic gearbox; in a shift the gear is neutral."""
+    speed_share = s.engine_speed / car.engine_limit
+    is_ready = s.since_shift >= law.shift_latency
+    sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > 0.0)
+    up = sets_off | is_ready & (speed_share > law.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+    down = is_ready & (speed_share < law.shift_down) & (s.gear > FIRST_GEAR)
+    target = s.target_gear + (1.0 if up else 0.0) - (1.0 if down else 0.0)
+    since_shift = 0.0 if up | down else s.since_shift + law.substep
+    gear = target if (target == s.gear) | (since_shift >= car.shift_end) else NEUTRAL
+    return Gearbox(gear, target, since_shift)
+
+
+@equation
+def tyre_force(car: Car, law: Law, speed: Number, rim: Number) -> Number:
+    """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
+
+    With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
+    F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
+    """
+    slip_speed = rim - speed
+    denominator = np.maximum(rim, speed) + law.slip_offset
+    root = np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator
+    return np.copysign(car.grip - car.grip * root * root * root, slip_speed)
+
+
+@equation
+def roll(car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brake: Number) -> Speeds:
+    """Engine, clutch, wheels, tyres and body over one substep.
+
+    I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
+    I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
+    m dv/dt = F - D v |v| - m g sin
+
+    Index e is the engine, w the wheels; G is the gear ratio, k_c the clutch strength, c_e and d are damping rates,
+    D is the air drag. The tyre force F is explicit. It may end the slip within a step but never reverse it, so the
+    slip cannot oscillate.
+    """
+    ratio = ratio_of(law, gear)
+    clutch = car.clutch if gear > NEUTRAL else 0.0
+    damping = car.damping_engaged if gear > NEUTRAL else car.damping_neutral
+    clutch_by_ratio = ratio * clutch
+    engine = law.engine_inertia + damping + (car.damping_full - damping) * throttle + clutch
+    wheel = car.wheel_inertia + car.wheel_damping + clutch_by_ratio * ratio * (1.0 - clutch / engine)
+    # Coefficients of a tyre step for the speeds (of a wheel, at its rim), for torques and for the tyre force:
+    engine_share = law.engine_inertia / engine
+    engine_gain = throttle * _full_torque(car, law, s.engine_speed) / engine
+    rim_by_torque = car.radius / wheel
+    rim_share = car.wheel_inertia / wheel
+    rim_by_engine = clutch_by_ratio * rim_by_torque
+    rim_loss = brake * car.brake_torque * rim_by_torque
+    rim_by_force = car.radius * rim_by_torque
+    speed_loss = car.speed_by_force * car.air_drag * s.speed * s.speed + car.speed_by_slope
+    slip_by_force = rim_by_force + car.speed_by_force
+    engine_by_rim = clutch_by_ratio / (engine * car.radius)
+
+    speed = s.speed
+    rim = car.radius * s.wheel_speed
+    engine_speed = s.engine_speed
+    for _ in range(TYRE_STEPS):
+        free_engine_speed = engine_share * engine_speed + engine_gain
+        free_rim = rim_share * rim + rim_by_engine * free_engine_speed - rim_loss
+        slip_end_force = (free_rim - speed) / slip_by_force
+        force = tyre_force(car, law, speed, rim)
+        force = np.minimum(np.maximum(force, np.minimum(slip_end_force, 0.0)), np.maximum(slip_end_force, 0.0))
+        rim = np.maximum(free_rim - rim_by_force * force, 0.0)
+        engine_speed = np.minimum(free_engine_speed + engine_by_rim * rim, car.engine_limit)
+        speed = np.maximum(speed + car.speed_by_force * force - speed_loss, 0.0)
+    return Speeds(speed, rim / car.radius, engine_speed)
+
+
+@equation
+def move(car: Car, law: Law, s: CarlaState, throttle_command: Number, brake_command: Number) -> CarlaState:
+    """The state of a vehicle one substep later."""
+    throttle = pedal_position(throttle_command, s.throttle, law.throttle_fall, law.throttle_rise)
+    brake = pedal_position(brake_command, s.brake, law.brake_fall, law.brake_rise)
+    gearbox = shift(car, law, s, throttle)
+    speeds = roll(car, law, s, gearbox.gear, throttle, brake)
+    return CarlaState(
+        speeds.speed, speeds.wheel_speed, speeds.engine_speed,
+        gearbox.gear, gearbox.target_gear, gearbox.since_shift, throttle, brake,
+    )  # fmt: skip
+
+
+@equation
+def car_in(t: FloatArray, i: int) -> Car:
+    """The vehicle in column i of a block."""
+    return Car(
+        t[0, i], t[1, i], t[2, i], t[3, i], t[4, i], t[5, i], t[6, i], t[7, i],
+        t[8, i], t[9, i], t[10, i], t[11, i], t[12, i], t[13, i], t[14, i], t[15, i],
+    )  # fmt: skip
+
+
+@equation
+def state_in(t: FloatArray, i: int) -> CarlaState:
+    """The state in column i of a block."""
+    return CarlaState(t[16, i], t[17, i], t[18, i], t[19, i], t[20, i], t[21, i], t[22, i], t[23, i])
+
+
+@compiled
+def advance(cars: FloatArray, law: Law, states: FloatArray, commands: FloatArray, substeps: int) -> None:
+    """Move N vehicles: rows of `cars` are those of `Car`, shape (16, N), of `states`, which changes, those of
+    `CarlaState`, shape (8, N), of `commands` throttle and brake, shape (2, N).
+    """
+    n = states.shape[1]
+    t = np.ones((26, BLOCK))
+    for start in range(0, n, BLOCK):
+        count = min(BLOCK, n - start)
+        t[:16, :count] = cars[:, start : start + count]
+        t[16:24, :count] = states[:, start : start + count]
+        t[24:, :count] = commands[:, start : start + count]
+        for _ in range(substeps):
+            for i in range(BLOCK):  # the whole block, whose last columns may hold no vehicle
+                s = move(car_in(t, i), law, state_in(t, i), t[24, i], t[25, i])
+                t[16, i] = s.speed
+                t[17, i] = s.wheel_speed
+                t[18, i] = s.engine_speed
+                t[19, i] = s.gear
+                t[20, i] = s.target_gear
+                t[21, i] = s.since_shift
+                t[22, i] = s.throttle
+                t[23, i] = s.brake
+        for i in range(count):
+            if t[23, i] > 0.0 and t[16, i] < t[15, i]:  # a standstill
+                t[16, i] = 0.0
+                t[17, i] = 0.0
+        states[:, start : start + count] = t[16:24, :count]
