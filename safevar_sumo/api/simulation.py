@@ -131,7 +131,7 @@ class Simulation:
 
     @property
     def collision_speed(self) -> float:
-        """Speed of the vehicle at the collision [m/s]; NaN without a collision."""
+        """The vehicle's own speed at the collision [m/s]; NaN without a collision."""
         return float(self.evaluation.collision_speed[0])
 
     @property
@@ -170,7 +170,7 @@ class Simulation:
     @property
     def _contact(self) -> float:
         """The safety degree at which bodies touch [m]."""
-        return self.runs.trace.vehicle_length if self._scenario.centre_to_centre else 0.0
+        return self.runs.middles_apart if self._scenario.centre_to_centre else 0.0
 
     @property
     def gap(self) -> float:
@@ -188,9 +188,9 @@ class Simulation:
     @property
     def verdict(self) -> str:
         """How the simulation ended, in words."""
-        if self.outcome is Outcome.COLLISION:
-            return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
+        if self.outcome is Outcome.COLLISION:
+            return f"collides at {-safety_degree:.2f} m/s"
         distance = distance_in_words(safety_degree, self._contact)
         return OUTCOME_VERBS[self.outcome] + (
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CRITERIA = (
     "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's "
-    "speed in m/s]"
+    "closing speed in m/s]"
 )
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
@@ -38,7 +38,7 @@ class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with `below`, a safety degree
     below this limit [m, or -m/s]; with `points`, at most that many points of a rating.
 
-    `contact` is the safety degree at which bodies touch [m]: 0, or a vehicle's length from centre to centre.
+    `contact` is the safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre.
     """
 
     below: float | None = None

@@ -26,6 +26,10 @@ TIME_ROUNDING = 1e-9
 """Difference below which two sums of time steps count as the same time [s]."""
 TOUCH_OVERLAP = 2e-3
 """Overlap up to which bodies count as touching, not colliding: SUMO ignores an overlap of a millimetre [m]."""
+LEAST_CLOSING_SPEED = 1e-3
+"""Least closing speed that a collision counts with [m/s]: also one with a faster body is worse than any distance."""
+LENGTH_DECIMALS = 9
+"""Decimals to which differences of distances are rounded: 4.7 m, not 4.699999999999996 m."""
 TIME_DECIMALS = 9
 """Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
 ZERO: FloatArray = np.zeros(())
@@ -152,7 +156,8 @@ class Trace:
 
     - `vehicle_length`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
     - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
-    - `obstacle_speed` is the obstacle's speed along the vehicle's path.
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its length where the scenario
+      states it [m].
     """
 
     step: float
@@ -168,6 +173,7 @@ class Trace:
     gear: FloatArray
     active: BoolArray
     obstacle_speed: FloatArray = field(default_factory=lambda: ZERO)
+    obstacle_length: FloatArray = field(default_factory=lambda: ZERO)
     pedal: FloatArray = field(default_factory=lambda: ZERO)
 
     def of(self, vehicles: slice | IntArray) -> Trace:
@@ -181,14 +187,16 @@ class Contact(NamedTuple):
 
     `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0
     to 100; NaN without a contact. At the front or rear it is in % of the vehicle's width, from the side on which
-    `lateral` is negative; at the left or right in % of its length, from the front.
+    `lateral` is negative; at the left or right in % of its length, from the front. `speed` is the obstacle's along the
+    vehicle's lane at that sample [m/s]; 0 without a contact.
     """
 
     side: npt.NDArray[np.str_]
     place: FloatArray
+    speed: FloatArray
 
 
-NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan))
+NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan), np.array(0.0))
 """No contact of N vehicles."""
 for _array in NO_CONTACT:
     _array.flags.writeable = False
@@ -199,6 +207,7 @@ class SimulationRuns:
     """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`, `collision_speed` is NaN without
     a collision [m/s].
 
+    `collision_speed` is the vehicle's own speed, at the end of the step in which bodies overlap.
     `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed
     is prescribed [m/s]; `warning_ttc` the time to collision at which the system first warned its driver, NaN if it
     never did [s].
@@ -239,9 +248,22 @@ class SimulationRuns:
         return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
 
     @property
+    def middles_apart(self) -> float:
+        """How far the middles of bodies that touch are apart, in a scenario that measures from centre to centre [m]."""
+        differences = self.encounter.separation - np.broadcast_to(self.trace.gap, self.encounter.separation.shape)
+        return round(float(differences[np.isfinite(differences)][0]), LENGTH_DECIMALS)
+
+    @property
+    def closing_speed(self) -> FloatArray:
+        """Severity of a collision: `collision_speed` minus the struck body's speed along the lane at that sample [m/s],
+        shape (N,), at least `LEAST_CLOSING_SPEED`; NaN without a collision.
+        """
+        return np.maximum(self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED)
+
+    @property
     def relative_speed(self) -> FloatArray:
-        """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a
-        collision.
+        """Speed of a collision relative to the obstacle along the vehicle's path at the moment of contact, as rated by
+        Euro NCAP [m/s], shape (N,); NaN without a collision.
 
         A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at
         sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of the step counts: `collision_speed` minus the

@@ -112,8 +112,8 @@ class Comparison:
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
         runs, nearest = self.runs, self.moments[row].nearest
-        if not math.isnan(runs.collision_speed[row]):
-            return f"collides at {runs.collision_speed[row]:.1f} m/s"
+        if not math.isnan(runs.closing_speed[row]):
+            return f"collides at {runs.closing_speed[row]:.1f} m/s"
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"

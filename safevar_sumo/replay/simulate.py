@@ -55,7 +55,7 @@ POINTS: Columns = {
     "outcome": "how the simulation ends",
     "impact_speed": Column("m/s", "speed of the vehicle at the collision", ".2f"),
     "relative_impact_speed": Column("m/s", "relative speed of the impact", ".2f", is_shown=False),
-    SAFETY_DEGREE: Column("m", "safety degree; minus the collision's speed in m/s", ".2f"),
+    SAFETY_DEGREE: Column("m", "safety degree; minus a collision's closing speed in m/s", ".2f"),
     "gap": Column("m", "least distance between bodies", ".2f", is_shown=False),
     STOPPING_DISTANCE.name: Column("m", "distance from the first brake force to standstill", ".1f"),
     "test_speed_error": Column("km/h", "deviation from the test speed before the driving system acts", "+.1f"),

@@ -166,7 +166,8 @@ class World(Protocol):
 class Scene(NamedTuple):
     """The obstacle relative to N vehicles; arrays of shape (N,); see `Observation` for the quantities.
 
-    `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded.
+    `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded. A scenario that
+    measures from centre to centre states the obstacle's length [m].
     """
 
     gap: FloatArray
@@ -175,6 +176,7 @@ class Scene(NamedTuple):
     over: BoolArray
     obstacle_speed: FloatArray = ZERO
     visible: BoolArray = ALL_TRUE
+    obstacle_length: FloatArray = ZERO
 
 
 MAX_DURATION = 3600.0

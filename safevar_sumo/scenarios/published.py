@@ -180,6 +180,14 @@ PARKED_VEHICLE, PARKED_POSITION, VUT_FRONT = "parked_ahead", 85.0, 20.0
 PARKED_LENGTH = 4.7
 
 
+class _Parked(NamedTuple):
+    """The frame of the vehicle's lane; the parked vehicle's rear in it, shape (N,), and length [m]."""
+
+    frame: Frame
+    rear: FloatArray
+    length: FloatArray
+
+
 class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
 
@@ -218,24 +226,20 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         frame, still = Frame.of(roads.lane("road_0")), np.zeros((samples, 1))
         return Layout(frame, self._front, None, PARKED_VEHICLE, still + PARKED_POSITION, still, still)
 
-    def begin(self, world: World) -> tuple[Frame, FloatArray]:
-        frame = Frame.through_origin(world.lane_of(VUT))
-        return frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - world.vehicle_length(PARKED_VEHICLE)
+    def begin(self, world: World) -> _Parked:
+        frame, length = Frame.through_origin(world.lane_of(VUT)), world.vehicle_length(PARKED_VEHICLE)
+        return _Parked(frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - length, np.array(length))
 
-    def observe(
-        self, world: World, step: float, memory: tuple[Frame, FloatArray]
-    ) -> tuple[Scene, tuple[Frame, FloatArray]]:
-        frame, parked_rear = memory
-        gap = parked_rear - frame.along(world.vehicle_positions(VUT))
+    def observe(self, world: World, step: float, memory: _Parked) -> tuple[Scene, _Parked]:
+        gap = memory.rear - memory.frame.along(world.vehicle_positions(VUT))
         zeros = np.zeros_like(gap)
-        return Scene(gap, zeros, zeros, over=zeros > 0), memory  # never over
+        never = zeros > 0
+        return Scene(gap, zeros, zeros, over=never, obstacle_length=memory.length), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Safety degree: distance between the centres of two vehicles of equal length; TTC = gap / v (docs/method.md,
-        section 4).
-        """
+        """Safety degree: distance between the centres of two vehicles; TTC = gap / v (docs/method.md, section 4)."""
         return Encounter(
-            separation=trace.gap + trace.vehicle_length,
+            separation=trace.gap + (trace.vehicle_length + trace.obstacle_length) / 2,
             distance=trace.gap,
             closing_speed=trace.speed,
             in_conflict=trace.gap > 0,

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.records import BoolArray, Contact, FloatArray
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import TOUCH_OVERLAP, BoolArray, Contact, FloatArray, IntArray
 from safevar_sumo.scenarios import Scenario, Scene
-from safevar_sumo.scenarios.base import ScenarioMemory, World as ScenariosWorld
+from safevar_sumo.scenarios.base import NETWORK_KEY, ScenarioMemory, World as ScenariosWorld
 from safevar_sumo.vehicles import SumoType
 
 
@@ -93,8 +94,19 @@ class World(ScenariosWorld, Protocol):
     def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
         """The bodies of vehicles that hit somebody in this step, and of those whom they hit, both in columns."""
 
+    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
+        """Each of these vehicles with each other actor of its scene: numbers of the vehicles, shape (M,), their bodies
+        and those of the actors, both in columns.
+        """
+
 
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
+COSINE_DECIMALS = 9
+"""Decimals of a cosine between directions, which SUMO states in degrees."""
+COLLISION_PLACES = (
+    "vehicles in the lane of the vehicle under test or on a junction, persons on a crossing or in a network without "
+    "junctions: elsewhere SUMO looks for no collisions"
+)
 
 
 class Contacts:
@@ -104,7 +116,8 @@ class Contacts:
     """
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
-        self._is_tested, self.first = is_tested, Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan))
+        self._is_tested, self._was_inside = is_tested, np.zeros(n, dtype=bool)
+        self.first = Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n))
 
     def count(self, world: World, hits: Mapping[int, float], scene: Scene) -> dict[int, float]:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by vehicle number."""
@@ -115,12 +128,38 @@ class Contacts:
         side = self.first.side
         return {copy: speed for copy, speed in hits.items() if not self._is_tested[copy] or side[copy] == FRONT}
 
+    def check(self, world: World, scene: Scene, is_open: BoolArray, time: float) -> None:
+        """Refuse a scene in which the front of an open run's vehicle drives into a body and no collision is reported.
+
+        To be called at every sample, after `count`. A body that comes into the vehicle from the side is none in its
+        path.
+
+        Raises
+        ------
+        InputError
+            With the time [s].
+        """
+        is_inside = scene.gap < -TOUCH_OVERLAP
+        enters = is_inside & ~self._was_inside & is_open & (self.first.side == "")
+        self._was_inside = is_inside
+        if not np.count_nonzero(enters):
+            return
+        vehicles, own, other = world.bodies_around(np.flatnonzero(enters).tolist())
+        if not len(vehicles):
+            return
+        depth = find_overlaps(own, other)
+        is_missed = (depth > TOUCH_OVERLAP) & (find_touches(own, other)[0] == FRONT)
+        if is_missed.any():
+            inside = f"the front of the vehicle under test is {depth[is_missed].max():.2f} m inside a body"
+            raise InputError(NETWORK_KEY, f"at {time:g} s {inside}, and SUMO reports no collision", COLLISION_PLACES)
+
     def _locate(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
         side, age, distance_behind_front = find_touches(own, other)
         lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * age
         is_at_end = (side == FRONT) | (side == REAR)
         share = np.where(is_at_end, lateral / own.width + 0.5, distance_behind_front / own.length)
         self.first.side[copies] = side
+        self.first.speed[copies] = other.speed * np.round((own.along * other.along).sum(axis=1), COSINE_DECIMALS)
         self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
 
@@ -136,15 +175,7 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
     smaller overlap.
     """
-    axes = np.stack([own.along, np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)])
-    cosine, sine = np.abs(_dot(other.along, axes))
-    extent = np.stack(
-        [
-            (own.length + other.length * cosine + other.width * sine) / 2,
-            (own.width + other.length * sine + other.width * cosine) / 2,
-        ]
-    )
-    distance = _dot(other.middle - own.middle, axes)
+    axes, extent, distance = _along_axes(own, other)
     speed = _dot(own.along * own.speed[:, np.newaxis] - other.along * other.speed[:, np.newaxis], axes)
     overlap, closing_speed = extent - np.abs(distance), np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
@@ -155,6 +186,32 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     ahead, left = distance > 0
     side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
     return side, age, own.length / 2 - (distance[0] + age * speed[0])
+
+
+def find_overlaps(own: Body, other: Body) -> FloatArray:
+    """How deeply M pairs of bodies overlap [m], shape (M,), in the direction in which they overlap least; negative
+    for bodies that do not touch.
+    """
+    overlaps = []
+    for pair in ((own, other), (other, own)):
+        _, extent, distance = _along_axes(*pair)
+        overlaps.append((extent - np.abs(distance)).min(axis=0))
+    return np.asarray(np.minimum(*overlaps))
+
+
+def _along_axes(own: Body, other: Body) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The axes of M bodies, along and across them, shape (2, M, 2); in these directions the joint half extents with M
+    other bodies, and the distances to their middles, shape (2, M) [m].
+    """
+    axes = np.stack([own.along, np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)])
+    cosine, sine = np.abs(_dot(other.along, axes))
+    extent = np.stack(
+        [
+            (own.length + other.length * cosine + other.width * sine) / 2,
+            (own.width + other.length * sine + other.width * cosine) / 2,
+        ]
+    )
+    return axes, extent, _dot(other.middle - own.middle, axes)
 
 
 def _dot(vectors: FloatArray, axes: FloatArray) -> FloatArray:

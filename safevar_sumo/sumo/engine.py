@@ -21,6 +21,27 @@ from safevar_sumo.sumo.world import Api, SumoWorld
 CONNECTION_ATTEMPTS = 15
 """Number of times, once per second, that traci tries to connect to the SUMO process that it has started."""
 
+OWN_OPTIONS = {
+    "step-method.ballistic": "true",
+    "ignore-accidents": "false",
+    "collision.action": "warn",
+    "collision.mingap-factor": "0",
+    "collision.stoptime": "0",
+    "collision.check-junctions": "true",
+    "collision.check-junctions.mingap": "0",
+    "intermodal-collision.action": "warn",
+    "intermodal-collision.stoptime": "0",
+    "time-to-teleport": "-1",
+    "time-to-teleport.highways": "-1",
+    "time-to-teleport.disconnected": "-1",
+    "time-to-teleport.ride": "-1",
+    "time-to-teleport.bidi": "-1",
+    "time-to-teleport.railsignal-deadlock": "-1",
+}
+"""Options with which SUMO starts, whatever options a network's file has: how far a vehicle comes at its speeds, and
+what a collision is, depends on no user's file, and nobody who collides or waits leaves his place.
+"""
+
 
 class Engine(StrEnum):
     """What moves the vehicles: numpy in recorded scenes, or SUMO in this process.
@@ -107,10 +128,18 @@ def sumo_options(files: CopiedNetwork) -> list[str]:
         "-c": files.options,
         "-n": files.network,
         "-r": files.traffic,
+        "--verbose": "false",
+        "--duration-log.disable": "true",
+        "--duration-log.statistics": "false",
         "--no-step-log": "true",
         "--no-warnings": "true",
         "--xml-validation": "never",
         "--xml-validation.net": "never",
         "--xml-validation.routes": "never",
     }
-    return [str(text) for option in options.items() for text in option]
+    return [*own_options(), *(str(text) for option in options.items() for text in option)]
+
+
+def own_options() -> list[str]:
+    """`OWN_OPTIONS` as arguments of SUMO."""
+    return [text for name, value in OWN_OPTIONS.items() for text in (f"--{name}", value)]

@@ -64,13 +64,13 @@ def point_record(result: PointResult) -> JsonObject:
     evaluations, runs = result.evaluations, result.runs
     test_speed_error, warning_ttc, side, place = (
         np.broadcast_to(column, len(evaluations))[0]
-        for column in (runs.test_speed_error, runs.warning_ttc, *runs.contact)
+        for column in (runs.test_speed_error, runs.warning_ttc, runs.contact.side, runs.contact.place)
     )
     values = {
         "impact_speed": evaluations.collision_speed[0],
         "relative_impact_speed": runs.relative_speed[0],
         SAFETY_DEGREE: evaluations.f_safe[0],
-        "gap": evaluations.gaps(runs.trace.vehicle_length * result.point.scenario.centre_to_centre)[0],
+        "gap": evaluations.gaps(runs.middles_apart if result.point.scenario.centre_to_centre else 0.0)[0],
         "test_speed_error": test_speed_error / KMH,
         "warning_ttc": warning_ttc,
         **{name: values[0] for name, values in evaluations.metrics.items() if name == STOPPING_DISTANCE.name},
@@ -208,14 +208,14 @@ def simulate_all_points(system: System, settings: FloatArray, engine: Engine = E
 
 
 def contact_degree(system: System) -> float:
-    """The safety degree at which bodies touch [m]: 0, or the vehicle's length in a scenario that measures from centre
-    to centre.
+    """The safety degree at which bodies touch [m]: 0, or half of both lengths where a scenario measures from centre to
+    centre.
     """
     point = system.points[0]
     if not point.scenario.centre_to_centre:
         return 0.0
     runs = drive_all(system.at(point), system.characteristics.original[np.newaxis], Engine.RECORDED)
-    return runs.trace.vehicle_length
+    return runs.middles_apart
 
 
 def simulate_groups(

@@ -13,7 +13,7 @@ import numpy as np
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import ensure_cached, parse_seconds, parse_xml
-from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.engine import OWN_OPTIONS, open_world, own_options
 from safevar_sumo.sumo.network import (
     OPTIONS_FILE,
     TRAFFIC_FILE,
@@ -52,6 +52,12 @@ EXACT_MODELS = ("Krauss", "KraussOrig1", "IDM", "ACC", "CACC")
 """Car-following models of which SUMO's driver under a controller drives as in SUMO."""
 SIGMA_MODELS, DETERMINISTIC_MODELS = ("Krauss", "KraussOrig1", "KraussPS"), ("IDM", "IDMM", "ACC", "CACC")
 """Car-following models that are random unless sigma is 0, and models that are never random."""
+DEFAULT_OPTIONS = {"step-method.ballistic": "false"}
+"""SUMO's default of an option that is overruled, and changes how everybody moves."""
+SWITCHED_OFF = "-1"
+"""A waiting time that is never over, as all that are not above 0."""
+TRUE_VALUES = ("1", "yes", "true", "on", "x", "t")
+"""Words for true in SUMO's options."""
 LEGAL_OPTIONS = (
     f"a step-length from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s], no remote-port, all traffic in {TRAFFIC_FILE}: "
     "safevar_sumo starts SUMO itself"
@@ -76,8 +82,8 @@ def check_network(name: str, source: str) -> None:
 
 
 def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
-    """Remarks on attributes of a user's traffic that the simulation does not use, and SUMO's warnings; none on shipped
-    networks.
+    """Remarks on attributes of a user's traffic and on options that the simulation does not use, and SUMO's warnings;
+    none on shipped networks.
 
     `acting` are the attributes of SUMO's own driver that act, as with a controller written for TraCI.
     """
@@ -100,9 +106,29 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     model = next((vtype.get("carFollowModel", "") for vtype in parse_xml(file).findall(f"vType[@id='{VUT}']")), "")
     if acting and model not in ("", *EXACT_MODELS):
         remarks.append(f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone")
+    options_file = network.path(OPTIONS_FILE)
+    stated = DEFAULT_OPTIONS | options_of(options_file)
+    overruled = [
+        f"{option} = {stated[option]} ({value} counts)"
+        for option, value in OWN_OPTIONS.items()
+        if option in stated and not _is_same(stated[option], value)
+    ]
+    if overruled:
+        reason = "how vehicles move at their speeds, what a collision is, and that nobody is teleported"
+        remarks.append(f"{options_file}: no effect: {', '.join(overruled)}: {reason}, is the same in every study")
     if warnings := _warnings_file(network).read_text(encoding="utf-8"):
         remarks.append(f"{network.folder}: {warnings}")
     return remarks
+
+
+def _is_same(stated: str, own: str) -> bool:
+    """Whether two values of an option of SUMO mean the same."""
+    number = parse_seconds(stated)
+    if own in ("true", "false"):
+        return (stated.lower() in TRUE_VALUES) == (own == "true")
+    if number is None:
+        return stated == own
+    return number <= 0 if own == SWITCHED_OFF else number == parse_seconds(own)
 
 
 @lru_cache(maxsize=100)
@@ -165,7 +191,7 @@ def _try_network(network: Network, into: Path) -> None:
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
     only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")
-    exit_code, messages = run_program(network.folder, "sumo", *files, *only_load)
+    exit_code, messages = run_program(network.folder, "sumo", *files, *only_load, *own_options())
     if exit_code != 0:
         problem = f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: {messages or f'exit code {exit_code}'}"
         raise InputError(network.folder, problem, legal)

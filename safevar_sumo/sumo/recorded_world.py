@@ -215,11 +215,20 @@ class RecordedWorld:
         return np.argwhere((starts < foremost[:, np.newaxis]) & (ends > rearmost[:, np.newaxis]))
 
     def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
+        struck = [self._struck[vehicle] for vehicle in vehicles]
+        return self._own_bodies(np.asarray(vehicles)), Body._make(column[struck] for column in self._others)
+
+    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
+        scenes, n_actors = np.asarray(vehicles) // self._size, self._motion.shape[2]
+        motion, sizes = self._motion[self.sample, scenes].reshape(-1, 5), self._sizes[scenes].reshape(-1, 3)
+        owners = np.repeat(vehicles, n_actors)
+        others = Body.behind(motion[:, :2], motion[:, 2:4], sizes[:, 0], sizes[:, 1], motion[:, 4])
+        return owners, self._own_bodies(owners), others
+
+    def _own_bodies(self, vehicles: IntArray) -> Body:
         scene, n = self._scene, len(vehicles)
         along, length, width = np.tile(scene.along, (n, 1)), np.full(n, scene.length), np.full(n, scene.width)
-        own = Body.behind(self.vehicle_positions(VUT)[vehicles], along, length, width, self._speeds[vehicles])
-        struck = [self._struck[vehicle] for vehicle in vehicles]
-        return own, Body._make(column[struck] for column in self._others)
+        return Body.behind(self.vehicle_positions(VUT)[vehicles], along, length, width, self._speeds[vehicles])
 
 
 def _joined_tracks(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:

@@ -28,6 +28,7 @@ from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.measuring import RESULT_COLUMNS, Measuring, measuring_of
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
+from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
@@ -232,7 +233,9 @@ def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scen
         (scene,) = scenes.of([Point(scenario, weather_of("clear", study.source))])
         if isinstance(scene, str):
             raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
-        limit += scene.length
+        world = RecordedWorld([scene], 1)
+        first, _ = scenario.observe(world, world.step_length, world.begin(scenario))
+        limit += (scene.length + float(first.obstacle_length)) / 2
     return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, Scenario
 from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
 from safevar_sumo.sumo.bodies import Body, Motion, Track
@@ -27,6 +27,10 @@ MAX_DEPARTURE_SPEED = 200.0
 SPEED_MODE = 32
 # TraCI "set lane change mode": the vehicle never changes lanes.
 LANE_CHANGE_MODE = 0
+CUT_SHAPE, FULL_SHAPE = "passenger", "evehicle"
+"""Shapes of vehicles that SUMO draws alike; of the first it cuts the front corners off, also where it looks for
+collisions.
+"""
 
 Api = Any
 """The module libsumo or traci, which have the same functions."""
@@ -97,7 +101,11 @@ class SumoWorld:
         return self._motion(np.ones(self.n, dtype=bool))
 
     def _depart(self) -> None:
-        """Insert all actors, and take control of the vehicles under test."""
+        """Insert all actors, whose bodies are rectangles, and take control of the vehicles under test."""
+        vehicletype = self.api.vehicletype
+        for type_id in vehicletype.getIDList():
+            if vehicletype.getShapeClass(type_id).startswith(CUT_SHAPE):
+                vehicletype.setShapeClass(type_id, FULL_SHAPE)
         self.api.simulationStep()
         departed = set(self.api.vehicle.getIDList())
         for id_ in self.ids(VUT):
@@ -162,6 +170,14 @@ class SumoWorld:
             Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in vehicles]),
             Body.columns([self._body_of(self._struck_ids[copy]) for copy in vehicles]),
         )
+
+    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
+        own_ids, wanted = self.ids(VUT), {*vehicles}
+        ids = [id_ for domain in (self.api.vehicle, self.api.person) for id_ in domain.getIDList()]
+        pairs = [(copy, id_) for id_ in ids if (copy := copy_and_name(id_)[0]) in wanted and id_ != own_ids[copy]]
+        copies = [copy for copy, _ in pairs]
+        own = Body.columns([self._body_of(own_ids[copy]) for copy in copies])
+        return np.array(copies), own, Body.columns([self._body_of(id_) for _, id_ in pairs])
 
     def _body_of(self, id_: str) -> Body:
         domain, (_, length, width) = self._domain_of(id_), self.actor_size(id_)

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import (
     Unsafe,
     time_to_collision,
 )
-from safevar_sumo.records import Encounter, Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.records import NO_CONTACT, Encounter, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
@@ -62,6 +62,15 @@ def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS)
 def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_collision() -> None:
     assert value("safety_degree", RUN) == pytest.approx(2.0)
     assert value("safety_degree", HIT) == -3.5
+
+
+@pytest.mark.parametrize(("speed_of_the_struck", "degree"), [(2.5, -1.0), (-1.0, -4.5), (3.5, -0.001), (9.0, -0.001)])
+def test_severity_is_the_closing_speed_and_every_collision_is_below_0(
+    speed_of_the_struck: float, degree: float
+) -> None:
+    """The vehicle hits at 3.5 m/s."""
+    contact = NO_CONTACT._replace(speed=np.array([speed_of_the_struck]))
+    assert value("safety_degree", dataclasses.replace(HIT, contact=contact)) == degree
 
 
 def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:

@@ -4,6 +4,7 @@ occlusion by parked cars, gaps, ends of encounters, and agreement with SUMO.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 from pathlib import Path
@@ -208,9 +209,13 @@ def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight()
     assert encounter.separation[0, 0] == pytest.approx(4.0 - LENGTH / 2)
 
 
+PARKED = 12.0
+
+
 def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() -> None:
-    encounter = LeadVehicleStopped().encounter(trace([3.0, -0.1], [2.0, 2.0], [0.0, 0.0], [0.0, 0.0]))
-    assert encounter.separation[:, 0].tolist() == [3.0 + LENGTH, -0.1 + LENGTH]
+    run = trace([3.0, -0.1], [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
+    encounter = LeadVehicleStopped().encounter(dataclasses.replace(run, obstacle_length=np.array(PARKED)))
+    assert encounter.separation[:, 0].tolist() == [3.0 + (LENGTH + PARKED) / 2, -0.1 + (LENGTH + PARKED) / 2]
     assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
     assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]
     assert encounter.in_conflict[:, 0].tolist() == [True, False]
