@@ -6,7 +6,12 @@ import inspect
 import warnings
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
+from numbers import Integral
 
+MAX_JOBS = 1024
+"""Largest number of worker processes."""
+MAX_BATCH = 10_000
+"""Largest number of settings in a batch that a user may ask for."""
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
 
@@ -97,6 +102,12 @@ def unknown_name(source: object, problem: str, name: object, names: Iterable[str
     """
     known_names = list(names)
     return InputError(source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}")
+
+
+def check_whole(source: str, value: object, highest: int) -> None:
+    """Refuse what is no whole number from 1 to `highest`; raises an InputError."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= highest:
+        raise InputError(source, repr(value), f"a whole number from 1 to {highest:,}")
 
 
 def check_name(source: object, problem: str, name: object, names: Collection[str], otherwise: str = "") -> None:

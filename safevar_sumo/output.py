@@ -5,12 +5,19 @@ from __future__ import annotations
 import os
 import secrets
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
+from glob import escape
 from pathlib import Path
+
+import portalocker
 
 from safevar_sumo.errors import InputError
 
+ALONE = portalocker.LOCK_EX | portalocker.LOCK_NB
+SETTLING_TIME = 0.1
+"""Time within which a process locks a temporary file that it has made [s]."""
 WRITABLE = "a file in a directory that can be written, with space for it"
 """What an error about an output file expects."""
 
@@ -19,15 +26,17 @@ WRITABLE = "a file in a directory that can be written, with space for it"
 def whole_file(path: Path, source: str = "") -> Iterator[Path]:
     """Give the path of a temporary file to write, which then replaces `path`; after an error `path` is as it was.
 
-    The temporary file lies beside `path` and has the same ending. A stream such as `/dev/stdout` is given itself. An
-    OSError becomes an InputError that names `source`, if it is given.
+    The temporary file lies beside `path` and has the same ending. Those that killed processes have left there are
+    removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an InputError that names `source`, if it
+    is given.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
     is_stream = target.exists() and not target.is_file()
     short_stem = target.stem[:100]  # file systems limit the length of names
     file = path if is_stream else target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
     try:
-        yield file
+        with nullcontext() if is_stream else _owned(file, f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"):
+            yield file
         if not is_stream:
             with open(file, "rb+") as stream:
                 os.fsync(stream.fileno())
@@ -38,6 +47,27 @@ def whole_file(path: Path, source: str = "") -> Iterator[Path]:
         if source and isinstance(error, OSError):
             raise unwritable(path, source, error) from None
         raise
+
+
+@contextmanager
+def _owned(file: Path, pattern: str) -> Iterator[None]:
+    """Make a temporary file and lock it within the block; remove files of the same pattern that nobody has locked."""
+    with open(file, "xb") as own:
+        if os.name != "nt":  # where a lock would keep out this process, too
+            for other in file.parent.glob(pattern):
+                if other != file:
+                    _remove_left_behind(other)
+            with suppress(portalocker.LockException):  # a disk without locks
+                portalocker.lock(own, ALONE)
+        yield
+
+
+def _remove_left_behind(file: Path) -> None:
+    """Remove a temporary file that no process has locked, unless it is so new that one may be about to."""
+    with suppress(OSError, portalocker.LockException), open(file, "rb+") as stream:
+        portalocker.lock(stream, ALONE)
+        if time.time() - os.fstat(stream.fileno()).st_mtime > SETTLING_TIME:
+            file.unlink()
 
 
 def check_writable(path: Path, source: str, endings: Sequence[str] = (), but: str = "") -> None:

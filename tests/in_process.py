@@ -95,7 +95,8 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
     the test's folder.
     """
     out, err, code = io.StringIO(), io.StringIO(), None
-    handler = signal.getsignal(signal.SIGINT)  # a command that fails ignores Ctrl-C, and so would later processes
+    # a command that fails ignores Ctrl-C, and so would later processes
+    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
     loaded_modules = set(sys.modules)
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
@@ -104,7 +105,8 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
             main()
         except SystemExit as end:
             code = end.code
-    signal.signal(signal.SIGINT, handler)
+    for one, handler in handlers.items():
+        signal.signal(one, handler)
     for name in set(sys.modules) - loaded_modules:
         file = str(getattr(sys.modules[name], "__file__", None) or "")
         if file.startswith(os.getcwd()) and not file.startswith(sys.prefix):

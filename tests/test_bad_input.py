@@ -37,6 +37,8 @@ TYPED = [
     ("study", "Missing argument 'STUDY'"),
     ("study smoke --algorithms rs,rs --dry-run", "same name"),
     ("study smoke --jobs 0", "--jobs"),
+    ("study smoke --out=", "--out: ''"),
+    ("study smoke --evaluations 9", "search.population = 10 is more than search.evaluations = 9"),
     ("study smoke --only nonsense", "ALGORITHM:RUN"),
     ("study smoke --only nsga2:2", "'nsga2:2'"),
     ("study smoke --evaluations 99999999999999999999", "--evaluations"),

@@ -9,7 +9,7 @@ from pathlib import Path
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, problem_of, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import warn
+from safevar_sumo.errors import MAX_BATCH, InputError, check_whole, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
@@ -69,7 +69,16 @@ def run(
         If nothing can be computed, a file cannot be written, or another process works on one of the runs.
     """
     loaded_study, system = load_for_search(study)
-    keys = all_runs(loaded_study) if only is None else [RunKey(*key) for key in only]
+    keys = all_runs(loaded_study)
+    if only is not None:
+        for key in only:
+            if tuple(key) not in keys:
+                raise InputError("only", repr(key), "(algorithm of the study, run from 0 to less than `search.runs`)")
+        keys = [RunKey(*key) for key in only]
+    if batch is not None:
+        check_whole("batch", batch, MAX_BATCH)
+    if out == "":
+        raise InputError("out", "''", "a directory")
     directory = Path(out) if out is not None else Path("results") / loaded_study.name
     pool_context = open_pool(jobs, cluster) if pool is None else nullcontext(pool)
     with pool_context as workers, open_progress(progress) as show:
@@ -92,6 +101,10 @@ def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
     """
     loaded_study, system = load_and_assemble(study, source)
     characteristics = system.characteristics
+    search = loaded_study.search
+    if search.population > search.evaluations:
+        excess = f"search.population = {search.population} is more than search.evaluations = {search.evaluations}"
+        raise InputError(loaded_study.source, excess, "a run of at least one population")
     problem = problem_of(loaded_study, system, Evaluations.none(len(characteristics), METRICS))
     for name in loaded_study.search.labels:
         algorithm = algorithm_of(name, loaded_study)

@@ -14,7 +14,7 @@ from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.campaign.campaign import choose_engine, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import open_pool
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import MAX_BATCH, InputError, warn
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.ask import Jobs, Range
@@ -52,7 +52,7 @@ def study(
     evaluations: Annotated[int | None, Range(1, 10_000_000)] = None,
     algorithms: Annotated[str | None, "NAME,..."] = None,
     seed: Annotated[int | None, Range(0, 2**63 - 1)] = None,
-    batch: Annotated[int | None, Range(1, 10_000)] = None,
+    batch: Annotated[int | None, Range(1, MAX_BATCH)] = None,
     engine: Literal["recorded", "sumo"] = "recorded",
     out: Path | None = None,
     jobs: Jobs = None,
@@ -63,7 +63,7 @@ def study(
     quiet: bool = False,
     dry_run: bool = False,
     status: bool = False,
-) -> Answer | None:
+) -> Answer:
     """Search a study; run the same command again to continue where it stopped.
 
     Parameters
@@ -94,7 +94,7 @@ def study(
     retry_failed
         Simulate again the settings that could not be simulated before (simulator-error).
     quiet
-        Print only errors and warnings.
+        Print only errors, warnings, and what an output option such as --json asks for.
     dry_run
         Estimate the time from a short measurement.
     status
@@ -127,8 +127,6 @@ def study(
     except KeyboardInterrupt:
         warn(f"finished evaluations are kept in {directory}: run the same command again to continue")
         raise
-    if quiet:
-        return None
     answer, reason = summarise(results), why_no_verdict(system)
     following = ", ".join(question_command(name, str(directory)) for name in ("explain", "tolerance"))
     verdict = f"{reason or _verdict(results, system)} Next: {following}"
@@ -160,7 +158,7 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
     return Answer(
         question="study",
         study=study,
-        verdict=f"At most {time} for {evaluations} evaluations, {runs} runs of {names}; nothing was written.",
+        verdict=f"About {time} for at most {evaluations} evaluations, {runs} runs of {names}; nothing was written.",
         numbers={
             "runs": runs,
             "engine": engine,
@@ -229,7 +227,7 @@ def summarise(results: Results) -> Answer:
             "results": str(results.directory),
             "finished": len(results.finished),
             "runs": runs,
-            "evaluations": study.search.evaluations,
+            "evaluations": len(results.evaluations),
             "solutions": len(results.solutions),
             "original_outcome": results.original["outcome"],
             "original_degree": results.original[SAFETY_DEGREE],

@@ -173,7 +173,7 @@ def measure_speed(task: Task, pool: Pool) -> float:
     characteristics, size = system.characteristics, max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
     rng, shape = np.random.default_rng(task.study.search.seed), (pool.workers, size, len(characteristics))
     jobs = [(task, rows) for rows in rng.uniform(characteristics.lower, characteristics.upper, shape)]
-    carry_out(evaluate_settings, [(task, rows[:1]) for _, rows in jobs], pool)  # workers load the study
+    carry_out(evaluate_settings, jobs, pool)  # workers load the study, and warm up
     start = time.perf_counter()
     carry_out(evaluate_settings, jobs, pool)
     return pool.workers * size / (time.perf_counter() - start)

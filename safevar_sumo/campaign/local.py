@@ -91,6 +91,7 @@ def say_last_words(file: IO[str] | None) -> None:
 def _begin_work(path: ImportPath, last_words: Path) -> None:
     path.inherit()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
     say_last_words(file)
@@ -130,14 +131,16 @@ def _show_package() -> Iterator[None]:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block Ctrl-C in this thread: a process that it starts inherits that, and does not end while modules load."""
+    """Block Ctrl-C and the like in this thread: a process that it starts inherits that, and does not end while modules
+    load; the one that started it ends it.
+    """
     if sys.platform == "win32":  # Windows has no signal masks
         yield
         return
     from multiprocessing import resource_tracker
 
     resource_tracker.ensure_running()  # a later start would unblock interrupts
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:

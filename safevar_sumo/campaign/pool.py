@@ -17,7 +17,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 from safevar_sumo.campaign import cluster as dask, local
-from safevar_sumo.errors import SafevarError
+from safevar_sumo.errors import MAX_JOBS, SafevarError, check_whole
 
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two looks at the jobs under way [s]."""
@@ -137,8 +137,10 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
     Raises
     ------
     InputError
-        If the scheduler does not answer, or the extra `cluster` is not installed.
+        If `jobs` is no number of processes, the scheduler does not answer, or the extra `cluster` is not installed.
     """
+    if jobs is not None:
+        check_whole("jobs", jobs, MAX_JOBS)
     with ExitStack() as stack:
         if cluster is None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True))

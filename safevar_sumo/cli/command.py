@@ -58,10 +58,10 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         conditions = [_parse(text) for text in fail_if]
         if plot is not None:
             check_writable(plot, "plot", PICTURE_ENDINGS)
-        answer: Answer | None = call(**values)
-        if answer is None:
-            return
-        _print(answer, "json" if as_json else form, table)
+        answer: Answer = call(**values)
+        form = "json" if as_json else form
+        if form != "text" or table or not values.get("quiet"):
+            _print(answer, form, table)
         if plot is not None:
             from safevar_sumo.questions.figures import save
 
@@ -103,11 +103,20 @@ def _complete_study(_ctx: click.Context, _param: click.Parameter, incomplete: st
     return [*names, CompletionItem(incomplete, type="file")]
 
 
+class _Path(click.Path):
+    """A path, which is not empty."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            raise InputError(str(param and param.name), "''", "a path")
+        return super().convert(value, param, ctx)
+
+
 def _flag(option: Option) -> click.Option:
     is_path = option.kind is Path
     return click.Option(
         [f"--{option.name.replace('_', '-')}", option.name],
-        type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if is_path else option.kind,
+        type=click.Choice(option.choices) if option.choices else _Path(path_type=Path) if is_path else option.kind,
         is_flag=option.kind is bool,
         multiple=option.is_repeated,
         show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
@@ -119,7 +128,7 @@ def _flag(option: Option) -> click.Option:
 
 def _output_options() -> list[click.Option]:
     """The options of every command that gives an answer."""
-    path = click.Path(path_type=Path)
+    path = _Path(path_type=Path)
     return [
         click.Option(
             ["--format", "form"], type=click.Choice(FORMATS), default="text", show_default=True, help="How to print."

@@ -51,6 +51,8 @@ COMMANDS_BY_GROUP = {
 }
 """The function of each command, by the title of its group, in the order of the help."""
 COMMANDS = {name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()}
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end the program as Ctrl-C does."""
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 """An argument of a function of the library in an error, such as `method=monte_carlo`."""
 
@@ -140,6 +142,8 @@ def main() -> None:
     """
     # Without its file and line.
     warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file
         faulthandler.enable()  # if compiled code crashes, its line is printed
     try:
@@ -180,15 +184,16 @@ def _exit_on_interrupt() -> Iterator[None]:
         os._exit(INTERRUPT_EXIT_CODE)
 
     in_main_thread = threading.current_thread() is threading.main_thread()
-    previous_handler = signal.signal(signal.SIGINT, exit_at_once) if in_main_thread else None
+    previous = {one: signal.signal(one, exit_at_once) for one in INTERRUPTS} if in_main_thread else {}
     try:
         yield
     finally:
-        if in_main_thread:
-            signal.signal(signal.SIGINT, previous_handler or signal.default_int_handler)
+        for one, handler in previous.items():
+            signal.signal(one, handler or signal.default_int_handler)
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
+    for one in INTERRUPTS:  # another Ctrl-C must change neither exit code nor message
+        signal.signal(one, signal.SIG_IGN)
     click.echo(f"{PROGRAM}: {message}", err=True)
     sys.exit(code)

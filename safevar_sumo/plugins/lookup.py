@@ -194,7 +194,7 @@ def only_from(folder: str) -> Iterator[None]:
     own = {name for name in modules if name != "__main__" and is_user_file(file_of_module(name))}
     for name in own:
         del sys.modules[name]
-    ImportPath([folder, *(entry for entry in path.folders if _is_of_libraries(entry))], []).inherit()
+    ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
     os.chdir(folder)
     try:
         yield

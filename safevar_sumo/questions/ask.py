@@ -17,7 +17,7 @@ from pathlib import Path
 from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from safevar_sumo.errors import InputError, check_name, unknown_name, warn
+from safevar_sumo.errors import MAX_JOBS, InputError, check_name, unknown_name, warn
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
 from safevar_sumo.records import JsonObject
@@ -66,7 +66,7 @@ any evaluated setting collides, else half of the original's safety degree; of a 
 """
 PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
-Jobs = Annotated[int | None, Range(1, 1024)]
+Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),

@@ -117,7 +117,7 @@ def write_whole(path: Path, text: str) -> None:
     with (
         disk_errors(path, "written"),
         whole_file(path) as temporary_file,
-        open(temporary_file, "x", encoding="utf-8", newline="") as file,
+        open(temporary_file, "w", encoding="utf-8", newline="") as file,
     ):
         file.write(text)
 

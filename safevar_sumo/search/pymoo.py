@@ -132,7 +132,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
             Naming the arguments of the study `source` without which pymoo would not fail.
         """
         given = {name: value for name in self.__struct_fields__ if (value := getattr(self, name)) is not UNSET}
-        key, size = f"search.{self.name!r}", given.get("pop_size", 0)
+        key = f"search.{self.name!r}"
+        size = given.get("pop_size", 0)
         if size > problem.evaluations:
             legal = f"at most the {problem.evaluations} evaluations of a run"
             raise InputError(source, f"{key}.pop_size = {size}", legal)

@@ -155,6 +155,28 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"jobs": -1}, "jobs: -1\nexpected: a whole number from 1 to 1,024"),
+        ({"jobs": 0}, "jobs: 0\nexpected: a whole number from 1 to 1,024"),
+        ({"batch": 0}, "batch: 0\nexpected: a whole number from 1 to 10,000"),
+        ({"only": [("rs", 0), ("nsga2", 9)]}, "only: ('nsga2', 9)\nexpected: (algorithm"),
+        ({"only": [("sr", 0)]}, "only: ('sr', 0)"),
+        ({"out": ""}, "out: ''"),
+    ],
+)
+def test_a_run_refuses_what_its_command_refuses(options: dict[str, Any], error: str, in_tmp: Path) -> None:
+    with pytest.raises(sv.InputError) as refused:
+        sv.run("smoke", **options)
+    assert str(refused.value).startswith(error)
+    assert not [*in_tmp.iterdir()]
+    if "jobs" in options:
+        for ask in (sv.risk, sv.tolerance, lambda study, jobs: sv.evaluate(study, [{}], jobs=jobs)):
+            with pytest.raises(sv.InputError, match="jobs"):
+                ask("smoke", jobs=options["jobs"])
+
+
 def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     Path("script.py").write_text(
         "import safevar_sumo as sv\nprint('begun')\n"

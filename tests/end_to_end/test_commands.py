@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, load_runs, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from tests.end_to_end.conftest import solutions, study, written
-from tests.in_process import refused, run
+from tests.in_process import json_of, refused, run
 
 pytestmark = pytest.mark.usefixtures("small")
 SLOW = pytest.mark.slow
@@ -103,6 +103,15 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
     assert "evaluations before" not in fewer
 
 
+def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what_is_asked_for(whole: Path) -> None:
+    simulated = len(load_runs(whole).evaluations)
+    again = ("study", "small.toml", "--out", str(whole))
+    assert f"evaluations: {simulated};" in run(*again).stdout
+    assert run(*again, "--quiet").stdout == ""
+    assert json_of(*again, "--quiet")["numbers"]["evaluations"] == simulated
+    assert "NSGA-II" in run(*again, "--quiet", "--table", "algorithms").stdout
+
+
 @pytest.mark.slow
 def test_torn_runs_are_continued(copied: Path, whole: Path) -> None:
     for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
@@ -114,6 +123,7 @@ def test_torn_runs_are_continued(copied: Path, whole: Path) -> None:
 
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     output = run("study", "small.toml", "--dry-run").stdout
+    assert output.startswith("About ")
     for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations_per_second", " s "):
         assert word in output
     assert not Path("results").exists()

@@ -18,7 +18,7 @@ import pytest
 
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import load_runs
+from safevar_sumo.results import load_runs, write_whole
 from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
 from tests.in_process import run
 
@@ -75,6 +75,41 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGINT)
     assert "interrupted" in ended(process, 130)
+
+
+def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path) -> None:
+    Path("temporary").mkdir()
+    environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
+    process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo", env=environment)
+    until(lambda: written(OUT) > 0, process)
+    process.terminate()
+    errors = ended(process, 130)
+    assert "interrupted" in errors
+    assert "leaked" not in errors, "a remark on semaphores"
+    assert not [*Path("temporary").iterdir()]
+
+
+def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_written_stays(in_tmp: Path) -> None:
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom safevar_sumo.output import whole_file\n"
+        "with whole_file(Path('page.html')) as file:\n    file.write_text('half')\n    print(file.name, flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    writers = [subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) for _ in range(2)]
+    names = [writer.stdout.readline().strip() for writer in writers if writer.stdout]
+    writers[0].kill()
+    writers[0].wait()
+    before = time.time() - 60
+    for name in (*names, ".page.0badcafe.tmp.html"):
+        Path(name).touch()
+        os.utime(name, (before, before))
+    write_whole(Path("page.html"), "whole")
+    assert sorted(path.name for path in in_tmp.glob(".page*")) == [names[1]]
+    writers[1].communicate("", timeout=60)
+    assert writers[1].returncode == 0
+    assert Path("page.html").read_text() == "half"
+    assert not [*in_tmp.glob(".page*")]
 
 
 @SLOW
