@@ -25,17 +25,16 @@ from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, equals_clear, wea
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.encounters import check_domains, encounter
-from safevar_sumo.sumo.measuring import RESULT_COLUMNS, Measuring, measuring_of
+from safevar_sumo.sumo.measuring import Measuring, measuring_of
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
+from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
 from safevar_sumo.vehicles.base import Prepared
 
-MIN_HEADWAY = 0.5
-"""Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
 CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
 """The legal forms of a controller written for TraCI."""
 
@@ -175,7 +174,8 @@ def _assemble(study: Study, source: str) -> System:
     unload_user_modules()  # so that each system has the code as it is now, and no state of another one
     vehicle, ads, scenario, weather = models_of(study, source)
     is_shipped_vehicle = study.vehicle.model in VEHICLES
-    _check_units(study, vehicle, is_shipped_vehicle, source)
+    check_units(study, vehicle, source)
+    check_plausible(study, vehicle, source)
     if isinstance(ads, TraciController) and not is_shipped_vehicle and type(vehicle).sensors is Vehicle.sensors:
         problem = (
             f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of TraCI bypasses sense"
@@ -320,32 +320,6 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
         return msgspec.structs.replace(scenario, network=network)
     vars(scenario)["network"] = network
     return scenario
-
-
-def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, source: str) -> None:
-    table, units = study.vehicle.characteristics, vehicle.UNITS
-    if (
-        "actuatorLag" in units
-        and "tau" in table
-        and ("actuatorLag" not in table or table["tau"].original < MIN_HEADWAY)
-    ):
-        problem = (
-            f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway of SUMO's driver"
-        )
-        legal = f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is vehicle.characteristics.actuatorLag"
-        raise InputError(source, problem, legal)
-    for name, entry in table.items():
-        key = f"vehicle.characteristics.{name}"
-        if name in RESULT_COLUMNS:
-            raise InputError(source, f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
-        check_name(source, f"{key}: {study.vehicle.model} has no such characteristic", name, units)
-        if entry.unit != units[name]:
-            raise InputError(source, f"{key}.unit = {entry.unit!r}", repr(units[name]))
-        if is_shipped_vehicle and entry.lower <= 0:
-            raise InputError(source, f"{key}.lower = {entry.lower}", "a value above 0")
-    for name in units:
-        if name not in table:
-            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
 def _class_and_creator(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -15,6 +16,24 @@ from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, IntArr
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
+
+
+class Plausible(NamedTuple):
+    """The plausible values of a characteristic, in its unit, or of a parameter, in `unit`: wide enough for every road
+    vehicle, too narrow for another unit.
+    """
+
+    lowest: float
+    highest: float
+    unit: str = ""
+
+
+MASS = Plausible(50, 60_000, "kg")
+"""Mass of a vehicle, from a moped to a loaded truck."""
+FRICTION = Plausible(0.05, 3, "-")
+"""Friction coefficient of tyres."""
+SECONDS = Plausible(1e-12, 20, "s")
+"""Delays, time constants and headways: above 0."""
 
 
 class Slope(NamedTuple):
@@ -184,6 +203,9 @@ class Vehicle:
     ----------
     UNITS
         Units of the characteristics by name.
+    PLAUSIBLE
+        Plausible values of characteristics and parameters by name; a study with others is refused. A name may be
+        missing.
     FITTED_UP_TO
         Highest speed at which the parameters were identified [m/s].
     remarks
@@ -204,6 +226,7 @@ class Vehicle:
         "advance": Returned((LEGAL_STATE,), like=2),
     }
     UNITS: Mapping[str, str]
+    PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType({})
     FITTED_UP_TO: ClassVar[float] = np.inf
     remarks: Sequence[str] = ()
 

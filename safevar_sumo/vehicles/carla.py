@@ -15,7 +15,18 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Sensors, Slope, SumoType, Vehicle
+from safevar_sumo.vehicles.base import (
+    LEVEL,
+    MASS,
+    SECONDS,
+    Characteristics,
+    Plausible,
+    Positive,
+    Sensors,
+    Slope,
+    SumoType,
+    Vehicle,
+)
 
 if TYPE_CHECKING:
     from safevar_sumo.vehicles.carla_step import Car, CarlaState, Law
@@ -96,6 +107,21 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         "dampRate": "kg m^2/s",
         "radius": "cm",
         "maxBrakeTorque": "N m",
+    }
+    PLAUSIBLE = {
+        "max_rpm": Plausible(300, 30_000),
+        "dampRateFullT": Plausible(0.001, 50),
+        "dampRateZeroT_CE": Plausible(0.001, 50),
+        "dampRateZeroT_CD": Plausible(0.001, 50),
+        "gearSwitchTime": SECONDS,
+        "clutchStrength": Plausible(0.01, 1000),
+        "mass": MASS,
+        "dragCoeff": Plausible(0.01, 5),
+        "tireFric": Plausible(0.05, 20),
+        "dampRate": Plausible(0.001, 50),
+        "radius": Plausible(10, 100),
+        "maxBrakeTorque": Plausible(20, 50_000),
+        "shift_latency": SECONDS,
     }
     FITTED_UP_TO: ClassVar[float] = 6.5  # m/s; highest speed in simulations of the published settings of sun and rain
 

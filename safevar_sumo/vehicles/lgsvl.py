@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
+from safevar_sumo.vehicles.base import LEVEL, MASS, SECONDS, Characteristics, Plausible, Slope, SumoType, Vehicle
 
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles
 # the cost.
@@ -121,6 +121,21 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         "wheelDamping": "kg m^2/s",
         "shiftTime": "s",
         "tractionControlSlipLimit": "-",
+    }
+    PLAUSIBLE = {
+        "mass": MASS,
+        "wheelMass": Plausible(1, 500),
+        "radius": Plausible(0.1, 1),
+        "maxRpm": Plausible(300, 30_000),
+        "minRpm": Plausible(50, 5000),
+        "maxBrakeTorque": Plausible(20, 50_000),
+        "maxMotorTorque": Plausible(5, 10_000),
+        "maxSteeringAngle": Plausible(5, 90),
+        "tireDragCoeff": Plausible(0.001, 100),
+        "wheelDamping": Plausible(0.001, 50),
+        "shiftTime": SECONDS,
+        "tractionControlSlipLimit": Plausible(0.01, 2),
+        "steering_design_angle": Plausible(5, 90, "deg"),
     }
 
     pedal_lag: Annotated[float, Meta(ge=0)]

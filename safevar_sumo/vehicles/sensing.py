@@ -14,9 +14,13 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import (
+    FRICTION,
     LEVEL,
+    MASS,
+    SECONDS,
     Characteristics,
     DelayedSignal,
+    Plausible,
     Positive,
     Prepared,
     Sensors,
@@ -144,6 +148,20 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         "brakeDelay": "s",
         "brakeGain": "-",
     }
+    PLAUSIBLE = {
+        "mass": MASS,
+        "accel": Plausible(0.1, 30),
+        "decel": Plausible(0.5, 30),
+        "maxSpeed": Plausible(1, 150),
+        "tau": SECONDS,
+        "actuatorLag": SECONDS,
+        "sensorRange": Plausible(0.5, 2000),
+        "reactionTime": SECONDS,
+        "brakeDelay": SECONDS,
+        "brakeGain": Plausible(0.01, 10),
+        "reference_mass": MASS,
+        "tyre_friction": FRICTION,
+    }
 
     reference_mass: Annotated[float, Meta(gt=0)] = 1500.0
     tyre_friction: Annotated[float, Meta(gt=0)] = 0.9
@@ -254,6 +272,23 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         "payloadCentre": "m",
         "sensorRange": "m",
         "sensorLatency": "s",
+    }
+    PLAUSIBLE = {
+        "treadDepth": Plausible(0.1, 50),
+        "brakeTorque": Plausible(0.01, 10),
+        "brakeResponse": SECONDS,
+        "payload": Plausible(0.1, 60_000),
+        "payloadCentre": Plausible(0.05, 20),
+        "sensorRange": Plausible(0.5, 2000),
+        "sensorLatency": SECONDS,
+        "kerb_mass": MASS,
+        "kerb_centre": Plausible(0.1, 10, "m"),
+        "wheelbase": Plausible(0.5, 12, "m"),
+        "centre_height": Plausible(0.05, 4, "m"),
+        "drive_force": Plausible(100, 500_000, "N"),
+        "brake_force": Plausible(200, 1_000_000, "N"),
+        "tyre_friction": FRICTION,
+        "max_speed": Plausible(1, 150, "m/s"),
     }
 
     kerb_mass: Positive = 1500.0

@@ -1,0 +1,67 @@
+"""Checks of the vehicle of a study: its characteristics, their units, and values that are plausible in these units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.study import Study
+from safevar_sumo.study.characteristics import unit_text
+from safevar_sumo.sumo.measuring import RESULT_COLUMNS
+from safevar_sumo.vehicles import Vehicle
+from safevar_sumo.vehicles.base import Plausible
+
+MIN_HEADWAY = 0.5
+"""Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
+
+
+def check_units(study: Study, vehicle: Vehicle, source: str) -> None:
+    """Refuse characteristics that the vehicle does not have, in other units, or missing."""
+    table, units = study.vehicle.characteristics, vehicle.UNITS
+    if (
+        "actuatorLag" in units
+        and "tau" in table
+        and ("actuatorLag" not in table or table["tau"].original < MIN_HEADWAY)
+    ):
+        problem = (
+            f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway of SUMO's driver"
+        )
+        legal = f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is vehicle.characteristics.actuatorLag"
+        raise InputError(source, problem, legal)
+    for name, entry in table.items():
+        key = f"vehicle.characteristics.{name}"
+        if name in RESULT_COLUMNS:
+            raise InputError(source, f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
+        check_name(source, f"{key}: {study.vehicle.model} has no such characteristic", name, units)
+        if entry.unit != units[name]:
+            raise InputError(source, f"{key}.unit = {entry.unit!r}", repr(units[name]))
+    for name in units:
+        if name not in table:
+            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
+
+
+def check_plausible(study: Study, vehicle: Vehicle, source: str) -> None:
+    """Refuse values of characteristics and parameters that the vehicle calls implausible, as in another unit."""
+    try:
+        ranges = msgspec.convert(vehicle.PLAUSIBLE, dict[str, Plausible])
+    except msgspec.ValidationError as error:
+        problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}"
+        raise InputError(source, problem, "(lowest, highest) or (lowest, highest, unit) by name") from None
+    for name, (lowest, highest, own_unit) in ranges.items():
+        entry = study.vehicle.characteristics.get(name)
+        if entry is None and not hasattr(vehicle, name):
+            problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}"
+            raise InputError(source, problem, "names of characteristics and of parameters")
+        values: list[tuple[str, Any]] = [(f"parameters.{name}", getattr(vehicle, name, None))]
+        if entry is not None:
+            ends = ("original", "lower", "upper")
+            values = [(f"characteristics.{name}.{end}", getattr(entry, end)) for end in ends]
+        unit = unit_text(own_unit if entry is None else entry.unit)
+        for key, value in values:
+            is_number = isinstance(value, int | float)
+            if not (is_number and lowest <= value <= highest):
+                legal = f"a plausible value, {lowest:g} to {highest:g}{unit}"
+                text = f"{value:g}{unit}" if is_number else repr(value)
+                raise InputError(source, f"vehicle.{key} = {text}", legal)
