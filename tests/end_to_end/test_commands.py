@@ -66,7 +66,7 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
         "NSGA-II",
         "RQ1 over runs",
         "RQ2 over runs",
-        "too few runs for 8 of 8 tests of RQ1 (8 are needed)",
+        "too few runs for 8 of 8 tests of RQ1 (11 are needed after the correction)",
         "Next: python -m safevar_sumo explain results/smoke, python -m safevar_sumo tolerance results/smoke",
     ):
         assert part in output

@@ -299,6 +299,35 @@ def test_tables_have_the_promised_columns(name: str, columns: str) -> None:
         assert all(isinstance(count, int) for count in counts if count is not None)
 
 
+def test_the_tests_of_each_question_are_a_family_and_the_needed_runs_count_after_the_correction() -> None:
+    """Runs that are all apart: Holm multiplies the smallest p-value of RQ1, 2 / 2^n, by its 8 tests, and that of RQ2,
+    2 / C(2n, n), by its 7: 11 and 7 runs are needed where 8 and 5 would be without the correction.
+    """
+    for runs, enough in ((6, (False, False)), (7, (False, True)), (10, (False, True)), (11, (True, True))):
+        metrics = {"tet": (2.5, 2.0), "tit": (2.5, 2.0), "ave_dece": (9.0, 8.0)}
+        case = made_up(
+            *(
+                row(name, run=run, sd=degree + run / 1000)
+                | {metric: values[i] + run / 1000 for metric, values in metrics.items()}
+                for i, (name, degree) in enumerate((("nsga2", 0.5), ("rs", 1.5)))
+                for run in range(runs)
+            )
+        )
+        answer = answer_questions([case], names=("rq1-runs", "rq2-runs"))
+        for name, tests, smallest, is_enough in (
+            ("rq1-runs", 8, 2 / 2**runs, enough[0]),
+            ("rq2-runs", 7, 2 / math.comb(2 * runs, runs), enough[1]),
+        ):
+            table, remarks = answer.only(name).tables.values()
+            assert len(table) == tests
+            if runs <= 8:  # from then on, U's p-value of tied runs is approximate
+                assert table["p_holm"].min() == pytest.approx(min(tests * smallest, 1))
+            assert (table["enough_runs"].all(), table["significant"].any()) == (is_enough, is_enough)
+            text = " ".join(remarks["remark"])
+            assert f"p is corrected by Holm's method for the {tests} tests of {name[:3].upper()}, a family." in text
+            assert ("are needed after the correction" in text) is not is_enough
+
+
 def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever the number of
     solutions.
@@ -309,7 +338,7 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     answer = answer_questions([case])
     few = "too few runs of NSGA-II, RS for a test (8 are needed)"
     over_runs = answer.only("rq1-runs").tables["remarks"]["remark"]
-    assert "too few runs for 8 of 8 tests of RQ1 (8 are needed)" in "".join(over_runs)
+    assert "too few runs for 8 of 8 tests of RQ1 (11 are needed after the correction)" in "".join(over_runs)
     for name, stands_out in (("rq1", False), ("rq2", True)):
         table, remarks = answer.only(name).tables.values()
         assert (table["p_value"] < 0.001).any()

@@ -19,6 +19,7 @@ from safevar_sumo.questions.research_questions.figures import draw_change_counts
 from safevar_sumo.questions.research_questions.fronts import count_evaluations, describe_evaluations, few_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, TABLES, WEATHER
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.study import SAFETY_DEGREE, label_of
 
 if TYPE_CHECKING:
@@ -173,8 +174,13 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
             yield f"{prefix}settings that a run simulates, mean: {texts}."
     if table in ("rq1-runs", "rq2-runs"):
         tests = frame.dropna(subset="effect_size")
+        if len(tests):
+            yield f"{prefix}p is corrected by Holm's method for the {number_of(len(tests), 'test')} of {rq}, a family."
         if few_count := len(tests) - tests["enough_runs"].sum():
-            needed = fewest_runs(rq, alpha)
-            yield f"{prefix}too few runs for {few_count} of {len(tests)} tests of {rq} ({needed} are needed)."
+            needed = fewest_runs(rq, alpha, len(tests))
+            yield (
+                f"{prefix}too few runs for {few_count} of {number_of(len(tests), 'test')} of {rq} ({needed} are needed "
+                "after the correction)."
+            )
     if table == "combinations" and frame.empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."

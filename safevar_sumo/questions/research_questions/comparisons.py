@@ -2,7 +2,8 @@
 
 The paper pools the solutions of all runs and compares them with a second sample: the original's single value, repeated
 once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
-small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests.
+small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests of the question:
+those of RQ1 and those of RQ2 are a family each.
 
 In the frames, `method` holds the name of the test, and `enough_runs` whether a test with so many runs can be
 significant; undefined values are NaN. Functions of a case raise `UnanswerableError` if no
@@ -95,7 +96,8 @@ def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
     `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal ones
     (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is
-    `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
+    `p_value` corrected by Holm's method for all tests of RQ1 of this case, and `enough_runs` says whether it can be
+    significant.
     """
     tests = compare_over_runs(case, choices)
     return tests[tests.index == "RQ1"]
@@ -105,7 +107,8 @@ def rq2_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, metrics' means
     over solutions and, if they were counted, distinct minimal causes.
 
-    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
+    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` and `enough_runs` are as in
+    `rq1_runs`, for all tests of RQ2.
     """
     tests = compare_over_runs(case, choices)
     opponents_of(case, choices.algorithm)  # raises if RQ2 has no answer
@@ -117,8 +120,14 @@ def compare_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     rows = {"RQ1": _test_original(case, choices, over_runs=True)}
     if len(case.algorithms) > 1:
         rows["RQ2"] = _test_opponents(case, choices, over_runs=True)
-    tests = pd.concat({question: pd.DataFrame(rows[question]) for question in rows}).droplevel(1)
-    return _with_significance(tests.assign(p_holm=correct_by_holm(tests["p_value"])), choices)
+    families = {question: _corrected(question, pd.DataFrame(rows[question]), choices.alpha) for question in rows}
+    return _with_significance(pd.concat(families).droplevel(1), choices)
+
+
+def _corrected(question: str, tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
+    """The tests of a question, which are corrected as a family."""
+    needed = fewest_runs(question, alpha, int(tests["p_value"].count()))
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough_runs=tests["runs"] >= needed)
 
 
 def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:

@@ -33,12 +33,15 @@ MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
 
 
-def fewest_runs(question: str, alpha: float = ALPHA) -> int:
-    """Smallest number of runs with which a test of RQ1 or RQ2 can be significant before any correction.
+def fewest_runs(question: str, alpha: float = ALPHA, tests: int = 1) -> int:
+    """Smallest number of runs with which a test of RQ1 or RQ2 can be significant, after Holm's correction for so many
+    tests.
 
-    The smallest two-sided p-value of n runs is 2 / 2^n by RQ1's signed-rank test, and 2 / C(2n, n) by RQ2's U test.
+    The smallest two-sided p-value of n runs is 2 / 2^n by RQ1's signed-rank test, and 2 / C(2n, n) by RQ2's U test; the
+    smallest one of a family is multiplied by the number of its tests.
     """
-    return next(n for n in count(1) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < alpha)
+    orders = ((n, 2**n if question == "RQ1" else math.comb(2 * n, n)) for n in count(1))
+    return next(n for n, number in orders if 2 * max(tests, 1) / number < alpha)
 
 
 class TwoSampleTest(NamedTuple):
