@@ -83,17 +83,16 @@ class Lookup(NamedTuple):
         return Member(target, code._replace(target=target))
 
     def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
-        """A class by name; a user's class must meet the contract of the first base that it derives from, else of the
-        last one.
+        """A class by name; a user's class must meet the contract of the first base that it derives from, else of that
+        which it meets, else of the last one.
 
         `otherwise` is what the study may give in place of a class, for the error.
         """
         member = self.find(shipped, name, key)
         if member.code is None:
             return member
-        base = next(
-            (base for base in bases if inspect.isclass(member.target) and issubclass(member.target, base)), bases[-1]
-        )
+        base = next((base for base in bases if _derives(member.target, base)), None)
+        base = base or next((base for base in bases if not violation(member.target, base)), bases[-1])
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError(self.source, f"{member.code.name} {reason}", expected, member.code.definition())
@@ -140,6 +139,10 @@ class Lookup(NamedTuple):
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             _user_modules.update(sys.modules.keys() - modules_before)
+
+
+def _derives(candidate: Any, base: type) -> bool:
+    return inspect.isclass(candidate) and issubclass(candidate, base)
 
 
 def unload_user_modules() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from safevar_sumo.records import BoolArray, Command
 from safevar_sumo.scenarios import Point
-from safevar_sumo.scenarios.euro_ncap import KMH
+from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
 from safevar_sumo.vehicles.base import Prepared, State
 

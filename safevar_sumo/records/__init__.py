@@ -22,6 +22,7 @@ from safevar_sumo.records.driving import (
     Observation as Observation,
     Outcome as Outcome,
     PedalTables as PedalTables,
+    Quantity as Quantity,
     SimulationRuns as SimulationRuns,
     Trace as Trace,
     finite_or_none as finite_or_none,

@@ -13,6 +13,8 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int_]
+Quantity = Any
+"""A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N encounters."""
 JsonObject = dict[str, Any]
 """An object of JSON, or a table of TOML: plain values by key."""
 

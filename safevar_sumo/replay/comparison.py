@@ -20,7 +20,7 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, S
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike, unit_text
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.bodies import Track
+from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
 from safevar_sumo.sumo.network import Network, built_network, stage_network
 from safevar_sumo.sumo.system import System
@@ -80,7 +80,7 @@ class Comparison:
     road: tuple[LaneLine, ...]
     evaluations: Evaluations
     runs: SimulationRuns
-    tracks: Mapping[str, Track]
+    tracks: Mapping[str, Film]
     objectives: tuple[MetricFacts, ...] = ()
     point: str = ""
 
@@ -183,9 +183,9 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     )
 
 
-def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, Track]]:
+def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, Film]]:
     """Simulate N settings, shape (N, n), and record in SUMO how all actors move, by name in alphabetical order."""
-    runs, tracks, samples = simulate(system, settings), dict[str, Track](), count()
+    runs, tracks, samples = simulate(system, settings), dict[str, Film](), count()
     length = len(runs.trace.time)
     drive_again(system, settings, runs, lambda world: world.film(tracks, next(samples), length))
     return runs, dict(sorted(tracks.items()))

@@ -16,10 +16,12 @@ from safevar_sumo.scenarios.base import (
     Scenario as Scenario,
     Scene as Scene,
     World as World,
+    WorldScenario as WorldScenario,
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.stop import Stop
+from safevar_sumo.scenarios.tracks import Track as Track, TrackScenario as TrackScenario, travelled as travelled
 from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study import FreeParameter, Weather
 

@@ -8,59 +8,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
-from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import (
-    Coordinates,
-    Frame,
-    Layout,
-    PreCrash,
-    Roads,
-    World,
-    XmlChanges,
-    as_text,
-    driven_distance,
-)
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios.base import PreCrash
 from safevar_sumo.scenarios.euro_ncap import (
-    BODIES,
-    EXIT_LANE,
-    JUNCTION,
-    JUNCTION_LANE,
-    KMH,
     SAME_DIRECTION,
-    TARGET,
-    VUT_LANE,
-    BodySize,
     Direction,
     Heading,
     Metres,
+    ProtocolTest,
     Seconds,
     Speed,
     SpeedProfile,
-    VehicleMover,
-    approach,
-    change_target_lanes,
     lateral_offset,
-    target_type,
 )
-from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetMotion, TargetTest, Times, value_at
+from safevar_sumo.scenarios.tracks import BODIES, KMH, Track, first_in_strip, travelled
 
-ROAD_LANE = "road_0"
-START_POSITION = 50.0
-"""Position of the vehicle's front bumper on the lane at the start [m]."""
-FRONT_POSITION = 0.5
-"""Position of a rotated target's front on the lane beyond the junction [m]; SUMO cannot insert a vehicle on the
-junction itself.
-"""
-REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
-"""Targets that have no type in the traffic file, each with the type there that it replaces."""
 FINAL_SPEED = 2.0
 """Speed at which the braking target stops braking [km/h]."""
 STEADY_SPEED_LIMIT = 80.0
@@ -68,8 +36,8 @@ STEADY_SPEED_LIMIT = 80.0
 """
 
 
-class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see `TargetTest`.
+class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see `ProtocolTest`.
 
     The middle of the target's rear is at the impact location. A standing target may be rotated around that point.
     """
@@ -94,105 +62,14 @@ class TargetAhead(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=T
         """Direction of the target."""
         return SAME_DIRECTION
 
-    @property
-    def _body(self) -> BodySize:
-        return BODIES[self.parameter("target")]
-
-    def lanes(self, roads: Roads) -> XmlChanges:
-        """Changes that turn the lanes into a rotated target's direction; its rear is on the junction, and its front on
-        the exit lane.
-        """
-        direction = self.direction
-        if direction == SAME_DIRECTION:
-            return {}
-        frame, length = approach(roads), self._body.length
-        rear_along, rear_left = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
-        entry, exit_ = (
-            (rear_along + distance * direction.along, rear_left + distance * direction.left)
-            for distance in (-length, length - FRONT_POSITION)
-        )
-        return change_target_lanes(frame, entry, exit_, direction)
-
-    def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle at its speed, and the target ahead of it: in line with the lane, or rotated on the junction."""
-        name, direction = self.parameter("target"), self.direction
-        if self.gap <= 0:
-            raise InputError(
-                "scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead"
-            )
-        if direction == SAME_DIRECTION:
-            replaced = REPLACED_TYPES.get(name)
-            return {
-                **self._vehicle_at(START_POSITION),
-                **({f"vType[@id='{replaced}']": target_type(name)} if replaced else {}),
-                "vehicle[@id='target']": {
-                    "type": name,
-                    "departPos": as_text(START_POSITION + self.gap + self._body.length),
-                    "departPosLat": as_text(-self.offset),
-                    "departSpeed": as_text(self.target_speed_at(0.0)),
-                },
-            }
-        exit_along, _ = approach(roads).lane_coordinates(roads.lane(EXIT_LANE).start)
-        rotated = {"type": name, "route": "beyond", "departPos": repr(FRONT_POSITION)}
-        return {
-            **self._vehicle_at(exit_along + FRONT_POSITION * direction.along - self._depth - self.gap),
-            **{f"vehicle[@id='parked_{size}']": None for size in ("small", "large")},
-            "vType[@id='target']": target_type(name),
-            "vehicle[@id='target']": {**rotated, "departPosLat": "0", "departSpeed": "0"},
-        }
-
-    def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        times = np.arange(samples)[:, np.newaxis] * step
-        speeds = self.target_speed_at(times) + np.zeros_like(times)
-        along = START_POSITION + self.gap + self._body.length + driven_distance(speeds, step)
-        frame = Frame.of(roads.lane(ROAD_LANE))
-        return Layout(frame, None, self.test_speed, TARGET, along, np.asarray(-self.offset), speeds)
-
-    def _motion(self, world: World) -> TargetMotion:
-        direction, depth, offset, speed_at = self.direction, self._depth, self.offset, self.target_speed_at
-        frame = Frame.of(world.lane(ROAD_LANE if direction == SAME_DIRECTION else VUT_LANE))
-
-        def target(positions: FloatArray, times: Times) -> Target:
-            along = frame.along(positions)
-            return Target(along - depth, np.full_like(along, offset), speed=value_at(times, speed_at))
-
-        mover = VehicleMover(self.parameter("target"), direction, speed_at)
-        return TargetMotion(frame, EncounterConstants(follows=True), mover, target)
-
-    @property
-    def _depth(self) -> float:
-        """Distance along the lane from the first point of contact to the middle of the target's front [m]."""
-        (along, left), (length, width) = self.direction, self._body
-        if self.direction == SAME_DIRECTION:
-            return length
-        front, rear = (length * along, length * left - self.offset), (0.0, -self.offset)
-        ends_and_sides = ((rear, 1), (rear, -1), (front, -1), (front, 1))  # 1 is the left side; once around the body
-        corners = [(x - side * left * (width / 2), y + side * along * (width / 2)) for (x, y), side in ends_and_sides]
-        return front[0] - _first_contact_position(corners, self.vut_width / 2)
-
-    def encounter(self, trace: Trace) -> Encounter:
-        """Distance from the front bumper to the target's body; TTC is this distance over the difference of speeds."""
-        return Encounter(
-            separation=trace.gap,
-            distance=trace.gap,
-            closing_speed=trace.speed - trace.obstacle_speed,
-            in_conflict=trace.gap > 0,
-        )
-
-
-def _first_contact_position(corners: list[Coordinates], half_width: float) -> float:
-    """Position along the lane at which a vehicle of this half width first touches a body with these corners [m].
-
-    If the body is beside the vehicle's path: the position of its rearmost corner.
-    """
-    positions = [x for x, y in corners if abs(y) <= half_width]
-    for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
-        positions += [
-            x + (to_x - x) * (path_edge - y) / (to_y - y)
-            for path_edge in (-half_width, half_width)
-            if min(y, to_y) < path_edge < max(y, to_y)
-        ]
-    return min(positions or [x for x, _ in corners])
+    def tracks(self, times: FloatArray) -> list[Track]:
+        """The target: a body that the vehicle's path touches first where the gap ends, and then moves ahead."""
+        target, direction = self.parameter("target"), self.direction
+        body, speeds = BODIES[target], self.target_speed_at(times)
+        y = direction.left * body.length / 2 - self.offset
+        at_gap = Track("target", target, *body, self.gap, y, *direction, speeds)
+        first = first_in_strip(at_gap._replace(x=0.0), self.vut_width / 2)
+        return [at_gap._replace(x=self.gap - first + travelled(speeds, times))]
 
 
 class Along(TargetAhead, frozen=True, kw_only=True):
@@ -227,7 +104,6 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     target_speed: Annotated[float, Meta(gt=0, le=60)] | None = None
     acceleration_distance: Metres | None = None
     time_to_impact: Seconds = 6.0
-    network: str = "along"
 
     def obstacle(self) -> str:
         """The target, which is ahead."""
@@ -277,8 +153,6 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         Size of the vehicle under test [m].
     grade
         Rise of the road over its length, negative downhill [%].
-    network
-        By default `car_to_car`, or `junction` for a rotated target.
 
     Notes
     -----
@@ -296,14 +170,14 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     heading: Heading = 0.0
     time_after: Seconds = 5.0
 
-    def __post_init__(self) -> None:
-        if not self.network:
-            force_setattr(self, "network", JUNCTION if self.heading else "car_to_car")
-
     @property
     def duration(self) -> Any:
-        """Length of a run [s]."""
-        return self._time_to_impact() + self.time_after
+        """Length of a run [s]: the target has stopped braking by then."""
+        end = self._time_to_impact()
+        if self._target_brakes:
+            lost = self._target_speed - self.target_speed_at(math.inf)
+            end = np.maximum(end, self.brakes_at + lost / self.target_deceleration)
+        return end + self.time_after
 
     @property
     def gap(self) -> Any:

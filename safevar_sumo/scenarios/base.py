@@ -215,11 +215,13 @@ def check_changes(code: UserCode, method: str, changes: Any, roads: Roads) -> Xm
     }
 
 
-def check_fields(code: UserCode, scenario: Any) -> None:
-    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed."""
+def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
+    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed, or illegal numbers of
+    `further` fields.
+    """
     if not isinstance(getattr(scenario, "network", None), str):
         raise code.wrong("__init__", quoted(scenario), "an object with the attribute network, a folder's name or path")
-    legal = {"duration": Legal(0.0, MAX_DURATION, above=True), "grade": Legal(-MAX_GRADE, MAX_GRADE)}
+    legal = {"duration": Legal(0.0, MAX_DURATION, above=True), "grade": Legal(-MAX_GRADE, MAX_GRADE), **further}
     if scenario.test_speed is not None:
         legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
     Returned((legal,)).check(code, "__init__", scenario, ())
@@ -249,21 +251,13 @@ class Layout(NamedTuple):
     backwards: BoolArray | bool = False
 
 
-def driven_distance(speeds: FloatArray, step: float) -> FloatArray:
-    """Distances that targets have driven since the first of T samples, shape (T, N) [m], as SUMO's ballistic update
-    adds them.
-    """
-    covered = (speeds[1:] + speeds[:-1]) / 2 * step
-    return np.concatenate([np.zeros_like(speeds[:1]), np.add.accumulate(covered, axis=0)])
-
-
 def as_text(value: Any) -> str:
     """A number as SUMO's files have it."""
     return repr(float(value))
 
 
 class Scenario:
-    """A scenario. Its fields are the parameters of `scenario.parameters`.
+    """What all scenarios have. A class's fields are the parameters of `scenario.parameters`.
 
     Attributes
     ----------
@@ -285,20 +279,11 @@ class Scenario:
         tolerance before the ADS brakes is an invalid test. Only contacts at the vehicle's front are collisions.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
-    RETURNS
-        What the methods of a user's class must return.
     is_user_code
         Whether the class is a user's.
     """
 
     __slots__ = ()
-    RETURNS: ClassVar[Mapping[str, Returned]] = {
-        "lanes": Returned(then=check_changes),
-        "actors": Returned(then=check_changes),
-        "begin": Returned(like=0),
-        "observe": Returned((LEGAL_SCENE, {}), like=0),
-        "encounter": Returned((LEGAL_ENCOUNTER,), like=0, then=check_encounter),
-    }
     is_user_code: ClassVar[bool] = False
     network: str
     reactive_actors: bool = True
@@ -318,6 +303,41 @@ class Scenario:
         pre_crash = ""
         test_speed = None
 
+    def lanes(self, roads: Roads) -> XmlChanges:
+        """Changes to the lanes of the built network."""
+        return {}
+
+    def actors(self, roads: Roads) -> XmlChanges:
+        """Changes to the network's traffic."""
+        return {}
+
+    def remarks(self) -> list[str]:
+        """Remarks for the user on the scenario's parameters."""
+        return []
+
+    def obstacle(self) -> str:
+        """What the vehicle hits in a collision, in words."""
+        return OBSTACLES.get(self.pre_crash, "what is in its way")
+
+
+class WorldScenario(Scenario):
+    """A scenario that observes the actors of its network itself, in the world that moves them.
+
+    Attributes
+    ----------
+    RETURNS
+        What the methods of a user's class must return.
+    """
+
+    __slots__ = ()
+    RETURNS: ClassVar[Mapping[str, Returned]] = {
+        "lanes": Returned(then=check_changes),
+        "actors": Returned(then=check_changes),
+        "begin": Returned(like=0),
+        "observe": Returned((LEGAL_SCENE, {}), like=0),
+        "encounter": Returned((LEGAL_ENCOUNTER,), like=0, then=check_encounter),
+    }
+
     @abstractmethod
     def begin(self, world: World) -> ScenarioMemory:
         """Prepare a run, before the first step; returns the memory for `observe`."""
@@ -330,27 +350,11 @@ class Scenario:
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
 
-    def lanes(self, roads: Roads) -> XmlChanges:
-        """Changes to the lanes of the built network."""
-        return {}
-
-    def actors(self, roads: Roads) -> XmlChanges:
-        """Changes to the network's traffic."""
-        return {}
-
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         """Where the actors are at samples `step` seconds apart, if parameters of this scenario are arrays of N values:
         the same as `actors` and `observe` make SUMO do.
         """
         raise NotImplementedError
-
-    def remarks(self) -> list[str]:
-        """Remarks for the user on the scenario's parameters."""
-        return []
-
-    def obstacle(self) -> str:
-        """What the vehicle hits in a collision, in words."""
-        return OBSTACLES.get(self.pre_crash, "what is in its way")
 
 
 SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"

@@ -14,8 +14,8 @@ from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import Point, Scenario
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.euro_ncap import BODIES
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
+from safevar_sumo.scenarios.tracks import BODIES
 
 SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
 """Distances from the vehicle's path at which a pedestrian stops [m]."""

@@ -19,20 +19,24 @@ from safevar_sumo.scenarios.base import (
     Layout,
     PreCrash,
     Roads,
-    Scenario,
     Scene,
     World,
+    WorldScenario,
     XmlChanges,
     as_text,
 )
-from safevar_sumo.scenarios.euro_ncap import approach
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
 """How far beyond the place where he turns a pedestrian may get by rounding errors [m]."""
-FOOTPATH_LANE = "footpath_0"
+VUT_LANE, FOOTPATH_LANE = "approach_0", "footpath_0"
 WALKING_SPEED, LATERAL_START = 1.8, 5.16
 """The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic file."""
+
+
+def approach(roads: Roads | World) -> Frame:
+    """The coordinates of the vehicle's lane before the crossing."""
+    return Frame.of(roads.lane(VUT_LANE))
 
 
 def _place(position: float, name: str) -> str:
@@ -63,7 +67,7 @@ class _Memory(NamedTuple):
     has_turned: BoolArray
 
 
-class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A pedestrian crosses the lane at right angles, turns round and walks back, without reacting to the vehicle.
 
     Parameters
@@ -188,7 +192,7 @@ class _Parked(NamedTuple):
     length: FloatArray
 
 
-class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
 
     Parameters

@@ -8,11 +8,12 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import STANDSTILL, Encounter, Trace
-from safevar_sumo.scenarios.base import VUT, Frame, Grade, Roads, Scenario, Scene, World, XmlChanges
-from safevar_sumo.scenarios.euro_ncap import KMH, Speed
+from safevar_sumo.scenarios.base import VUT, Frame, Grade, Roads, Scene, World, WorldScenario, XmlChanges
+from safevar_sumo.scenarios.euro_ncap import Speed
+from safevar_sumo.scenarios.tracks import KMH
 
 
-class Stop(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Stop(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle brakes fully from a speed until it stands; the driving system is not asked.
 
     The metric `stopping_distance` says how far it went from the first brake force on.
@@ -41,7 +42,7 @@ class Stop(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test alone, at its speed."""
-        return {"vehicle[@id='target']": None, "vehicle[@id='vut']": {"departSpeed": repr(self.test_speed)}}
+        return {"vehicle[@id='vut']": {"departSpeed": repr(self.test_speed)}}
 
     def begin(self, world: World) -> Frame:
         return Frame.of(world.lane_of(VUT))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,19 +29,21 @@ from safevar_sumo.records import (
     SimulationRuns,
     Trace,
 )
-from safevar_sumo.scenarios import VUT, Lane, Point, Scene
+from safevar_sumo.scenarios import VUT, Point, Scenario, Scene, TrackScenario, WorldScenario
 from safevar_sumo.scenarios.base import Frame
-from safevar_sumo.scenarios.target import TargetTest
-from safevar_sumo.sumo.bodies import Contacts, Motion, World
+from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
-from safevar_sumo.sumo.network import copied_network, stage_network, stage_networks
-from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, TargetObserver, encounter_of, per_vehicle
+from safevar_sumo.sumo.lane_world import LaneWorld
+from safevar_sumo.sumo.network import copied_network, stage_networks
+from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
+from safevar_sumo.sumo.stage import Stage
+from safevar_sumo.sumo.stage_world import StageWorld, start_frame
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.sumo.world import Api, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
@@ -91,7 +94,7 @@ def drive_all(
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
     The result holds the runs at the first point, then the runs at the second point, and so on. Several points must have
-    recorded scenes of one road; SUMO simulates only one point at once. `listen` is called with what the ADS observes
+    scenarios of tracks; SUMO simulates only one point at once. `listen` is called with what the ADS observes
     at every sample.
 
     Raises
@@ -103,18 +106,55 @@ def drive_all(
     """
     points, n, (fleet, vehicles) = system.points, len(settings), system.at_encounters(settings)
     with user_errors(system.source):
+        stage = stage_of(system, settings)
         if not is_recorded(system, engine):
-            with open_points_world(system, settings) as sumo_world:
-                return drive(fleet, vehicles, sumo_world, listen=listen)
-        scenes = [scene for scene in system.scenes.of(points) if isinstance(scene, Recording)]
-        if fleet.points[0].scenario is not points[0].scenario:  # each encounter has a scene of its own
+            with open_points_world(system, settings, stage) as sumo_world:
+                observer = observer_of(fleet.points[0].scenario, sumo_world, stage)
+                return drive(fleet, vehicles, sumo_world, observer, listen)
+        if stage is not None:
+            lane = LaneWorld(stage, _start_speeds(fleet.points, n), stage.step)
+            return drive(fleet, np.tile(vehicles, (len(points), 1)), lane, stage, listen)
+        (scenario,) = (point.scenario for point in points if isinstance(point.scenario, WorldScenario))
+        (scene,) = (scene for scene in system.scenes.of([scenario]) if isinstance(scene, Recording))
+        size = n
+        if fleet.points[0].scenario is not scenario:  # each encounter has a scene of its own
             size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])
-            scenario = system.at_encounters(settings[::size])[0].scenario
-            world = RecordedWorld([scenes_of_encounters(scenes[0], scenario, n // size)], size)
-            return drive(fleet, vehicles, world, listen=listen)
-        targets = [point.scenario for point in points if isinstance(point.scenario, TargetTest)]
-        observer = TargetObserver(targets, scenes, n) if targets else None
-        return drive(fleet, np.tile(vehicles, (len(points), 1)), RecordedWorld(scenes, n), observer, listen)
+            encounters = system.at_encounters(settings[::size])[0].scenario
+            assert isinstance(encounters, WorldScenario)
+            scene = scenes_of_encounters(scene, encounters, n // size)
+        world = RecordedWorld([scene], size)
+        return drive(fleet, vehicles, world, observer_of(fleet.points[0].scenario, world, None), listen)
+
+
+def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> Observer:
+    """Who observes for the vehicles: the stage of tracks, or else the scenario itself."""
+    if stage is not None:
+        return stage
+    assert isinstance(scenario, WorldScenario)
+    return SceneObserver(scenario, world)
+
+
+def stage_of(system: System, settings: FloatArray) -> Stage | None:
+    """The bodies around N settings, shape (N, n), at every point; None if the scenario observes a world itself."""
+    n, size = len(settings), len(settings)
+    scenarios = [point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)]
+    if len(scenarios) < len(system.points):
+        return None
+    if len(system.characteristics.scenario):
+        size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])
+        scenario = system.at_encounters(settings[::size])[0].scenario
+        assert isinstance(scenario, TrackScenario)
+        scenarios = [scenario]
+    step = system.scenes.step_of(scenarios[0])
+    duration = max(float(np.max(scenario.duration)) for scenario in scenarios)
+    n_samples = round(duration / step) + 1
+    return Stage(scenarios, n * len(scenarios), size, n_samples=n_samples, step=step)
+
+
+def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
+    """The speeds at the start of n vehicles at each point."""
+    scenarios = (point.scenario for point in points)
+    return np.concatenate([np.zeros(n) + one.start_speed for one in scenarios if isinstance(one, TrackScenario)])
 
 
 def _vehicles_per_encounter(encounters: FloatArray) -> int:
@@ -123,20 +163,26 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
     return 2 if is_paired else 1
 
 
-def open_points_world(system: System, settings: FloatArray) -> AbstractContextManager[SumoWorld]:
+def open_points_world(system: System, settings: FloatArray, stage: Stage | None) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
     (point,), options, n = system.points, system.scenes.options, len(settings)
-    encounters = system.characteristics.scenario
-    if not len(encounters):
-        return open_world(copied_network(stage_network(point.scenario), n), n, options)
-    rows = settings[:, ~system.characteristics.of_vehicle].tolist()
-    points = [encounter(point, dict(zip(encounters.names, row, strict=True))) for row in rows]
-    return open_varied_world(stage_networks([point.scenario for point in points]), options)
+    encounters, scenarios = system.characteristics.scenario, [point.scenario]
+    if len(encounters):
+        rows = settings[:, ~system.characteristics.of_vehicle].tolist()
+        scenarios = [encounter(point, dict(zip(encounters.names, row, strict=True))).scenario for row in rows]
+    networks = stage_networks(scenarios)
+    create: Callable[[Api, int], SumoWorld] = SumoWorld
+    if stage is not None:
+        speeds = _start_speeds(system.at_encounters(settings)[0].points, n)
+        create = partial(StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], options))
+    if len(encounters):
+        return open_varied_world(networks, options, create)
+    return open_world(copied_network(networks[0], n), n, options, create)
 
 
 @np.errstate(all="ignore")
 def drive(
-    system: System, settings: FloatArray, world: World, observer: Observer | None = None, listen: Listener | None = None
+    system: System, settings: FloatArray, world: World, observer: Observer, listen: Listener | None = None
 ) -> SimulationRuns:
     """Simulate vehicles in a world that has not taken its first step; see `drive_all`.
 
@@ -144,8 +190,7 @@ def drive(
     """
     vehicle, step, n, outcomes = system.vehicle, world.step_length, len(settings), _Outcomes(len(settings))
     prepared, ads, motion = enter(system, settings, world)
-    observer = observer or SceneObserver(system.points[0].scenario, world)
-    vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
+    vehicle_length, frame = world.vehicle_length(VUT), world.frame
     state = vehicle.at_start(prepared, motion.speeds)
     ads_memory = ads.start(n, system.nominal, step)
     size = n // len(system.points)
@@ -183,7 +228,7 @@ def drive(
     trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
         trace=trace,
-        encounter=encounter_of(system.points, trace),
+        encounter=observer.encounter(trace),
         outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
         contact=contacts.first,

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import TOUCH_OVERLAP, BoolArray, Contact, FloatArray, IntArray
-from safevar_sumo.scenarios import Scenario, Scene
-from safevar_sumo.scenarios.base import NETWORK_KEY, ScenarioMemory, World as ScenariosWorld
+from safevar_sumo.records import TOUCH_OVERLAP, BoolArray, Contact, FloatArray, IntArray, Quantity
+from safevar_sumo.scenarios import Scene, Track, WorldScenario
+from safevar_sumo.scenarios.base import NETWORK_KEY, Frame, ScenarioMemory, World as ScenariosWorld
+from safevar_sumo.scenarios.tracks import corners_of
 from safevar_sumo.vehicles import SumoType
 
 
@@ -46,7 +47,7 @@ class Body(NamedTuple):
         return cls._make(np.array(column) for column in zip(*bodies, strict=True))
 
 
-class Track(NamedTuple):
+class Film(NamedTuple):
     """How an actor moves: at every sample the position of its front bumper, or of a person [m], its direction, a unit
     vector, and its speed [m/s]; shape (T, 5), or (T, N, 5) in N copies.
 
@@ -72,14 +73,15 @@ class Track(NamedTuple):
         return np.arctan2(self.motion[..., 3], self.motion[..., 2])
 
 
-class World(ScenariosWorld, Protocol):
-    """N vehicles under test in a scene that SUMO simulates or that was recorded; scenarios see it as theirs."""
+class World(Protocol):
+    """N vehicles under test: on a lane, in a recorded scene or in SUMO."""
 
     n: int
     step_length: float
 
-    def begin(self, scenario: Scenario) -> ScenarioMemory:
-        """Start a scenario before the first step, and return its memory."""
+    @property
+    def frame(self) -> Frame:
+        """The coordinates in which the vehicles' positions are along their lane."""
 
     def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
         """Put the vehicles onto the road and return their first motion; called once, first.
@@ -99,7 +101,21 @@ class World(ScenariosWorld, Protocol):
         and those of the actors, both in columns.
         """
 
+    def vehicle_length(self, actor: str) -> float:
+        """Length of a vehicle [m]."""
 
+
+class SceneWorld(World, ScenariosWorld, Protocol):
+    """N vehicles in a scene that SUMO simulates or that was recorded; scenarios see it as theirs."""
+
+    def begin(self, scenario: WorldScenario) -> ScenarioMemory:
+        """Start a scenario before the first step, and return its memory."""
+
+
+TOUCH = 1e-3
+"""Overlap up to which bodies only touch [m], as in SUMO: an impact that is due exactly at a sample must not depend on
+the last bit.
+"""
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 COSINE_DECIMALS = 9
 """Decimals of a cosine between directions, which SUMO states in degrees."""
@@ -161,6 +177,35 @@ class Contacts:
         self.first.side[copies] = side
         self.first.speed[copies] = other.speed * np.round((own.along * other.along).sum(axis=1), COSINE_DECIMALS)
         self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
+
+
+def distance_between(body: Track, middle: FloatArray, length: float, width: float) -> FloatArray:
+    """Distances [m] of a body and of vehicles of this size in the lane's middle, with their middles at `middle`: the
+    least distance of a corner of either rectangle to the other one; 0 if they overlap.
+    """
+    nearest = np.full(middle.shape, np.inf)
+    for x, y in corners_of(body):
+        nearest = np.minimum(nearest, _outside(x - middle, y, length, width))
+    for end, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        x, y = middle + end * length / 2 - body.x, side * width / 2 - body.y
+        lengthwise, across = x * body.along + y * body.left, y * body.along - x * body.left
+        nearest = np.minimum(nearest, _outside(lengthwise, across, body.length, body.width))
+    # Bodies that cross each other have no corner in the other one.
+    x, cosine, sine = body.x - middle, np.abs(body.along), np.abs(body.left)
+    overlaps = (
+        (np.abs(x) < (length + body.length * cosine + body.width * sine) / 2)
+        & (np.abs(body.y) < (width + body.length * sine + body.width * cosine) / 2)
+        & (np.abs(x * body.along + body.y * body.left) < (body.length + length * cosine + width * sine) / 2)
+        & (np.abs(body.y * body.along - x * body.left) < (body.width + length * sine + width * cosine) / 2)
+    )
+    return np.where(overlaps, 0.0, nearest)
+
+
+def _outside(x: Quantity, y: Quantity, length: Quantity, width: Quantity) -> Quantity:
+    """How far points are outside a rectangle around the origin [m]."""
+    dx = np.maximum(np.abs(x) - length / 2, 0.0)
+    dy = np.maximum(np.abs(y) - width / 2, 0.0)
+    return np.sqrt(dx * dx + dy * dy)
 
 
 def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:

@@ -17,9 +17,9 @@ import numpy as np
 from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.scenarios import SEARCHABLE, Point, Scenario, searchable_in
+from safevar_sumo.scenarios import SEARCHABLE, Point, TrackScenario, WorldScenario, searchable_in
 from safevar_sumo.study import Study, unit_text
-from safevar_sumo.sumo.bodies import Track
+from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import stage_networks
 from safevar_sumo.sumo.recording import Recording
 
@@ -48,7 +48,11 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
     for point in points:
         try:
-            stage_networks([encounter(point, corner).scenario for corner in corners])
+            scenarios = [encounter(point, corner).scenario for corner in corners]
+            stage_networks(scenarios)
+            for scenario in scenarios:
+                if isinstance(scenario, TrackScenario):
+                    scenario.tracks(np.zeros((1, 1)))
         except InputError as error:
             raise InputError(source, f"scenario.search: {error.problem}", error.legal or "narrower domains") from None
 
@@ -64,7 +68,7 @@ def encounter(point: Point, values: Mapping[str, Any]) -> Point:
     return point._replace(scenario=scenario, weather=weather)
 
 
-def scenes_of_encounters(recording: Recording, scenario: Scenario, n: int) -> Recording:
+def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
     layout = scenario.layout(recording, recording.step_length, samples)
@@ -87,7 +91,7 @@ def scenes_of_encounters(recording: Recording, scenario: Scenario, n: int) -> Re
     )
 
 
-def _extended(track: Track, samples: int) -> Track:
+def _extended(track: Film, samples: int) -> Film:
     """The track of an actor who stands, for at least this number of samples."""
     missing = max(samples - len(track.motion), 0)
     return track._replace(motion=np.pad(track.motion, ((0, missing), (0, 0)), mode="edge"))

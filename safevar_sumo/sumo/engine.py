@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
@@ -54,8 +54,11 @@ class Engine(StrEnum):
 
 
 @contextmanager
-def open_world(files: CopiedNetwork, n: int, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an error.
+def open_world(
+    files: CopiedNetwork, n: int, options: Sequence[str] = (), create: Callable[[Api, int], SumoWorld] = SumoWorld
+) -> Iterator[SumoWorld]:
+    """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an error. `create` makes
+    the world of SUMO's API and the number of copies.
 
     Raises
     ------
@@ -69,13 +72,15 @@ def open_world(files: CopiedNetwork, n: int, options: Sequence[str] = ()) -> Ite
             libsumo.start(["sumo", *sumo_options(files), *options])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
-        yield SumoWorld(libsumo, n)
+        yield create(libsumo, n)
 
 
 @contextmanager
-def open_varied_world(networks: Sequence[Network], options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+def open_varied_world(
+    networks: Sequence[Network], options: Sequence[str] = (), create: Callable[[Api, int], SumoWorld] = SumoWorld
+) -> Iterator[SumoWorld]:
     """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
-    with varied_network(networks) as files, open_world(files, len(networks), options) as world:
+    with varied_network(networks) as files, open_world(files, len(networks), options, create) as world:
         yield world
 
 

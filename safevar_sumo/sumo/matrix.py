@@ -24,14 +24,12 @@ from safevar_sumo.records import (
     SimulationRuns,
     finite_or_none,
 )
-from safevar_sumo.scenarios import Point
-from safevar_sumo.scenarios.euro_ncap import KMH
-from safevar_sumo.scenarios.target import TargetTest
+from safevar_sumo.scenarios import Point, TrackScenario
+from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import drive_all, is_recorded, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
-from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_COPIES = 200
@@ -287,18 +285,25 @@ def study_at(study: Study, name: str, source: object) -> Study:
 
 
 def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
-    """Yield groups of at most `size` points whose recorded scenes may share a batch, sorted by duration; a point whose
-    scenario observes no recorded target is alone.
+    """Yield groups of at most `size` points that may share a batch, sorted by duration: those whose scenarios are
+    tracks of equally many bodies around equal vehicles; any other point is alone.
     """
     groups: dict[Hashable, list[Point]] = {}
-    for point, scene in zip(system.points, system.scenes.of(system.points), strict=True):
-        has_target = isinstance(point.scenario, TargetTest)
-        key = scene.batch_key if has_target and isinstance(scene, Recording) else point.name
-        groups.setdefault(key, []).append(point)
+    for point in system.points:
+        groups.setdefault(_batch_key(point), []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), size):
             yield tuple(group[start : start + size])
+
+
+def _batch_key(point: Point) -> Hashable:
+    """Points with the same key may share a batch."""
+    scenario = point.scenario
+    if not isinstance(scenario, TrackScenario):
+        return point.name
+    n_bodies = len(scenario.tracks(np.zeros((1, 1))))
+    return scenario.vut_length, scenario.vut_width, scenario.sensor_setback, n_bodies, scenario.network
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:

@@ -8,15 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
-from safevar_sumo.scenarios import Point, Scenario, Scene
-from safevar_sumo.scenarios.base import Frame
-from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, scene_of
+from safevar_sumo.scenarios import Scene, WorldScenario
+from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.bodies import Motion, World
-from safevar_sumo.sumo.recorded_world import RecordedWorld
-from safevar_sumo.sumo.recording import Recording
+from safevar_sumo.sumo.bodies import Motion, SceneWorld
 
 OCCLUDED_VALUES = np.array([[np.inf], [np.inf], [0.0], [0.0]])
 """Gap and lateral position [m], lateral speed and speed [m/s] of an occluded obstacle."""
@@ -27,6 +23,9 @@ class Observer(Protocol):
 
     def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
         """The scene now; must be called at every sample."""
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """The geometry of the encounters, from which the metrics are computed."""
 
 
 class Perception:
@@ -64,61 +63,22 @@ class Perception:
 
 
 class SceneObserver:
-    """Observes the obstacle of a scenario in a world."""
+    """Observes the obstacle of a scenario in a world, once the vehicles are there."""
 
-    def __init__(self, scenario: Scenario, world: World) -> None:
+    def __init__(self, scenario: WorldScenario, world: SceneWorld) -> None:
         self._scenario, self._world = scenario, world
-        self._memory = world.begin(scenario)
+        self._has_begun = False
+        self._memory: ScenarioMemory = None
 
     def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
+        if not self._has_begun:
+            self._memory = self._world.begin(self._scenario)
+            self._has_begun = True
         scene, self._memory = self._scenario.observe(self._world, self._world.step_length, self._memory)
         return scene
 
-
-class TargetObserver:
-    """Observes the targets of K recorded scenes with `size` vehicles each, whose motion it computes once."""
-
-    def __init__(self, scenarios: Sequence[TargetTest], recordings: Sequence[Recording], size: int) -> None:
-        self._step_length, self._size, self._sample = recordings[0].step_length, size, -1
-        at_samples = [
-            scenario.at_all_samples(RecordedWorld.at_all_samples(recording), recording.step_length)
-            for scenario, recording in zip(scenarios, recordings, strict=True)
-        ]
-        motions, targets, absences = zip(*at_samples, strict=True)
-        coordinates = np.array([(*motion.frame.origin, *motion.frame.direction) for motion in motions]).T.tolist()
-        x, y, along_x, along_y = (per_vehicle(values, size) for values in coordinates)
-        self._frame = Frame((x, y), (along_x, along_y))
-        self._constants = EncounterConstants._make(
-            per_vehicle(column, size) for column in zip(*(motion.constants for motion in motions), strict=True)
-        )
-        length = max(map(len, absences))
-        self._target = [_table(column, length) for column in zip(*targets, strict=True)]
-        self._absence = _table(absences, length)
-        self._has_approached = np.zeros(size * len(recordings), dtype=bool)
-
-    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
-        """The scene of all vehicles now; raises `SimulationError` if the target of an open run is not on the road."""
-        self._sample += 1
-        absence = self._absence[self._sample]
-        if absence.any() and (absence & is_open.reshape(-1, self._size).any(axis=1)).any():
-            raise SimulationError(
-                f"SUMO failed: the target is not on the road at {self._sample * self._step_length:g} s"
-            )
-        target = Target._make(
-            column if column.ndim == 0 else column[self._sample].repeat(self._size) for column in self._target
-        )
-        front = self._frame.along(motion.fronts)
-        scene, self._has_approached = scene_of(self._constants, target, front, motion.speeds, self._has_approached)
-        return scene
-
-
-def encounter_of(points: Sequence[Point], trace: Trace) -> Encounter:
-    """The geometry of the encounters at all points, from which the metrics are computed."""
-    if len(points) == 1:
-        return points[0].scenario.encounter(trace)
-    size = trace.speed.shape[1] // len(points)
-    encounters = [point.scenario.encounter(trace.of(slice(k * size, (k + 1) * size))) for k, point in enumerate(points)]
-    return Encounter(*(np.concatenate(columns, axis=1) for columns in zip(*encounters, strict=True)))
+    def encounter(self, trace: Trace) -> Encounter:
+        return self._scenario.encounter(trace)
 
 
 def per_vehicle(values: Sequence[Any], size: int) -> Any:
@@ -127,13 +87,3 @@ def per_vehicle(values: Sequence[Any], size: int) -> Any:
     """
     is_shared = len(values) == 1 or all(value == values[0] for value in values)
     return values[0] if is_shared else np.repeat(values, size)
-
-
-def _table(columns: Sequence[Any], length: int) -> Any:
-    """K columns of samples, padded with their last values, as a table of shape (length, K); a scalar if all are the
-    same scalar.
-    """
-    if all(np.ndim(column) == 0 and column == columns[0] for column in columns):
-        return np.asarray(columns[0])
-    columns = [np.broadcast_to(column, length) if np.ndim(column) == 0 else column for column in columns]
-    return np.stack([np.pad(column, (0, length - len(column)), mode="edge") for column in columns], axis=1)

@@ -14,8 +14,8 @@ import numpy as np
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, Lane, Scenario
-from safevar_sumo.scenarios.base import ScenarioMemory
+from safevar_sumo.scenarios import VUT, Lane, WorldScenario
+from safevar_sumo.scenarios.base import Frame, ScenarioMemory
 from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.vehicles import SumoType
@@ -61,14 +61,6 @@ class RecordedWorld:
         self._last_coordinates = self._last_fronts @ self._scene.along
         self._starts, self._ends = self._extents()
 
-    @classmethod
-    def at_all_samples(cls, recording: Recording) -> RecordedWorld:
-        """A world of T vehicles that stand, vehicle k at sample k of the scene."""
-        n_samples = max(len(track.motion) for track in recording.tracks.values())
-        world = cls([recording], n_samples)
-        world.sample = np.arange(n_samples)
-        return world
-
     def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
         """All vehicles have departed, and their types do not limit the commanded speeds."""
         return self._moved(np.ones(self.n, dtype=bool))
@@ -99,7 +91,7 @@ class RecordedWorld:
     def _moved(self, is_open: BoolArray) -> Motion:
         return Motion(self.vehicle_positions(VUT), self._speeds, self._hits(is_open))
 
-    def begin(self, scenario: Scenario) -> ScenarioMemory:
+    def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory."""
         return scenario.begin(self)
 
@@ -125,6 +117,10 @@ class RecordedWorld:
 
     def lane(self, lane: str) -> Lane:
         return self._scene.lane(lane)
+
+    @property
+    def frame(self) -> Frame:
+        return Frame.through_origin(self.lane_of(VUT))
 
     def lane_of(self, vehicle: str) -> Lane:
         return self.lane(self._scene.first_lanes[vehicle])

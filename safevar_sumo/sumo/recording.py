@@ -6,7 +6,7 @@ While SUMO plays a scene, this vehicle stays at its start; `recorded_world.py` m
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -17,17 +17,27 @@ import numpy as np
 from msgspec import msgpack, to_builtins
 
 from safevar_sumo.records import FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, Lane, Point, Scenario
+from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
 from safevar_sumo.scenarios.base import lane_through
-from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.sumo.bodies import Track
+from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.network import Network, copied_network, is_shipped, stage_networks, sumo_version
+from safevar_sumo.sumo.network import (
+    OPTIONS_FILE,
+    Network,
+    copied_network,
+    is_shipped,
+    open_network,
+    options_of,
+    stage_networks,
+    sumo_version,
+)
 from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
 
 SCENES_FILE = "scenes.msgpack"
+SUMOS_STEP = 1.0
+"""SUMO's time step, unless an option sets another one [s]."""
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 STRAIGHTNESS = 1e-6
@@ -82,13 +92,7 @@ class Recording:
     along: FloatArray
     lanes: dict[str, tuple[tuple[float, float], ...]]
     first_lanes: dict[str, str]
-    tracks: dict[str, Track]
-
-    @property
-    def batch_key(self) -> tuple[Hashable, ...]:
-        """Vehicles in scenes with the same key may share a batch."""
-        way = (column.tobytes() for column in self.way)
-        return self.step_length, self.length, self.width, self.along.tobytes(), *way
+    tracks: dict[str, Film]
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id."""
@@ -101,11 +105,18 @@ class Scenes:
     """
 
     def __init__(self, step_length: float | None = None) -> None:
+        self._step_length = step_length
         self.options = () if step_length is None else ("--step-length", repr(step_length))
-        self._recorded: dict[Scenario, Recording | str] = {}
+        self._recorded: dict[WorldScenario, Recording | str] = {}
 
-    def of(self, points: Sequence[Point]) -> list[Recording | str]:
-        """Each point's scene, or the reason why SUMO must simulate it.
+    def step_of(self, scenario: Scenario) -> float:
+        """Time step of a scenario [s]."""
+        if self._step_length is not None:
+            return self._step_length
+        return float(options_of(open_network(scenario.network).path(OPTIONS_FILE)).get("step-length", SUMOS_STEP))
+
+    def of(self, scenarios: Sequence[WorldScenario]) -> list[Recording | str]:
+        """Each scenario's scene, or the reason why SUMO must simulate it.
 
         SUMO plays a scene once; scenes of shipped scenarios are also kept in the user's cache folder.
 
@@ -114,19 +125,20 @@ class Scenes:
         SimulationError
             If SUMO fails.
         """
-        scenarios = dict.fromkeys(point.scenario for point in points if point.scenario not in self._recorded)
-        reasons = {scenario: _reason_against_recording(scenario) for scenario in scenarios}
+        missing = dict.fromkeys(scenario for scenario in scenarios if scenario not in self._recorded)
+        reasons = {scenario: _reason_against_recording(scenario) for scenario in missing}
         new = [scenario for scenario, reason in reasons.items() if not reason]
         keys = [(scenario, network, self.options) for scenario, network in zip(new, stage_networks(new), strict=True)]
         self._recorded |= reasons | dict(zip(new, _recordings_of(keys) if keys else [], strict=True))
-        return [self._recorded[point.scenario] for point in points]
+        return [self._recorded[scenario] for scenario in scenarios]
 
     def reason_for_sumo(self, points: Sequence[Point]) -> str:
         """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; "" if scenes suffice."""
-        return next((scene for scene in self.of(points) if isinstance(scene, str)), "")
+        played = [point.scenario for point in points if isinstance(point.scenario, WorldScenario)]
+        return next((scene for scene in self.of(played) if isinstance(scene, str)), "")
 
 
-def _reason_against_recording(scenario: Scenario) -> str:
+def _reason_against_recording(scenario: WorldScenario) -> str:
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
     # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
@@ -135,7 +147,7 @@ def _reason_against_recording(scenario: Scenario) -> str:
     return ""
 
 
-_Key = tuple[Scenario, Network, tuple[str, ...]]
+_Key = tuple[WorldScenario, Network, tuple[str, ...]]
 """A scenario, its network, and additional options of SUMO."""
 
 
@@ -176,7 +188,7 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     return np.frombuffer(content).reshape(shape)
 
 
-def _play(scenario: Scenario, network: Network, options: tuple[str, ...]) -> Recording | str:
+def _play(scenario: WorldScenario, network: Network, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, options) as world:
         world.enter(None)
@@ -199,15 +211,12 @@ def _play(scenario: Scenario, network: Network, options: tuple[str, ...]) -> Rec
         )
 
 
-def _tracks(scenario: Scenario, world: SumoWorld) -> dict[str, Track]:
+def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
     """How all actors except the vehicle under test move."""
-    length, tracks, memory = round(scenario.duration / world.step_length) + 1, dict[str, Track](), world.begin(scenario)
+    length, tracks, memory = round(scenario.duration / world.step_length) + 1, dict[str, Film](), world.begin(scenario)
     for sample in range(length):
         world.film(tracks, sample, length)
-        if isinstance(scenario, TargetTest):
-            memory = scenario.move(world, world.step_length, memory)
-        else:
-            _, memory = scenario.observe(world, world.step_length, memory)
+        _, memory = scenario.observe(world, world.step_length, memory)
         if sample < length - 1:
             world.step(np.zeros(1), np.ones(1, dtype=bool))
     return {name: track._replace(motion=track.motion[:, 0]) for name, track in tracks.items() if name != VUT}

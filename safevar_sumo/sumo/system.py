@@ -21,8 +21,9 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, equals_clear, weather_of
+from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, TrackScenario, WorldScenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import check_fields
+from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
@@ -230,7 +231,8 @@ def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scen
     """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
     limit = margin_of(study, None)
     if scenario.centre_to_centre:
-        (scene,) = scenes.of([Point(scenario, weather_of("clear", study.source))])
+        assert isinstance(scenario, WorldScenario)
+        (scene,) = scenes.of([scenario])
         if isinstance(scene, str):
             raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
         world = RecordedWorld([scene], 1)
@@ -342,10 +344,11 @@ def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
 
 
 def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
-    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, Scenario)
+    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, TrackScenario, WorldScenario)
     scenario: Scenario = create()
     if member.code is not None:
-        check_fields(member.code, scenario)
+        further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
+        check_fields(member.code, scenario, **further)
     return _locate_network(scenario, lookup.folders)
 
 

@@ -11,13 +11,10 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
-from safevar_sumo.scenarios import VUT
-from safevar_sumo.scenarios.base import Frame
-from safevar_sumo.sumo.batch import enter, open_points_world
+from safevar_sumo.sumo.batch import enter, observer_of, open_points_world, stage_of
 from safevar_sumo.sumo.bodies import Contacts
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import batch_size, simulate_groups
-from safevar_sumo.sumo.perception import SceneObserver
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 
@@ -27,6 +24,7 @@ COMPARED = ("position", "gap", "lateral", "obstacle_speed")
 """Quantities of a trace that SUMO must repeat [m, m/s]."""
 
 
+@np.errstate(all="ignore")
 def drive_again(
     system: System, settings: FloatArray, runs: SimulationRuns, watch: Callable[[SumoWorld], None] = lambda world: None
 ) -> dict[str, FloatArray]:
@@ -39,11 +37,12 @@ def drive_again(
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
     fleet, vehicles = system.at_encounters(settings)
     point = fleet.points[0]
-    with user_errors(system.source), open_points_world(system, settings) as world:
+    stage = stage_of(system, settings)
+    with user_errors(system.source), open_points_world(system, settings, stage) as world:
         _, _, motion = enter(fleet, vehicles, world)
-        observer, is_open = SceneObserver(point.scenario, world), np.ones(n, dtype=bool)
+        observer = observer_of(point.scenario, world, stage)
+        is_open, frame = np.ones(n, dtype=bool), world.frame
         contacts = Contacts(n, np.full(n, point.scenario.test_speed is not None))
-        frame = Frame.through_origin(world.lane_of(VUT))
         for sample in range(len(trace.time)):
             watch(world)
             scene = observer.observe(motion, is_open)

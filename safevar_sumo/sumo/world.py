@@ -11,9 +11,9 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
-from safevar_sumo.scenarios import VUT, Lane, Scenario
-from safevar_sumo.scenarios.base import ScenarioMemory, lane_through
-from safevar_sumo.sumo.bodies import Body, Motion, Track
+from safevar_sumo.scenarios import VUT, Lane, WorldScenario
+from safevar_sumo.scenarios.base import Frame, ScenarioMemory, lane_through
+from safevar_sumo.sumo.bodies import Body, Film, Motion
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
@@ -114,7 +114,7 @@ class SumoWorld:
             self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
             self.api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
 
-    def begin(self, scenario: Scenario) -> ScenarioMemory:
+    def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory.
 
         Raises
@@ -213,12 +213,12 @@ class SumoWorld:
             id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
         }
 
-    def film(self, tracks: dict[str, Track], sample: int, length: int) -> None:
+    def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
         """Write the motion of all actors on the road, by name, at one of `length` samples."""
         for id_, (x, y, angle) in self.actor_poses().items():
             copy, name = copy_and_name(id_)
             if name not in tracks:
-                tracks[name] = Track(np.full((length, self.n, 5), np.nan), *self.actor_size(id_))
+                tracks[name] = Film(np.full((length, self.n, 5), np.nan), *self.actor_size(id_))
             tracks[name].motion[sample, copy] = x, y, *direction_of(angle), self._domain_of(id_).getSpeed(id_)
 
     def actor_size(self, id_: str) -> tuple[bool, float, float]:
@@ -231,6 +231,10 @@ class SumoWorld:
 
     def lane(self, lane: str) -> Lane:
         return lane_through(lane, self.api.lane.getShape(copied_id(0, lane)))
+
+    @property
+    def frame(self) -> Frame:
+        return Frame.through_origin(self.lane_of(VUT))
 
     def lane_of(self, vehicle: str) -> Lane:
         return self.lane(copy_and_name(self.api.vehicle.getLaneID(self.ids(vehicle)[0]))[1])

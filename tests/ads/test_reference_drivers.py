@@ -46,7 +46,7 @@ def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """libsumo with a vehicle of every model, all with SUMO's default parameters of a passenger car, cruising at
     13.89 m/s.
     """
-    folder = NETWORKS / "car_to_car"
+    folder = NETWORKS / "along"
     traffic = tmp_path_factory.mktemp("models") / "traffic.rou.xml"
     kinds = [
         f'<vType id="{name}" carFollowModel="{name}" minGap="2.5" tau="1" accel="2.6" decel="4.5" '

@@ -51,7 +51,7 @@ VEHICLE, SCENARIO, METRIC, OBJECTIVE, ALGORITHM = (
     FILES[f"{file}.py"].replace(name, "Mine")
     for file, name in (
         ("my_vehicle", "Cart"),
-        ("my_scenario", "Wall"),
+        ("my_scenario", "Trailer"),
         ("my_metrics", "JERK"),
         ("my_objective", "MEAN"),
         ("my_search", "Halving"),
@@ -139,7 +139,7 @@ DEFECTS = {
     "vehicle maximum": planted(
         "vehicle", "alone", VEHICLE, "* command.throttle -", "* np.max(state.speed + 1) -", ALONE
     ),
-    "scenario truth values": planted("scenario", "contract", SCENARIO, "gap < -100)", "gap)", "returned over"),
+    "scenario with a text": planted("scenario", "contract", SCENARIO, "self.distance, 0.0", "'far', 0.0", "returned x"),
     "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO, with "),
     "metric over runs": planted(
         "metric", "alone", METRIC, "    return np.max(", "    jerk = jerk - np.mean(jerk)\n    return np.max(", ALONE

@@ -82,8 +82,8 @@ def test_no_option_of_a_users_file_decides_what_a_collision_is(options: str, tmp
     assert hit.metrics["safety_degree"] == pytest.approx(-2.80, abs=0.005)
 
 
-def test_a_crossing_car_is_hit_on_a_junction_that_the_users_file_does_not_check(tmp_path: Path) -> None:
-    network = own_network(tmp_path / "crossing", "junction")
+def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> None:
+    network = own_network(tmp_path / "road", "along")
     set_options(network, OPTIONS["junctions unchecked"])
     parameters = {"network": str(network), "test": "CCCscp", "speed": 50}
     scenario = {"model": "crossing", "parameters": parameters}

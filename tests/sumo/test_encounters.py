@@ -20,7 +20,7 @@ from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SEARCHABLE
-from safevar_sumo.scenarios.euro_ncap import KMH
+from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
@@ -266,7 +266,6 @@ MISTAKES = {
     "pure": ({"road_friction": domain(0, 1, "-", 1)}, r"a part of \[0\.1, 1\.2\]$"),
     "fixed": ({"impact_location": PLACE}, r"scenario\.parameters\.impact_location = 25\.0 fixes it"),
     "impossible": ({"target_speed": domain(3, 8, "km/h")}, "needs .* s to the impact"),
-    "runner": ({"target_speed": domain(20, 30, "km/h")}, "target_speed = 30 km/h of a person on foot"),
     "vehicle": ({"payload": domain(3, 8, "kg")}, "a characteristic of the vehicle"),
     "key": ({"speed": {**SPEED, "weight": 2}}, "there is no such key"),
 }

@@ -80,10 +80,10 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 ) -> None:
     """In an empty cache: SUMO plays the scene, and the next process reads the file."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
-    points = assemble(load_study("sun")).points
+    scenario = assemble(load_study("sun")).scenario
 
     def scene() -> str:
-        return repr(Scenes().of(points))
+        return repr(Scenes().of([scenario]))
 
     played = scene()
     assert [*tmp_path.glob("networks/scenes-*/scenes.msgpack")]
@@ -92,7 +92,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
-    scenario = SCENARIOS["crossing"](network="my_town")
+    scenario = SCENARIOS["pedestrian_crossing"](network="my_town")
     assert "my_town" in Scenes().reason_for_sumo([Point(scenario, weather_of("clear", "study"))])
 
 

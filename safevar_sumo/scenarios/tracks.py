@@ -1,0 +1,206 @@
+"""A scenario is who moves how: tracks of bodies, in coordinates of the vehicle's lane.
+
+`x` leads along the lane and `y` to its left; the front of the vehicle under test is at (0, 0) at the start. What is
+seen, measured and hit follows from the tracks (`sumo/stage.py`), so no scenario needs to know a road.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
+from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
+from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Roads, Scenario, XmlChanges, as_text
+
+KMH = 1 / KMH_PER_MS
+"""m/s per km/h."""
+VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
+"""Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
+
+
+class BodySize(NamedTuple):
+    """Size of a body [m]: length in the direction in which it faces, width across."""
+
+    length: float
+    width: float
+
+
+BODIES = {
+    "adult": BodySize(0.6, 0.5),
+    "child": BodySize(0.711, 0.298),
+    "cyclist": BodySize(1.9, 0.5),
+    "motorcyclist": BodySize(2.1, 0.8),
+    "car": BodySize(4.023, 1.712),
+}
+"""Bounding boxes of Euro NCAP's targets, including riders, by kind [m]."""
+MAX_LENGTH = 100.0
+"""Largest size of a vehicle [m]."""
+PERSONS = ("adult", "child")
+"""Kinds of bodies that are persons in SUMO; all others are vehicles."""
+SCREEN = "screen"
+"""Kind of a body that only hides others: it is neither hit nor in SUMO."""
+
+
+class Track(NamedTuple):
+    """How a body moves; every quantity is a number or an array that broadcasts to (T, N): what is the same in all N
+    encounters has the shape (T, 1).
+
+    Attributes
+    ----------
+    name
+        The body's name, of which a scenario has one each.
+    kind
+        A kind of `BODIES`, `screen`, or any other word, such as `van`.
+    length, width
+        Size in the direction in which the body faces, and across [m].
+    x, y
+        The body's middle [m].
+    along, left
+        The direction in which it faces, a unit vector. (No sines in tracks: their last bits differ between machines.)
+    speed
+        Its speed in this direction [m/s].
+    """
+
+    name: str
+    kind: str
+    length: Quantity
+    width: Quantity
+    x: Quantity
+    y: Quantity
+    along: Quantity
+    left: Quantity
+    speed: Quantity
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        kind: str,
+        x: Quantity,
+        y: Quantity,
+        vx: Quantity = 0.0,
+        vy: Quantity = 0.0,
+        size: tuple[float, float] | None = None,
+    ) -> Track:
+        """A body with these velocities along the lane and to its left [m/s] that faces where it moves, and along the
+        lane while it stands; without a `size` it has that of its kind.
+        """
+        length, width = BODIES[kind] if size is None else size
+        speed = np.sqrt(np.square(vx) + np.square(vy))
+        moves = speed > 0
+        divisor = np.where(moves, speed, 1.0)
+        along = np.where(moves, vx / divisor, 1.0)
+        left = np.where(moves, vy / divisor, 0.0)
+        return cls(name, kind, length, width, x, y, along, left, speed)
+
+
+def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
+    """Distances [m] covered since the first of T `times`, shape (T, 1) [s], at speeds that are linear in between."""
+    at_times = speeds + np.zeros_like(times)
+    covered = (at_times[1:] + at_times[:-1]) / 2 * (times[1:] - times[:-1])
+    return np.concatenate([np.zeros_like(at_times[:1]), np.add.accumulate(covered, axis=0)])
+
+
+def first_in_strip(body: Track, half_width: float) -> Quantity:
+    """Position along the lane [m] of the first point of a body in the strip of this half width around the lane's
+    middle; of a body beside the strip that of its first corner.
+    """
+    corners = corners_of(body)
+    first = np.full(np.broadcast_shapes(*(np.shape(value) for corner in corners for value in corner)), np.inf)
+    for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
+        first = np.where(np.abs(y) <= half_width, np.minimum(first, x), first)
+        for side in (-half_width, half_width):
+            crosses = (np.minimum(y, to_y) < side) & (side < np.maximum(y, to_y))
+            share = (side - y) / np.where(crosses, to_y - y, 1.0)
+            first = np.where(crosses, np.minimum(first, x + (to_x - x) * share), first)
+    beside = np.minimum.reduce(np.broadcast_arrays(*(x for x, _ in corners)))
+    return np.where(np.isinf(first), beside, first)[()]
+
+
+def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
+    """The four corners of a body, once around it [m]."""
+    half_length, half_width = body.length / 2, body.width / 2
+    return [
+        (
+            body.x + end * half_length * body.along - side * half_width * body.left,
+            body.y + end * half_length * body.left + side * half_width * body.along,
+        )
+        for end, side in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    ]
+
+
+def check_tracks(code: UserCode, method: str, tracks: Any, times: FloatArray) -> Sequence[Track]:
+    """Refuse what a user's scenario returns if it is no list of tracks, or if a track has no number."""
+    if not isinstance(tracks, list | tuple) or not all(isinstance(track, Track) for track in tracks) or not tracks:
+        raise code.wrong(method, quoted(tracks), "a list of safevar_sumo.scenarios.Track, of one at least")
+    for track in tracks:
+        for name, value in zip(Track._fields[2:], track[2:], strict=True):
+            if np.asarray(value).dtype.kind not in "biuf":
+                raise code.wrong(method, f"{name} = {quoted(value)} of {track.name!r}", "numbers")
+    return tracks
+
+
+LEGAL_FIELDS = {
+    "start_speed": Legal(0.0, MAX_TEST_SPEED),
+    "vut_length": Legal(0.0, MAX_LENGTH, above=True),
+    "vut_width": Legal(0.0, MAX_LENGTH, above=True),
+    "sensor_setback": Legal(0.0, MAX_LENGTH),
+}
+"""Legal numbers of a user's scenario of tracks, besides those of every scenario."""
+
+
+class TrackScenario(Scenario):
+    """A scenario whose actors move by tracks, whatever the vehicle under test does. Its fields are its parameters, each
+    a number or, where encounters are searched, an array of N.
+
+    Attributes
+    ----------
+    duration
+        Length of a run [s].
+    speed, start_speed
+        Speed of the vehicle at the start [km/h], and the same in m/s; a scenario may have either.
+    test_speed
+        See `Scenario`: with it a robot holds the speed, and only contacts of the vehicle's front are collisions.
+    vut_length, vut_width
+        The vehicle's body [m].
+    sensor_setback
+        Distance of the sensors behind the middle of the front bumper [m].
+    network
+        Where SUMO repeats runs and pictures show them: a straight lane on which the vehicle departs.
+    """
+
+    RETURNS: ClassVar[Mapping[str, Returned]] = {"tracks": Returned(then=check_tracks)}
+    reactive_actors = False
+    network = "along"
+    sensor_setback = 0.0
+    if TYPE_CHECKING:
+        speed: Any
+
+        @property
+        def vut_length(self) -> float: ...
+        @property
+        def vut_width(self) -> float: ...
+    else:
+        vut_length = VUT_LENGTH
+        vut_width = VUT_WIDTH
+
+    @property
+    def start_speed(self) -> Any:
+        """Speed of the vehicle at the start [m/s]."""
+        return self.speed * KMH
+
+    @abstractmethod
+    def tracks(self, times: FloatArray) -> Sequence[Track]:
+        """The bodies at T `times`, shape (T, 1) [s], which begin at 0."""
+
+    def actors(self, roads: Roads) -> XmlChanges:
+        """The vehicle under test, at its speed."""
+        return {
+            "vType[@id='vut']": {"length": as_text(self.vut_length), "width": as_text(self.vut_width)},
+            "vehicle[@id='vut']": {"departSpeed": as_text(self.start_speed)},
+        }

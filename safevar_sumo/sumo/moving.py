@@ -1,0 +1,143 @@
+"""Bodies of a scenario's tracks: what follows from a track alone, at every sample, before any vehicle moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import zip_longest
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from safevar_sumo.records import BoolArray, FloatArray, IntArray
+from safevar_sumo.scenarios import Track, TrackScenario
+from safevar_sumo.scenarios.tracks import SCREEN, first_in_strip
+
+TIE = 1e-6
+"""Margin of a body's sides [m]: a body that is exactly at an edge at a sample counts, whatever the last bit says."""
+LEAST_SINE = 1e-9
+"""Sine of an angle above which a body is rotated against the lane [-]."""
+NOBODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
+"""Who stands in for the bodies that other scenarios of the same batch have: far away."""
+Column = TypeVar("Column", FloatArray, BoolArray)
+BESIDE, IN_PATH = 1, 2
+"""Levels of a body that moves beside the vehicle's path, and of one that is ever in it; that of scenery is 0."""
+
+
+class Moving(NamedTuple):
+    """A body at T samples in M encounters; columns have the shapes (T or 1, M or 1): what does not vary has length 1.
+
+    Attributes
+    ----------
+    track
+        The body's track with such columns.
+    edge, far, half_width
+        Position along the lane of the first point in the vehicle's path, or of the body's rear, and of its far end;
+        half its extent across the lane [m].
+    vx, vy, least_vx, most_vx
+        Speeds along the lane and to its left; the least and largest speed along it from now on [m/s].
+    lateral, lateral_speed
+        Position across the lane, from the side that the body comes from, and its rate of change [m, m/s]: that of the
+        middle of its rear or front, or of the middle of who moves across.
+    is_in_path, is_cleared, is_avoidable
+        Whether it is in the vehicle's path; has left it for good; or stays in it to the end, so that a vehicle that is
+        never faster again has avoided it.
+    level
+        `IN_PATH`, `BESIDE` or 0; below 0 for a body that is not met at all.
+    """
+
+    track: Track
+    edge: FloatArray
+    far: FloatArray
+    half_width: FloatArray
+    vx: FloatArray
+    vy: FloatArray
+    least_vx: FloatArray
+    most_vx: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    is_in_path: BoolArray
+    is_cleared: BoolArray
+    is_avoidable: BoolArray
+    level: IntArray
+
+    @classmethod
+    def of(cls, track: Track, step: float, path: float) -> Moving:
+        """What follows from a track with columns; `path` is the width of the vehicle [m]."""
+        cosine, sine = np.abs(track.along), np.abs(track.left)
+        half_length = (track.length * cosine + track.width * sine) / 2
+        half_width = (track.length * sine + track.width * cosine) / 2
+        rear = track.x - half_length
+        edge = np.where(_rotated(track), first_in_strip(track, path / 2), rear) if _rotated(track).any() else rear
+        vx = slim(track.speed * track.along)
+        vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
+        is_in_path = slim((np.abs(track.y) < path / 2 + half_width + TIE) & (track.kind != SCREEN))
+        has_entered = np.maximum.accumulate(is_in_path, axis=0)
+        will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
+        lengthwise: FloatArray = track.y - np.sign(track.along) * track.left * track.length / 2
+        sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
+        level = np.where(is_in_path.any(axis=0), IN_PATH, np.where((track.speed > 0).any(axis=0), BESIDE, 0))
+        return cls(
+            track=track,
+            edge=edge,
+            far=track.x + half_length,
+            half_width=half_width,
+            vx=vx,
+            vy=vy,
+            least_vx=slim(_from_now_on(np.minimum, vx)),
+            most_vx=slim(_from_now_on(np.maximum, vx)),
+            lateral=slim(np.where(cosine > sine, lengthwise, track.y) * sign),
+            lateral_speed=slim(vy * sign),
+            is_in_path=is_in_path,
+            is_cleared=slim(has_entered & ~will_touch),
+            is_avoidable=slim(has_entered & is_in_path[-1]),
+            level=np.full_like(level, -1) if track.kind == SCREEN else level,
+        )
+
+    @property
+    def is_rotated(self) -> bool:
+        """Whether the body is ever rotated against the lane."""
+        return bool(_rotated(self.track).any())
+
+
+def _rotated(track: Track) -> BoolArray:
+    return np.asarray(np.minimum(np.abs(track.along), np.abs(track.left)) > LEAST_SINE)
+
+
+def _from_now_on(ufunc: np.ufunc, column: FloatArray) -> FloatArray:
+    """The least or largest value of a column from each sample on."""
+    return np.asarray(ufunc.accumulate(column[::-1], axis=0)[::-1])
+
+
+def slim(column: Column) -> Column:
+    """A column without the axes along which it does not vary."""
+    if len(column) > 1 and (column[1:] == column[:1]).all():
+        column = column[:1]
+    if column.shape[1] > 1 and (column[:, 1:] == column[:, :1]).all():
+        column = column[:, :1]
+    return column
+
+
+def row(column: Column, sample: int, group: IntArray | None) -> Column:
+    """A column at a sample: one value for all vehicles, or one for each; `group` is the encounter of each vehicle."""
+    values: Column = column[sample if len(column) > 1 else 0]
+    return values[group] if group is not None and len(values) > 1 else values
+
+
+def casts_of(scenarios: Sequence[TrackScenario], times: FloatArray) -> list[Track]:
+    """The bodies of K scenarios, or of one whose parameters are arrays, with columns; body b is that of all scenarios'
+    bodies b.
+    """
+    casts = [scenario.tracks(times) for scenario in scenarios]
+    return [_joined(tracks) for tracks in zip_longest(*casts, fillvalue=NOBODY)]
+
+
+def _joined(tracks: Sequence[Track]) -> Track:
+    """A body of K scenarios as one track with columns."""
+    columns = []
+    for values in zip(*(track[2:] for track in tracks), strict=True):
+        parts = [np.atleast_2d(np.asarray(value, dtype=float)) for value in values]
+        length = max(len(part) for part in parts)
+        widened = [np.broadcast_to(part, (length, part.shape[1])) for part in parts]
+        columns.append(slim(np.concatenate(widened, axis=1)))
+    first = next(track for track in tracks if track is not NOBODY)
+    return Track(first.name, first.kind, *columns)

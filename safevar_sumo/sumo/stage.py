@@ -1,0 +1,227 @@
+"""What vehicles under test see, meet and hit: once for all scenarios, from the geometry of bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Quantity, Trace
+from safevar_sumo.scenarios import Scene, Track, TrackScenario
+from safevar_sumo.sumo.bodies import TOUCH, Body, Motion, distance_between, find_overlaps
+from safevar_sumo.sumo.moving import TIE, Column, Moving, casts_of, row
+
+APPROACH_SPEED = 0.5
+"""Closing speed above which a vehicle approaches a body ahead [m/s]; once it is never faster again, it has avoided it.
+"""
+LEAST_DISTANCE = 1e-9
+"""Lower bound of a distance that is a divisor [m]."""
+LEAST_CLOSING_SPEED = 0.1
+"""Lower bound of a closing speed that is a divisor [m/s]."""
+OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
+"""What makes a body be seen only if there is no other [m of gap]: it is beside the way, hidden, passed, or scenery."""
+
+
+class Stage:
+    """The bodies around N vehicles, of which `size` at a time are in the same of K scenarios, or in the same encounter
+    of the only one, whose parameters are arrays.
+    """
+
+    def __init__(self, scenarios: Sequence[TrackScenario], n: int, size: int, *, n_samples: int, step: float) -> None:
+        first = scenarios[0]
+        self.length, self.width, self.setback = first.vut_length, first.vut_width, first.sensor_setback
+        times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
+        self.casts = casts_of(scenarios, times)
+        self.n, self.step = n, step
+        self.group: IntArray | None = np.repeat(np.arange(n // size), size) if 1 < size < n else None
+        bodies = [Moving.of(track, step, self.width) for track in self.casts]
+        level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
+        self._counts = [np.atleast_2d(body.level == level) for body in bodies]
+        # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
+        self._met = [k for k, body in enumerate(bodies) if body.level.max() >= min(level.max(), 1)]
+        self._bodies = bodies
+        self._ended = np.zeros((len(bodies), n_samples, self.n), dtype=bool)
+        # Who comes from beside has been approached as soon as it is in the path.
+        self._approached = [~self._row(body.is_in_path, 0) for body in bodies]
+        self._sample = 0
+        self._struck = np.full(self.n, -1)
+
+    def _row(self, column: Column, sample: int | None = None) -> Column:
+        return row(column, self._sample if sample is None else sample, self.group)
+
+    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
+        """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches a body sees it."""
+        front, speed = motion.fronts[:, 0], motion.speeds
+        over, seen = ALL_TRUE, []
+        for k in self._met:
+            body = self._bodies[k]
+            gap, closing = self._row(body.edge) - front, speed - self._row(body.vx)
+            is_passed = (self._row(body.far) < front - self.length) & (speed >= self._row(body.most_vx))
+            ended = np.asarray(is_passed | self._row(body.is_cleared))
+            if body.is_avoidable.any():
+                self._approached[k] = self._approached[k] | (closing > APPROACH_SPEED)
+                is_never_faster = (gap > 0) & (speed <= self._row(body.least_vx))
+                ended = ended | (self._approached[k] & self._row(body.is_avoidable) & is_never_faster)
+            self._ended[k, self._sample] = ended
+            counts: BoolArray = self._row(self._counts[k])
+            over = over & (ended | ~counts)
+            seen.append(_Seen(k, gap, closing, is_passed, self._is_visible(k, front)))
+        return self._scene_of(seen[0], over) if len(seen) == 1 else self._nearest(seen, over)
+
+    def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
+        """Whether nobody is on the line from the sensors to a body's middle."""
+        track, visible = self._bodies[number].track, ALL_TRUE
+        for k, other in enumerate(self._bodies):
+            if k != number:
+                line = (front - self.setback, 0.0, self._row(track.x), self._row(track.y))
+                visible = visible & ~self._blocks(other, *line)
+        return visible
+
+    def _blocks(self, other: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity) -> BoolArray:
+        """Whether a body is on the line between two points: the slab test in the body's own axes."""
+        of_x, of_y, along, left = (
+            self._row(column) for column in (other.track.x, other.track.y, other.track.along, other.track.left)
+        )
+        dx, dy, rx, ry = to_x - x, to_y - y, x - of_x, y - of_y
+        if other.is_rotated or not (np.abs(along) == 1).all():
+            dx, dy = dx * along + dy * left, dy * along - dx * left
+            rx, ry = rx * along + ry * left, ry * along - rx * left
+        enter: Quantity = -np.inf
+        leave: Quantity = np.inf
+        for position, change, size in ((rx, dx, other.track.length), (ry, dy, other.track.width)):
+            half = self._row(size) / 2 + TIE
+            first, second = (-half - position) / change, (half - position) / change
+            enter = np.maximum(enter, np.minimum(first, second))
+            leave = np.minimum(leave, np.maximum(first, second))
+        return np.asarray((enter < leave) & (leave > 0) & (enter < 1))
+
+    def _scene_of(self, seen: _Seen, over: BoolArray) -> Scene:
+        body, zeros = self._bodies[seen.body], np.zeros(self.n)
+        return Scene(
+            gap=seen.gap,
+            lateral=zeros + self._row(body.lateral),
+            lateral_speed=zeros + self._row(body.lateral_speed),
+            over=np.broadcast_to(over, self.n),
+            obstacle_speed=zeros + self._row(body.vx),
+            visible=seen.visible,
+        )
+
+    def _nearest(self, seen: Sequence[_Seen], over: BoolArray) -> Scene:
+        """The scene of the nearest visible body that is or comes into the way; without one, of the nearest other."""
+        ranks = []
+        for one in seen:
+            body = self._bodies[one.body]
+            counts: BoolArray = self._row(self._counts[one.body])
+            arrival = np.where(
+                one.closing > 0, np.maximum(one.gap, 0.0) / np.maximum(one.closing, LEAST_CLOSING_SPEED), 0.0
+            )
+            at_arrival = np.abs(self._row(body.track.y) + self._row(body.vy) * arrival)
+            comes = (one.closing > 0) & (at_arrival < self.width / 2 + self._row(body.half_width))
+            is_in_way = self._row(body.is_in_path) | comes
+            rank = (
+                one.gap + OFF_THE_WAY * ~is_in_way + HIDDEN * ~one.visible + PASSED * one.is_passed + NOT_MET * ~counts
+            )
+            ranks.append(np.where(self._struck == one.body, -np.inf, rank))
+        chosen = np.argmin(np.stack(ranks), axis=0), np.arange(self.n)
+        scenes = [self._scene_of(one, over) for one in seen]
+        columns = zip(*scenes, strict=True)
+        return Scene(*(np.stack([np.broadcast_to(values, self.n) for values in column])[chosen] for column in columns))
+
+    def hits(self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray) -> dict[int, float]:
+        """Speeds of the vehicles of open runs that touch a body at a sample, by number."""
+        self._sample, self._struck = sample, np.full(self.n, -1)
+        foremost, rear = front.max(), front - self.length
+        for k in self._met:
+            body = self._bodies[k]
+            if foremost <= body.edge[sample if len(body.edge) > 1 else 0].min():
+                continue
+            is_beside = (front > self._row(body.edge)) & (rear < self._row(body.far)) & self._row(body.is_in_path)
+            vehicles = np.flatnonzero(is_beside & is_open & (self._struck < 0))
+            if vehicles.size:
+                overlaps = find_overlaps(self._own(front[vehicles], speed[vehicles]), self._body(k, vehicles))
+                self._struck[vehicles[overlaps > TOUCH]] = k
+        touched = np.flatnonzero(self._struck >= 0)
+        return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
+
+    def bodies(self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray) -> tuple[Body, Body]:
+        """The bodies of vehicles that touch somebody, and of those whom they touch, in lane coordinates."""
+        numbers = np.asarray(vehicles)
+        others = [self._body(k, numbers) for k in range(len(self._bodies))]
+        struck = self._struck[numbers]
+        columns = (np.stack(column)[struck, np.arange(len(numbers))] for column in zip(*others, strict=True))
+        return self._own(front[numbers], speed[numbers]), Body(*columns)
+
+    def bodies_around(
+        self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray
+    ) -> tuple[IntArray, Body, Body]:
+        """Each of these vehicles with each body that it may meet."""
+        owners = np.tile(np.asarray(vehicles), len(self._met))
+        others = [self._body(k, np.asarray(vehicles)) for k in self._met]
+        columns = (np.concatenate(column) for column in zip(*others, strict=True))
+        return owners, self._own(front[owners], speed[owners]), Body(*columns)
+
+    def _own(self, front: FloatArray, speed: FloatArray) -> Body:
+        return Body.behind(
+            np.stack([front, np.zeros_like(front)], axis=1),
+            np.tile([1.0, 0.0], (len(front), 1)),
+            np.full(len(front), self.length),
+            np.full(len(front), self.width),
+            speed,
+        )
+
+    def _body(self, number: int, vehicles: IntArray) -> Body:
+        """A body at this sample, as the given vehicles meet it."""
+        length, width, x, y, along, left, speed = (
+            np.broadcast_to(self._row(column), self.n)[vehicles] for column in self._bodies[number].track[2:]
+        )
+        return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed)
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """The distance to the nearest body that still counts, and how fast it shrinks, at all samples of a trace whose
+        positions are those of the vehicles' fronts.
+        """
+        shape, front, speed = trace.speed.shape, trace.position, trace.speed
+        distance, closing, in_conflict = np.full(shape, np.inf), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+        for k in self._met:
+            body = self._bodies[k]
+            edge, far, vx, vy, y, half_width = (
+                self._table(column, len(front))
+                for column in (body.edge, body.far, body.vx, body.vy, body.track.y, body.half_width)
+            )
+            counts = ~self._ended[k, : len(front)] & self._table(self._counts[k], len(front))
+            ahead, behind = edge - front, front - self.length - far
+            dx = np.maximum(np.maximum(ahead, behind), 0.0)
+            dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
+            apart = np.sqrt(dx * dx + dy * dy)
+            approach = np.where(ahead > behind, speed - vx, vx - speed) * dx - np.sign(y) * vy * dy
+            rate = approach / np.maximum(apart, LEAST_DISTANCE)
+            if body.is_rotated:
+                apart = self._exact_distance(body, front)
+            is_nearer = counts & (apart < distance)
+            distance = np.where(is_nearer, apart, distance)
+            closing = np.where(is_nearer, rate, closing)
+            in_conflict |= counts
+        return Encounter(distance, distance, closing, in_conflict)
+
+    def _table(self, column: Column, n_samples: int) -> Column:
+        """The first samples of a column, for each vehicle or for all of them."""
+        values = column[:n_samples]
+        return values if self.group is None or values.shape[1] == 1 else values[:, self.group]
+
+    def _exact_distance(self, body: Moving, front: FloatArray) -> FloatArray:
+        """Distances of vehicles and a rotated body at all samples."""
+        track = Track(*body.track[:2], *(self._table(column, len(front)) for column in body.track[2:]))
+        return distance_between(track, front - self.length / 2, self.length, self.width)
+
+
+class _Seen(NamedTuple):
+    """A body as N vehicles meet it at a sample: its number, gap [m] and closing speed [m/s], and whether it is passed
+    and visible.
+    """
+
+    body: int
+    gap: FloatArray
+    closing: FloatArray
+    is_passed: BoolArray
+    visible: BoolArray

@@ -1,0 +1,164 @@
+"""Scenarios of tracks: who is seen, hit, passed and measured among several bodies, by formulas and by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.scenarios import Track, TrackScenario, travelled
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
+from tests.scenarios.holding import Hold, driven
+
+LENGTH, WIDTH = 4.9016, 2.1284
+SPEED = 72.0 / 3.6
+
+
+class Cast(TrackScenario):
+    """Bodies that a test names, around a vehicle at 72 km/h."""
+
+    def __init__(self, *cast: Any, duration: float = 6.0, test_speed: float | None = None) -> None:
+        self.cast, self.duration, self.speed, self.test_speed = cast, duration, 72.0, test_speed  # type: ignore[misc]
+
+    def tracks(self, times: np.ndarray) -> list[Track]:
+        return [one(times) for one in self.cast]
+
+
+def standing(x: float, y: float = 0.0, name: str = "car") -> Any:
+    return lambda times: Track.of(name, "car", x, y)
+
+
+def moving(name: str, x: float, y: float, vx: float, vy: float, kind: str = "car", size: Any = None) -> Any:
+    return lambda times: Track.of(name, kind, x + vx * times, y + vy * times, vx, vy, size)
+
+
+def held(*cast: Any, **parameters: Any) -> SimulationRuns:
+    """The run of a vehicle that keeps its speed."""
+    return driven(Cast(*cast, **parameters), Hold())
+
+
+def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
+    """An oncoming car in the next lane, a trailer across it behind, an overtaking car, two pedestrians: the second is
+    in the way at 60 m.
+    """
+    cast = [
+        moving("oncoming", 150.0, 3.5, -15.0, 0.0),
+        lambda times: Track("trailer", "trailer", 12.0, 2.5, 90.0, 9.0, 0.0, 1.0, 0.0),
+        moving("overtaking", -20.0, 3.5, 30.0, 0.0),
+        moving("first", 40.0, -4.0, 0.0, 4.0, "adult"),
+        moving("second", 60.0, -4.0, 0.0, 1.2, "adult"),
+    ]
+    run = held(*cast)
+    assert run.outcome[0] == Outcome.COLLISION
+    end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
+    assert run.trace.time[end] == pytest.approx(math.ceil((60 - 0.25) / SPEED / 0.05) * 0.05)
+    assert run.trace.lateral[end, 0] == pytest.approx(-4.0 + 1.2 * run.trace.time[end])
+    gone = held(*cast[:4])
+    assert gone.outcome[0] == Outcome.PASSED
+    nearest = math.sqrt(0.0 + (3.5 - WIDTH / 2 - 1.712 / 2) ** 2)
+    assert run.encounter.separation.shape == run.trace.speed.shape
+    assert np.nanmin(gone.encounter.separation[gone.trace.active]) >= min(nearest, 0.5)
+
+
+def test_a_contact_at_the_side_counts_but_in_a_test_of_the_front() -> None:
+    cast = moving("cutting", -LENGTH / 2, -3.0, SPEED, 0.4)
+    run = held(cast)
+    assert run.outcome[0] == Outcome.COLLISION
+    assert run.contact.side[0] == "right"
+    assert held(cast, test_speed=SPEED).outcome[0] != Outcome.COLLISION
+
+
+def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
+    """A leader at 60 m moves aside and shows a standing car at 110 m."""
+    leader = moving("leader", 60.0, 0.0, 0.01, 1.75)
+    run = held(leader, standing(110.0, name="standing"))
+    gap = run.trace.gap[:, 0]
+    shown = int(np.argmax(np.abs(np.diff(gap)) > 10)) + 1
+    lateral = 1.75 * run.trace.time[shown]
+    assert gap[shown] == pytest.approx(110.0 - 4.023 / 2 - SPEED * run.trace.time[shown])
+    assert lateral - 0.9 < WIDTH / 2 + 2.2, "only after the leader has gone far enough to the side"
+    assert run.outcome[0] == Outcome.COLLISION
+
+
+def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
+    """From 80 km/h, 2 m/s^2: a vehicle as fast as its leader is not safe while the leader still brakes."""
+    speed, wear = 80 / 3.6, load_study("wear", matrix=None)
+    scenario = {"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 80.0, "target_deceleration": 2.0}}
+    system = assemble(load_study(wear, scenario=scenario))
+    assert system.scenario.duration >= 3 + (speed - 2 / 3.6) / 2
+    run = simulate(system, system.characteristics.original[np.newaxis])
+    end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
+    assert run.outcome[0] == Outcome.PASSED
+    assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], "it ends when it is slower for good"
+
+
+angles = st.floats(-math.pi, math.pi)
+
+
+@settings(max_examples=60, deadline=None)
+@given(x=st.floats(-8, 8), y=st.floats(-5, 5), angle=angles, length=st.floats(0.3, 8), width=st.floats(0.3, 3))
+def test_distance_and_overlap_of_bodies_agree_with_points_on_them(
+    x: float, y: float, angle: float, length: float, width: float
+) -> None:
+    """Points of a grid on one rectangle against the other: a second implementation, coarse as its grid."""
+    along = np.array([math.cos(angle), math.sin(angle)])
+    body = Track("b", "car", length, width, x, y, along[0], along[1], 0.0)
+    distance = float(distance_between(body, np.zeros(1), LENGTH, WIDTH)[0])
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 81), np.linspace(-0.5, 0.5, 81))
+    points = np.stack(
+        [x + u * length * along[0] - v * width * along[1], y + u * length * along[1] + v * width * along[0]]
+    )
+    outside = np.maximum(np.abs(points) - np.array([LENGTH, WIDTH])[:, np.newaxis, np.newaxis] / 2, 0.0)
+    by_grid = float(np.sqrt((outside**2).sum(axis=0)).min())
+    assert distance == pytest.approx(by_grid, abs=0.06)
+    own = Body(np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([LENGTH]), np.array([WIDTH]), np.zeros(1))
+    other = Body(np.array([[x, y]]), along[np.newaxis], np.array([length]), np.array([width]), np.zeros(1))
+    depth = float(find_overlaps(own, other)[0])
+    assert (depth > 1e-9) == (distance == 0) or abs(depth) < 1e-6
+
+
+OWN = '''
+import msgspec
+from safevar_sumo.scenarios import Track, travelled
+
+
+class CutIn(msgspec.Struct, frozen=True, kw_only=True):
+    """A car moves over from the next lane."""
+
+    speed: float = 80.0
+    gap: float = 15.0
+    duration: float = 12.0
+
+    def tracks(self, times):
+        y = 3.5 - times.clip(1.0, 4.5) + 1.0
+        vy = -1.0 * ((times >= 1.0) & (times < 4.5))
+        x = self.gap + 2.0115 + (self.speed - 60.0) / 3.6 + travelled(60.0 / 3.6, times)
+        return [Track.of("car", "car", x, y, 60.0 / 3.6, vy)]
+'''
+
+
+@pytest.mark.parametrize("gap", [6.0, 15.0])
+def test_a_users_cut_in_is_the_same_in_sumo(gap: float, in_tmp: Path) -> None:
+    """He crosses lanes and turns into his course; the user's class derives from nothing of ours."""
+    Path("cut.py").write_text(OWN)
+    scenario = {"model": "cut:CutIn", "parameters": {"gap": gap}}
+    system = assemble(load_study("wear", matrix=None, scenario=scenario))
+    vehicles = np.stack([system.characteristics.original, system.characteristics.lower])
+    run = simulate(system, vehicles)
+    assert not verify_in_sumo(system, vehicles)
+    assert run.trace.gap[20] == pytest.approx(gap, abs=0.5), "when it begins to move over"
+    assert set(run.outcome) <= {"collision", "passed", "timeout", "stopped"}
+
+
+def test_distances_travelled_are_sums_of_trapezes() -> None:
+    times = np.arange(5)[:, np.newaxis] * 0.5
+    assert travelled(2.0 * times, times)[:, 0].tolist() == [0.0, 0.25, 1.0, 2.25, 4.0]
