@@ -140,6 +140,10 @@ def test_the_handbooks_wet_rows_have_its_order() -> None:
     assert rank >= 0.95
     assert error <= 0.08
     assert f"mean error {error:.3f}, rank correlation {rank:.3f}" in PAGE
+    shallow = [row["water_mm"] == "0.2" and row["speed_kmh"] == "50" for row in wet]
+    assert f"up to {(here - published)[shallow].max():.2f} too grippy at 50 km/h and 0.2 mm" in PAGE
+    as_stated = np.array([fit.model_friction(row, {**FITTED, "film": 1.0}) for row in wet])
+    assert f"up to {(as_stated - published).max():.2f} too grippy); even so" in PAGE
 
 
 @pytest.mark.parametrize(
