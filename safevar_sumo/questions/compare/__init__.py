@@ -27,6 +27,7 @@ from safevar_sumo.questions.compare.differences import (
     compare_counts,
     compare_limits,
     compare_originals,
+    compare_values,
     limits_of_both,
 )
 from safevar_sumo.questions.compare.settings import (
@@ -48,7 +49,7 @@ from safevar_sumo.questions.pairs import (
     paired_test,
     table_of_pairs,
 )
-from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
+from safevar_sumo.questions.research_questions.statistics import fewest_runs
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.words import counted_in_words, join_phrases, number_of
 from safevar_sumo.records import Evaluations, JsonObject
@@ -106,7 +107,13 @@ def compare(
     of_limits = limits_of_both(evaluators, criteria, within)
     ends, of_originals = compare_originals(evaluators, originals, criteria, titles[0])
     members = evaluator.characteristics.vehicle.members
-    differences = compare_counts(counts, titles[0]), compare_limits(of_limits, members), of_originals
+    quantity = "rating" if metric == RATING_POINTS.name else "safety degree"
+    differences = (
+        compare_counts(counts, titles[0]),
+        compare_limits(of_limits, members),
+        of_originals,
+        compare_values(quantity, p, a12),
+    )
     better, worse = ([*chain(*kind)] for kind in list(zip(*differences, strict=True))[:2])
     changes = [row[-1] for row in of_limits]
     numbers: JsonObject = {
@@ -128,7 +135,7 @@ def compare(
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         *_verdict(differences, titles, criteria[0], is_measured=bool(ends["benign_scenes"])),
-        _test_in_words("rating" if metric == RATING_POINTS.name else "safety degree", titles[1], p, a12, tested),
+        _test_in_words(p, a12, tested),
         *_basis_in_words(common, limits),
         *counted_in_words(study, left_out),
     ]
@@ -235,11 +242,10 @@ def _verdict(
         yield "Needless braking was not measured: no benign scenes are known for this scenario."
 
 
-def _test_in_words(quantity: str, b: str, p: float, a12: float, pairs: str) -> str:
+def _test_in_words(p: float, a12: float, pairs: str) -> str:
     if np.isnan(p):
         return "There is no pair of results to test."
-    change = f"{'lower' if a12 > 0.5 else 'higher'} in {b}" if p < ALPHA else "not significantly different"
-    return f"The {quantity} is {change} (p = {p:.2g}, A12 = {a12:.2f}; {pairs})."
+    return f"Test of {pairs}: p = {p:.2g}, A12 = {a12:.2f}."
 
 
 def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:

@@ -16,6 +16,7 @@ from safevar_sumo.questions.compare.settings import within
 from safevar_sumo.questions.evaluator import Evaluator, Interval
 from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
+from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, JsonObject
@@ -51,6 +52,14 @@ def compare_counts(counts: Mapping[str, Any], a: str) -> Difference:
     only_a, only_b, both, neither = (counts[name] for name in ("only_a_unsafe", "only_b_unsafe", "both", "neither"))
     better = [f"avoids {only_a} of {number_of(only_a + both, 'setting')} unsafe in {a}"] if only_a else []
     worse = [f"is unsafe in {only_b} of {number_of(only_b + neither, 'setting')} safe in {a}"] if only_b else []
+    return Difference(better, worse, [])
+
+
+def compare_values(quantity: str, p: float, a12: float) -> Difference:
+    """A significant difference of the safety degree, or of the rating, over all pairs."""
+    is_significant = p < ALPHA  # without pairs, p is NaN
+    better = [f"has a higher {quantity} (p = {p:.2g})"] if is_significant and a12 < 0.5 else []
+    worse = [f"has a lower {quantity} (p = {p:.2g})"] if is_significant and a12 >= 0.5 else []
     return Difference(better, worse, [])
 
 
@@ -180,4 +189,4 @@ def _metres_earlier(a: Evaluator, b: Evaluator) -> Iterator[float | None]:
         metres = onsets[0][0] - onsets[1][0]
     metres = metres[np.isfinite(metres)]
     for signed in (metres, -metres):
-        yield float(max(signed.max(), 0.0)) if len(signed) else None
+        yield float(max(0.0, signed.max())) if len(signed) else None
