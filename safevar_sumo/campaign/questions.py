@@ -9,11 +9,13 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import platformdirs
 
+from safevar_sumo.ads import PerVehicleAds
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -32,7 +34,7 @@ from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.terminal import Progress
-from safevar_sumo.vehicles import Vehicle
+from safevar_sumo.vehicles import VEHICLES, Vehicle
 
 BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the time left is known."""
@@ -40,7 +42,8 @@ COMPILING = "compiling the vehicle model, for the first time"
 """The stage of progress in which one worker compiles, and no simulation has begun."""
 ECONOMICAL_FRACTION = 1 / 4
 """Fraction of the most economical batch size from which on the steps of a simulation cost no more than its vehicles.
-Settings that fill only smaller batches make one batch for each worker.
+Settings that fill no larger batch make one: two would pay for the same steps twice. Where each vehicle takes a turn of
+its own, they make one for each worker.
 """
 
 
@@ -63,13 +66,9 @@ def evaluate_all(
         check_code(study, pool)
         pool.verified[packed_study] = 0
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
-    best_size, has_recorded_scene = choose_batch_size(study, selection)
-    per_worker = len(distinct_settings) / pool.workers
-    size = math.ceil(
-        min(best_size, max(per_worker / BATCHES_PER_WORKER, min(per_worker, ECONOMICAL_FRACTION * best_size)))
-    )
-    task = Task(study=study, batch_size=size, selection=selection)
-    jobs = [(task, distinct_settings[start : start + size]) for start in range(0, len(distinct_settings), size)]
+    batches = choose_batches(study, selection)
+    task = Task(study=study, batch_size=batches.best, selection=selection)
+    jobs = [(task, rows) for rows in np.array_split(distinct_settings, batches.number(len(distinct_settings), pool))]
 
     def show_ended(ended: Sequence[int]) -> None:
         for number in ended:
@@ -77,7 +76,7 @@ def evaluate_all(
 
     evaluations = Evaluations.concatenate(carry_out(evaluate_settings, jobs, pool, show_ended))
     sample_size = min(verified - pool.verified[packed_study], len(distinct_settings))
-    if has_recorded_scene and sample_size > 0 and selection == EVERYTHING:
+    if batches.are_recorded and sample_size > 0 and selection == EVERYTHING:
         sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
         sample = sample[~evaluations.failed[sample]]
         carry_out(verify_settings, [(task, distinct_settings[sample])], pool)
@@ -85,13 +84,40 @@ def evaluate_all(
     return evaluations.take(row_of.ravel())
 
 
-def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
-    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
-    SUMO.
+class Batches(NamedTuple):
+    """How settings of a study fill batches.
+
+    Attributes
+    ----------
+    best
+        The most economical number of settings in a batch.
+    share_steps
+        Whether the vehicles of a batch take each step together, so that a small batch costs as much as a larger one.
+    are_recorded
+        Whether a recorded scene replaces SUMO.
     """
+
+    best: int
+    share_steps: bool
+    are_recorded: bool
+
+    def number(self, settings: int, pool: Pool) -> int:
+        """The number of batches for so many settings."""
+        per_worker = settings / pool.workers
+        least = ECONOMICAL_FRACTION * self.best
+        if not self.share_steps:
+            least = min(per_worker, least)
+        size = min(self.best, max(per_worker / BATCHES_PER_WORKER, least))
+        return max(math.ceil(settings / math.ceil(size)), 1)
+
+
+def choose_batches(study: Study, selection: Selection) -> Batches:
+    """Choose how settings of a study fill batches."""
     task = Task(study=study, selection=selection)
     system = selection.of(system_of(study))
-    return settings_per_batch(system, task.engine), is_recorded(system)
+    are_recorded = is_recorded(system)
+    have_turns = isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
+    return Batches(settings_per_batch(system, task.engine), are_recorded and not have_turns, are_recorded)
 
 
 def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
@@ -101,8 +127,9 @@ def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
     if study.vehicle.model in pool.compiled:
         return
     pool.compiled.add(study.vehicle.model)
-    if type(system_of(study).vehicle).compile is Vehicle.compile:
-        return  # it compiles nothing
+    shipped = VEHICLES.get(study.vehicle.model)
+    if shipped is not None and shipped.compile is Vehicle.compile:
+        return  # it compiles nothing, and no worker needs to start to say so
     task = Task(study=study)
     if not carry_out(_compile_vehicle, [(task, True)], pool)[0]:
         progress(COMPILING, 0, 1)

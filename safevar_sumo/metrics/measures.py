@@ -40,11 +40,7 @@ def time_to_collision(runs: SimulationRuns) -> FloatArray:
 
     Infinite while the distance does not shrink, outside the encounter, and once the vehicle has stopped after moving.
     """
-    has_moved = np.logical_or.accumulate(runs.trace.speed > STANDSTILL, axis=0)
-    has_stopped = np.logical_or.accumulate(has_moved & (runs.trace.speed <= STANDSTILL), axis=0)
-    closing_speed, distance = runs.encounter.closing_speed, runs.encounter.distance
-    is_counted = runs.trace.active & runs.encounter.in_conflict & ~has_stopped & (closing_speed > 0) & (distance >= 0)
-    return np.divide(distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted)
+    return runs.time_to_collision
 
 
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -222,6 +223,16 @@ class SimulationRuns:
     contact: Contact = NO_CONTACT
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
+
+    @cached_property
+    def time_to_collision(self) -> FloatArray:
+        """TTC at every sample, which several metrics read [s]; see `metrics.time_to_collision`."""
+        trace = self.trace
+        _, distance, closing_speed, in_conflict = self.encounter
+        has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
+        has_stopped = np.logical_or.accumulate(has_moved & (trace.speed <= STANDSTILL), axis=0)
+        is_counted = trace.active & in_conflict & ~has_stopped & (closing_speed > 0) & (distance >= 0)
+        return np.divide(distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted)
 
     def of(self, vehicles: slice | IntArray) -> SimulationRuns:
         """The runs of some of the vehicles."""

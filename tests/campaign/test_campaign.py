@@ -17,6 +17,7 @@ import pytest
 from safevar_sumo.campaign import RunKey, evaluation
 from safevar_sumo.campaign.campaign import deal, measure_speed
 from safevar_sumo.campaign.evaluation import Task
+from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.campaign.runs import Run
 from safevar_sumo.campaign.share import VERIFIED_OTHERS, settings_to_verify
 from safevar_sumo.errors import SafevarError
@@ -25,7 +26,7 @@ from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
-from tests.in_process import searched
+from tests.in_process import InlinePool, searched
 from tests.made_up import made_up_evaluations
 
 
@@ -246,3 +247,22 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
         sys.setprofile(None)
     assert way == listed()
     assert len(way) <= 40
+
+
+@pytest.mark.parametrize(
+    ("batches", "settings", "workers", "number"),
+    [
+        (Batches(4000, True, True), 300, 2, 1),  # vehicles in a recorded scene take the same steps together
+        (Batches(4000, True, True), 1000, 8, 1),
+        (Batches(4000, True, True), 1001, 2, 2),
+        (Batches(4000, True, True), 8000, 2, 8),
+        (Batches(4000, True, True), 80_000, 2, 20),
+        (Batches(4000, False, True), 300, 2, 2),  # those of a `ScalarAds` take turns, as do copies in SUMO
+        (Batches(200, False, False), 10, 4, 4),
+        (Batches(200, False, False), 1, 4, 1),
+    ],
+)
+def test_a_small_batch_is_divided_only_where_that_saves_time(
+    batches: Batches, settings: int, workers: int, number: int
+) -> None:
+    assert batches.number(settings, InlinePool(workers)) == number

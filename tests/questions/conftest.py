@@ -13,6 +13,7 @@ import pytest
 
 from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
+from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -25,12 +26,12 @@ from tests.made_up import made_up_evaluations
 @pytest.fixture(autouse=True)
 def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have no vehicle model whose batches could be measured."""
-    choose = questions.choose_batch_size
+    choose = questions.choose_batches
 
-    def choose_batch_size(study: Study, selection: Selection) -> tuple[int, bool]:
-        return (100, False) if study.name == "made-up" else choose(study, selection)
+    def choose_batches(study: Study, selection: Selection) -> Batches:
+        return Batches(100, True, False) if study.name == "made-up" else choose(study, selection)
 
-    monkeypatch.setattr(questions, "choose_batch_size", choose_batch_size)
+    monkeypatch.setattr(questions, "choose_batches", choose_batches)
 
 
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
