@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -22,6 +23,7 @@ from safevar_sumo.questions.tables import (
     columns_of,
     csv_cell,
     html_table,
+    latex_notes,
     latex_table,
     plain,
     reader_tables,
@@ -62,6 +64,8 @@ class Answer:
         Frames by name, made by `tabulate`.
     failures
         Sentences that say which of the user's limits are not kept; the command then ends with exit code 3.
+    folded
+        Names of tables that readers see only if they ask for them; JSON and CSV have all.
     command
         The command line that gives this answer.
     draw
@@ -74,6 +78,7 @@ class Answer:
     numbers: JsonObject
     tables: dict[str, pd.DataFrame]
     failures: tuple[str, ...] = ()
+    folded: tuple[str, ...] = ()
     command: str = ""
     draw: Callable[[Answer], Figure] | None = field(default=None, compare=False)
 
@@ -116,8 +121,9 @@ class Answer:
         """
         tables, remarks = {name: self.table(name)}, self.tables.get("remarks")
         if remarks is not None:
-            tables["remarks"] = remarks[remarks["table"].isin([name, "all"])]
-        return replace(self, tables=tables)
+            is_about_it = remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
+            tables["remarks"] = remarks[is_about_it]
+        return replace(self, tables=tables, folded=())
 
     def render(self, form: str, table: str | None = None) -> str:
         """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default the first, as CSV."""
@@ -128,10 +134,12 @@ class Answer:
         if form == "json":
             return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
         if form == "latex":
-            tables = (latex_table(f"{self.question}-{name}", frame) for name, frame in self._short_tables.items())
-            return "\n".join([LATEX_PREAMBLE, *tables])
+            shown = self._short_tables
+            remarks = shown.pop("remarks", None)
+            tables = [latex_table(self._label_of(name), frame) for name, frame in shown.items()]
+            return "\n".join([LATEX_PREAMBLE, *tables, *([] if remarks is None else [latex_notes(remarks)])])
         if form == "html":
-            sentences = [f"<p>{escape(text)}</p>" for text in (self.verdict, self._long_tables) if text]
+            sentences = [f"<p>{escape(text)}</p>" for text in (self.verdict, self._other_tables) if text]
             return "\n".join([sentences[0], *map(html_table, self._short_tables.values()), *sentences[1:]])
         console = Console(width=WIDTH, no_color=True, force_terminal=False)
         with console.capture() as capture:
@@ -147,23 +155,37 @@ class Answer:
                     print_text(console, part)
                 elif part.row_count:
                     console.print(part)
-        if self._long_tables:
-            print_text(console, self._long_tables)
+        if self._other_tables:
+            print_text(console, self._other_tables)
         print_text(console, "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()))
 
     @property
     def _reader_tables(self) -> dict[str, pd.DataFrame]:
-        return {label: shown for name, frame in self.tables.items() for label, shown in reader_tables(name, frame)}
+        """The tables that readers see, by name; without remarks on others, and without a table of no remark."""
+        shown = {name: frame for name, frame in self.tables.items() if name not in self.folded}
+        remarks = shown.pop("remarks", None)
+        if remarks is not None:
+            about = remarks[~remarks["table"].isin(self.folded)] if "table" in remarks else remarks
+            shown |= {} if about.empty else {"remarks": about}
+        return {label: part for name, frame in shown.items() for label, part in reader_tables(name, frame)}
 
     @property
     def _short_tables(self) -> dict[str, pd.DataFrame]:
         return {name: frame for name, frame in self._reader_tables.items() if len(frame) <= MAX_ROWS}
 
     @property
-    def _long_tables(self) -> str:
-        """The tables that readers do not see, in a sentence."""
+    def _other_tables(self) -> str:
+        """The tables that readers do not see, in sentences."""
         long = [f"{name} ({len(frame):,} rows)" for name, frame in self._reader_tables.items() if len(frame) > MAX_ROWS]
-        return f"By --format csv --table NAME: {', '.join(long)}." if long else ""
+        sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
+        folded = [name for name in self.folded if len(self.tables.get(name, ()))]
+        sentences += [f"By --all, or --table NAME: {', '.join(folded)}."] if folded else []
+        return " ".join(sentences)
+
+    def _label_of(self, table: str) -> str:
+        """The label of a table in LaTeX, which tables of other studies, questions and commands do not have."""
+        digest = f"-{zlib.crc32(self.command.encode()) % 0x10000:04x}" if self.command else ""
+        return f"{getattr(self.study, 'name', 'safevar')}-{self.question.replace(':', '-')}-{table}{digest}"
 
     def _repr_html_(self) -> str:
         return self.render("html")

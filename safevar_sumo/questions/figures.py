@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 DPI = 200
 PICTURE_METADATA: Mapping[str, JsonObject] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 """Metadata by file ending; they keep the date out of the file, so that equal figures have equal bytes."""
+TRUETYPE = 42
+"""matplotlib's number of the fonts in a pdf: publishers refuse its default, Type 3."""
 FONT_SIZE = 8
 DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
@@ -74,7 +76,10 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
     import matplotlib
 
     try:
-        with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}), whole_file(path) as file:
+        with (
+            matplotlib.rc_context({"svg.hashsalt": "safevar_sumo", "pdf.fonttype": TRUETYPE}),
+            whole_file(path) as file,
+        ):
             figure.savefig(file, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise InputError(

@@ -250,6 +250,12 @@ def latex_table(label: str, frame: pd.DataFrame) -> str:
     )
 
 
+def latex_notes(frame: pd.DataFrame) -> str:
+    """A table of texts as small paragraphs, its last column alone."""
+    texts = [_escaped_for_latex(text) for text in frame.iloc[:, -1]]
+    return "".join(f"\\noindent{{\\footnotesize {text}\\par}}\n" for text in texts)
+
+
 def _escaped_for_latex(text: object) -> str:
     """Plain text as LaTeX, with superscripts and minus signs."""
     escaped = re.sub(r"\\textasciicircum\{\}(-?\d+)", r"\\textsuperscript{\1}", str(text).translate(LATEX_CODES))

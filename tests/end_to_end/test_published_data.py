@@ -63,7 +63,24 @@ def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
     assert len(files) == 10
     starts = {".png": b"\x89PNG", ".pdf": b"%PDF"}
     assert all(path.read_bytes().startswith(starts[path.suffix]) for path in files)
+    fonts = b"".join(path.read_bytes() for path in files if path.suffix == ".pdf")
+    assert b"/Type3" not in fonts, "publishers refuse such fonts"
+    assert b"/TrueType" in fonts or b"/CIDFontType2" in fonts
     assert Path("counts.svg").read_bytes().startswith(b"<?xml")
+
+
+@pytest.mark.slow
+def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(results: Path) -> None:
+    short, whole = (run("tables", str(results), *options).stdout for options in ((), ("--all",)))
+    for title in ("RQ1 over runs", "RQ2 over runs", "Collisions among"):
+        assert title in short
+    for title in ("RQ3.1", "Medians over runs", "RQ1 as published"):
+        assert title not in short
+        assert title in whole
+    assert len(short.splitlines()) < 100 < len(whole.splitlines())
+    assert "By --all, or --table NAME: medians" in short
+    assert "RQ3.1" in run("tables", str(results), "--table", "rq3.1").stdout
+    assert "rq3.2" in json_of("tables", str(results))["tables"]
 
 
 def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Path) -> None:

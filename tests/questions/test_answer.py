@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -98,8 +99,37 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
     long = tabulate("Remarks", {"remark": Column("", "remark")}, [("All of them are made up. " * 5,)])
     assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render("text")
     assert "Others" not in ANSWER.render("latex", "parts")
+    others = replace(answer, tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]})
+    assert r"\noindent{\footnotesize one is old\par}" in answer.render("latex"), "no table, whose label would repeat"
+    for form in ("text", "html"):
+        assert "Remarks" in answer.render(form)
+        assert "Remarks" not in replace(others, folded=("others",)).render(form), "an empty table"
+        assert "Remarks" not in others.only("parts").render(form)
     with pytest.raises(sv.InputError, match="did you mean 'parts'"):
         ANSWER.only("part")
+
+
+def test_readers_see_folded_tables_only_if_they_ask() -> None:
+    other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
+    answer = replace(ANSWER, tables={**ANSWER.tables, "others": other}, folded=("others",))
+    for form in ("text", "latex", "html"):
+        assert "Others" not in answer.render(form)
+        assert "Others" in answer.render(form, "others")
+    assert "By --all, or --table NAME: others." in answer.render("text")
+    assert [*json.loads(answer.render("json"))["tables"]] == ["parts", "others"]
+
+
+def test_a_label_is_that_of_one_study_question_table_and_command() -> None:
+    def label(**changes: Any) -> str:
+        (found,) = re.findall(r"\\label\{(.*)\}", replace(ANSWER, **changes).render("latex"))
+        return found
+
+    other = sv.load_study("rain")
+    answers: list[dict[str, Any]] = [{}, {"study": other}, {"question": "risk"}, {"command": "one"}, {"command": "two"}]
+    labels = [label(**changes) for changes in answers]
+    assert len({*labels}) == len(answers)
+    assert label(command="one") == labels[3], "the same command, the same label"
+    assert label(study=other).startswith(f"tab:rain-{ANSWER.question}-parts")
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ from safevar_sumo.questions.research_questions.statistics import (
     survival_median,
 )
 from safevar_sumo.study import CharacteristicTable
-from tests.research_questions.test_questions import made_up, made_up_study, row
+from tests.research_questions.test_questions import made_up, made_up_study, row, three_algorithms
 
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:
@@ -72,6 +72,23 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
         points = points_of(case, case.evaluations[case.evaluations["run"] == run])
         volume = moocore.hypervolume(normalised(points, reference_front(case)), ref=[1.1] * 3)
         assert group["hypervolume"].iloc[-1] == pytest.approx(volume)
+
+
+def test_convergence_ends_at_the_hypervolume_of_the_tables_whatever_else_was_evaluated() -> None:
+    """The first algorithm evaluates better settings than it returns: in the figure, too, it is behind the other."""
+    settings = [(1000.0 + 10 * i, 2.0 + i / 10, 0.1) for i in range(30)]
+    seen = [
+        {**row(name, values=values, sd=5 - i / 10 if name == "rs" else 1 - i / 100), "evaluation": i}
+        for name in ("nsga2", "rs")
+        for i, values in enumerate(settings)
+    ]
+    returned = [seen[3], seen[5], *seen[40:]]
+    case = made_up(*({**one} for one in returned), evaluations=seen)
+    ends = compute_convergence(case).groupby(["algorithm", "run"])["hypervolume"].last()
+    tables = compute_indicators(case)["hypervolume"]
+    assert ends.to_dict() == pytest.approx(tables.to_dict())
+    everything = normalised(points_of(case, case.evaluations.query("algorithm == 'nsga2'")), reference_front(case))
+    assert moocore.hypervolume(everything, ref=[1.1] * 3) > tables["nsga2", 0] + 0.01
 
 
 def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:
@@ -254,6 +271,23 @@ def test_latex_compiles(name: str, tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_the_table_for_a_paper_has_a_line_for_each_metric_and_a_mark_where_the_long_one_is_significant() -> None:
+    answer = answer_questions([three_algorithms()])
+    long = answer.tables["rq2-runs"].set_index(["metric", "baseline"])
+    short = answer.tables["a12"].set_index(["metric", "baseline"])
+    assert long.index.tolist() == short.index.tolist()
+    for key, text in short["a12"].items():
+        effect, is_significant, magnitude = long.loc[key, ["effect_size", "significant", "magnitude"]]
+        letter = "" if magnitude == "negligible" else f" {magnitude[0].upper()}"
+        assert text == f"{effect:.2f}{'*' if is_significant else ''}{letter}"
+    assert short["significant"].any()
+    lines = answer.only("a12").render("latex")
+    assert len(re.findall(r"^(IGD\+|HV|IGD|SD|TET|TIT|aveDece) & ", lines, re.MULTILINE)) == 7
+    assert "for the 14 tests of RQ2" in lines
+    assert "IGD+" in lines.partition("HV")[0]
+    assert not re.search(r"^IGD & ", lines.partition("HV")[0], re.MULTILINE)
 
 
 @pytest.mark.parametrize(

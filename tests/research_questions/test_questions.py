@@ -162,7 +162,7 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
         *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2)),
     ]
     frame = rq2(made_up(*rows))
-    assert frame["metric"].tolist() == ["igd", "igd_plus", "hypervolume", "safety_degree", "tet", "tit", "ave_dece"]
+    assert frame["metric"].tolist() == ["igd_plus", "hypervolume", "igd", "safety_degree", "tet", "tit", "ave_dece"]
     assert frame["effect_size"].tolist() == [1] * 7
     exchanged = [{**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows]
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import pandas as pd
@@ -18,8 +20,9 @@ from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choic
 from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
 from safevar_sumo.questions.research_questions.fronts import count_evaluations, describe_evaluations, few_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
-from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, TABLES, WEATHER
+from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, OVER_RUNS, POOLED, TABLES, WEATHER
 from safevar_sumo.questions.words import number_of
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
 
 if TYPE_CHECKING:
@@ -35,10 +38,13 @@ def tables(
     algorithm: str = "",
     alpha: Share = ALPHA,
     causes: Annotated[int, Range(0, 100_000)] = 0,
+    all: bool = False,
     figures: Path | None = None,
     jobs: Jobs = None,
 ) -> Answer:
     """Answer the research questions of the paper from results, one for each case, as tables and figures.
+
+    Readers see RQ1 and RQ2 over runs, collisions and causes; JSON has every table, and `--table` prints any.
 
     Parameters
     ----------
@@ -48,6 +54,8 @@ def tables(
         A p-value below it is significant, and intervals have the confidence 1 - alpha.
     causes
         Simulate the minimal causes of up to this many unsafe solutions of each run, and compare their numbers.
+    all
+        Show every table.
     figures
         Draw every figure into this directory, as png and pdf.
     jobs
@@ -61,7 +69,13 @@ def tables(
     answer = answer_questions(cases, Choices(label_of(algorithm), alpha, counted))
     if figures is not None:
         save_figures(cases, figures)
-    return answer
+    options = {"--algorithm": algorithm, "--alpha": alpha if alpha != ALPHA else "", "--causes": causes or ""}
+    flags = [f"{flag} {quote(str(value))}" for flag, value in options.items() if value]
+    directories = [quote(str(getattr(source, "directory", source))) for source in results]
+    command = " ".join([PROGRAM_COMMAND, "tables", *directories, *flags])
+    main = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
+    folded = () if all else tuple(name for name in answer.tables if name not in (*main, "remarks"))
+    return replace(answer, command=command, folded=folded)
 
 
 def figures(*results: Results | str | Path) -> dict[str, Figure]:
@@ -182,5 +196,7 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
                 f"{prefix}too few runs for {few_count} of {number_of(len(tests), 'test')} of {rq} ({needed} are needed "
                 "after the correction)."
             )
+    if table == "a12" and len(frame):
+        yield f"{prefix}* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2."
     if table == "combinations" and frame.empty:
         yield f"{prefix}no critical solution has exactly four characteristics changed."

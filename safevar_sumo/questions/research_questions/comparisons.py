@@ -46,6 +46,8 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
 
 CAUSES = "causes"
+MARKS = {"large": "L", "medium": "M", "small": "S", "negligible": ""}
+"""Magnitudes of effects in a table for a paper."""
 INTERVAL_OF_MEDIAN = ["median", "median_low", "median_high"]
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
@@ -113,6 +115,21 @@ def rq2_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     tests = compare_over_runs(case, choices)
     opponents_of(case, choices.algorithm)  # raises if RQ2 has no answer
     return tests[tests.index == "RQ2"]
+
+
+def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+    """`rq2_runs` in short, for a paper: columns algorithm, metric, baseline, effect_size, significant, and a12, the
+    effect size with marks.
+    """
+    tests = rq2_runs(case, choices)
+    texts = [
+        f"{effect:.2f}{'*' * significant} {MARKS[magnitude]}".strip() if magnitude else "-"
+        for effect, significant, magnitude in zip(
+            tests["effect_size"], tests["significant"], tests["magnitude"], strict=True
+        )
+    ]
+    columns = ["algorithm", "metric", "baseline", "effect_size", "significant"]
+    return tests[columns].assign(a12=texts)
 
 
 def compare_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:

@@ -96,8 +96,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 
 def draw_convergence(case: Case) -> Figure:
-    """The hypervolume of all settings so far over the number of evaluations, as median and range over the runs; a line
-    ends where its algorithm does.
+    """The hypervolume of a run's solutions, of those found so far, over the number of evaluations, as median and range
+    over the runs; a line ends where its algorithm does, at the hypervolume of the tables.
     """
     import seaborn as sns
 
@@ -120,7 +120,7 @@ def draw_convergence(case: Case) -> Figure:
         ax=axis,
     )
     axis.set_ylabel(
-        "normalised hypervolume of all settings so far\n(line: median, band: range over runs; "
+        "normalised hypervolume of a run's solutions found so far\n(line: median, band: range over runs; "
         f"reference point {REFERENCE_COORDINATE:g})"
     )
     _add_legend_below(figure, axis)

@@ -1,5 +1,6 @@
-"""The quality of the fronts that runs find (docs/method.md, section 7): IGD on the objectives in their units, IGD+ and
-hypervolume on normalised ones, and its growth with the evaluations; and the number of evaluations.
+"""The quality of the fronts that runs return (docs/method.md, section 7): IGD+ and hypervolume on normalised
+objectives, and its growth with the evaluations; IGD, as published, on objectives in their units; and the number of
+evaluations.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from safevar_sumo.questions.case import Case, UnanswerableError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import ORIGINAL_DEGREE
 
-MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
-INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
+MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
+INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
 REFERENCE_COORDINATE = 1.1
 """Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
 USUAL_SHARE = 0.9
@@ -77,11 +78,11 @@ def reference_front(case: Case) -> FloatArray:
 
 
 def compute_indicators(case: Case) -> pd.DataFrame:
-    """IGD, IGD+ and hypervolume of every finished run that has solutions; index algorithm and run, a column for each
+    """IGD+, hypervolume and IGD of every finished run that has solutions; index algorithm and run, a column for each
     indicator.
 
-    IGD is the mean Euclidean distance from each point of the reference front to the run's nearest point; IGD+ counts
-    only the objectives in which this point is worse.
+    IGD is the mean Euclidean distance from each point of the reference front to the run's nearest point, in the
+    objectives' units; IGD+ counts only the objectives in which this point is worse, and is normalised.
 
     Raises
     ------
@@ -93,8 +94,9 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     for run, group in _frames_of_runs(case, case.solutions):
         if len(points := points_of(case, group)):
             scaled = normalised(points, reference)
-            distances = moocore.igd(points, ref=reference), moocore.igd_plus(scaled, ref=scaled_reference)
-            rows[run] = *map(float, distances), hypervolume(scaled)
+            igd_plus = moocore.igd_plus(scaled, ref=scaled_reference)
+            igd = moocore.igd(points, ref=reference)
+            rows[run] = float(igd_plus), hypervolume(scaled), float(igd)
     index = pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"])
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
@@ -158,11 +160,11 @@ def few_evaluations(case: Case) -> str:
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
-    """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations,
-    hypervolume.
+    """The hypervolume of each run's solutions, of those found after a number of evaluations; columns algorithm, run,
+    evaluations, hypervolume.
 
-    The numbers end with the longest run of the algorithm; a shorter one keeps its last hypervolume. The hypervolume is
-    0 as long as no setting dominates the reference point.
+    The numbers end with the longest run of the algorithm, and with the hypervolume of `compute_indicators`. It is 0 as
+    long as no solution dominates the reference point.
 
     Raises
     ------
@@ -172,9 +174,13 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     reference, search, frames = reference_front(case), case.study.search, []
     counts = np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
     ends = count_evaluations(case).groupby("algorithm")["requested"].max()
+    names = list(case.characteristics.names)
+    returned = {run: _settings_of(rows, names) for run, rows in _frames_of_runs(case, case.solutions)}
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+        solutions = {*returned.get((algorithm, run), ())}
+        is_solution = np.array([setting in solutions for setting in _settings_of(group, names)])
         points = normalised(minimised_values(case, group), reference)
-        is_defined = np.isfinite(points).all(axis=1) & feasible_rows(case, group)
+        is_defined = np.isfinite(points).all(axis=1) & is_solution & feasible_rows(case, group)
         numbers = group["evaluation"].to_numpy()
         counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
         front, volumes = points[:0], []
@@ -185,3 +191,8 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         columns = {"algorithm": algorithm, "run": run, "evaluations": counts_of_run, "hypervolume": volumes}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
+
+
+def _settings_of(frame: pd.DataFrame, names: list[str]) -> list[bytes]:
+    """The settings in a frame, as bytes that are equal where they are."""
+    return [row.tobytes() for row in frame[names].to_numpy(dtype=float)]

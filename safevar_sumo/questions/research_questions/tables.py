@@ -15,7 +15,7 @@ from safevar_sumo.questions.research_questions.fronts import count_evaluations
 from safevar_sumo.shipped import shipped_table
 
 WEATHER, CAUSES = "weather", "causes"
-CHOSEN = ("rq1-runs", "rq2-runs", "medians", "first-collision", CAUSES, "rq1", "rq2")
+CHOSEN = ("rq1-runs", "rq2-runs", "medians", "first-collision", CAUSES, "rq1", "rq2", "a12")
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
@@ -45,6 +45,7 @@ DATA = shipped_table("questions/research_questions/tables.toml")
 FUNCTIONS: Mapping[str, Compute] = {
     "rq1-runs": comparisons.rq1_runs,
     "rq2-runs": comparisons.rq2_runs,
+    "a12": comparisons.effects,
     "medians": comparisons.median_runs,
     "first-collision": comparisons.first_collisions,
     CAUSES: comparisons.minimal_causes,
@@ -59,4 +60,7 @@ FUNCTIONS: Mapping[str, Compute] = {
     "combinations": changes.frequent_combinations,
     WEATHER: changes.compare_weathers,
 }
+OVER_RUNS = ("rq1-runs", "rq2-runs", "a12", "collisions", CAUSES)
+POOLED = ("rq1", "rq2", "collisions")
+"""The tables that answer the questions about results with runs, and about imported solutions, which have none."""
 TABLES = {name: PaperTable.of(name, compute) for name, compute in FUNCTIONS.items()}
