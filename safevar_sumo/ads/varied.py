@@ -12,7 +12,7 @@ from msgspec.structs import force_setattr
 from safevar_sumo.ads.base import Ads, Memory, PerVehicleAds
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 from safevar_sumo.shipped import shipped_table
-from safevar_sumo.study.schema import FreeParameter
+from safevar_sumo.study import FreeParameter
 
 CHANGEABLE = msgspec.convert(shipped_table("ads/changeable.toml"), dict[str, dict[str, FreeParameter]])
 """Parameters that a repair may change, by shipped ADS and name: changeable.toml beside this module."""

@@ -207,7 +207,7 @@ class Returned(NamedTuple):
 
     def check(self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]) -> UserValue:
         """The result after the check."""
-        values = (result,) if len(self.parts) == 1 else result
+        values = (result,) if len(self.parts) <= 1 else result
         if len(self.parts) > 1 and not (isinstance(result, tuple | list) and len(result) == len(self.parts)):
             names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
             raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")

@@ -23,9 +23,9 @@ from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCross
 from safevar_sumo.scenarios.stop import Stop
 from safevar_sumo.scenarios.tracks import Track as Track, TrackScenario as TrackScenario, travelled as travelled
 from safevar_sumo.shipped import shipped_table
-from safevar_sumo.study import FreeParameter, Weather
+from safevar_sumo.study import FreeParameter, Weather, free_parameters
 
-SCENARIOS: Mapping[str, type] = {
+SCENARIOS: Mapping[str, type[Scenario]] = {
     "pedestrian_crossing": PedestrianCrossing,
     "along": Along,
     "car_to_car": CarToCar,
@@ -41,18 +41,13 @@ WEATHERS = {
 """Weathers by name."""
 
 
-SEARCHABLE = msgspec.convert(shipped_table("scenarios/searchable.toml"), dict[str, dict[str, FreeParameter]])
-"""Parameters that a study may search, by shipped scenario, or `weather`, and name: searchable.toml in this folder."""
+WEATHER_PARAMETERS = free_parameters(Weather)
+"""Parameters of a weather that a study may search, by name."""
 
 
-def searchable_in(scenario: type) -> Mapping[str, FreeParameter]:
-    """Parameters of a scenario and its weather that a study may search: of a user's scenario those of its weather, and
-    none without an encounter.
-    """
-    if scenario is Stop:
-        return {}
-    name = next((name for name, shipped in SCENARIOS.items() if scenario is shipped), "")
-    return {**SEARCHABLE.get(name, {}), **SEARCHABLE["weather"]}
+def searchable_in(scenario: type[Scenario]) -> Mapping[str, FreeParameter]:
+    """Parameters of a scenario and its weather that a study may search; none without an encounter."""
+    return {} if scenario.brakes_fully else {**free_parameters(scenario), **WEATHER_PARAMETERS}
 
 
 def weather_of(choice: str | Weather, source: object) -> Weather:

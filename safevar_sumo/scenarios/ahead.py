@@ -20,6 +20,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     SAME_DIRECTION,
     Direction,
     Heading,
+    ImpactLocation,
     Metres,
     ProtocolTest,
     Seconds,
@@ -28,6 +29,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     lateral_offset,
 )
 from safevar_sumo.scenarios.tracks import BODIES, KMH, Track, first_in_strip, travelled
+from safevar_sumo.study import searched
 
 FINAL_SPEED = 2.0
 """Speed at which the braking target stops braking [km/h]."""
@@ -36,11 +38,20 @@ STEADY_SPEED_LIMIT = 80.0
 """
 
 
+VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start")
+"""The mark of the vehicle's speed, which a study may search."""
+
+
 class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see `ProtocolTest`.
 
     The middle of the target's rear is at the impact location. A standing target may be rotated around that point.
     """
+
+    speed: Annotated[Speed, VEHICLE_SPEED] = 40.0
+    impact_location: Annotated[
+        ImpactLocation, searched(0.0, 100.0, "%", "impact location, share of the vehicle's front from its left corner")
+    ] = 50.0
 
     @property
     def gap(self) -> Any:
@@ -101,7 +112,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 
     test: Literal["CPLA", "CBLA"] = "CPLA"
     target: Literal["adult", "child", "cyclist"] | None = None
-    target_speed: Annotated[float, Meta(gt=0, le=60)] | None = None
+    target_speed: Annotated[float, Meta(gt=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")] | None = None
     acceleration_distance: Metres | None = None
     time_to_impact: Seconds = 6.0
 
@@ -162,11 +173,17 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     """
 
     test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
-    speed: Speed = 50.0
-    target_speed: Annotated[float, Meta(ge=0, le=250)] | None = None
-    headway: Seconds | None = None
+    speed: Annotated[Speed, VEHICLE_SPEED] = 50.0
+    target_speed: (
+        Annotated[float, Meta(ge=0, le=250), searched(0.0, 130.0, "km/h", "speed of the target at the start")] | None
+    ) = None
+    headway: (
+        Annotated[Seconds, searched(0.5, 10.0, "s", "headway, gap at the start divided by the vehicle's speed")] | None
+    ) = None
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
-    target_deceleration: Annotated[float, Meta(gt=0, le=12)] = 4.0
+    target_deceleration: Annotated[
+        float, Meta(gt=0, le=12), searched(0.5, 9.0, "m/s^2", "deceleration of the target")
+    ] = 4.0
     heading: Heading = 0.0
     time_after: Seconds = 5.0
 

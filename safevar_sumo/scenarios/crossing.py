@@ -16,13 +16,16 @@ from safevar_sumo.scenarios.euro_ncap import (
     TESTS,
     Direction,
     Heading,
+    ImpactLocation,
     Metres,
     ProtocolTest,
     Seconds,
+    Speed,
     SpeedProfile,
     lateral_offset,
 )
 from safevar_sumo.scenarios.tracks import BODIES, KMH, PERSONS, SCREEN, BodySize, Track
+from safevar_sumo.study import searched
 
 PARKED_GAP = 1.0
 """Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars
@@ -158,7 +161,14 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
     target: Literal["adult", "child", "cyclist", "motorcyclist", "car"] | None = None
-    target_speed: Annotated[float, Meta(gt=0, le=150)] | None = None
+    speed: Annotated[Speed, searched(10.0, 80.0, "km/h", "speed of the vehicle at the start")] = 40.0
+    impact_location: Annotated[
+        ImpactLocation,
+        searched(
+            0.0, 100.0, "%", "impact location, share of the vehicle's front from the side where the target starts"
+        ),
+    ] = 50.0
+    target_speed: Annotated[float, Meta(gt=0, le=150), searched(3.0, 60.0, "km/h", "speed of the target")] | None = None
     side: Literal["near", "far"] | None = None
     lateral_start: Annotated[float, Meta(gt=0, le=12)] | None = None
     acceleration_distance: Metres | None = None

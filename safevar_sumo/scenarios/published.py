@@ -25,6 +25,7 @@ from safevar_sumo.scenarios.base import (
     XmlChanges,
     as_text,
 )
+from safevar_sumo.study import searched
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
@@ -94,9 +95,18 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     duration: Positive = 9.5
     turns_after: float | None = 0.7
     lane_width: Positive = 3.5
-    distance: Positive | None = None
-    walking_speed: Positive | None = None
-    lateral_start: Positive | None = None
+    distance: (
+        Annotated[
+            Positive,
+            searched(6.0, 30.0, "m", "gap at the start, from the front bumper to the middle of the pedestrian's path"),
+        ]
+        | None
+    ) = None
+    walking_speed: Annotated[Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")] | None = None
+    lateral_start: (
+        Annotated[Positive, searched(4.0, 13.0, "m", "start of the pedestrian, to the right of the lane's middle")]
+        | None
+    ) = None
     grade: Grade = 0.0
     reactive_actors = False
     pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
@@ -211,7 +221,10 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
 
     network: str = "lead_vehicle_stopped"
     duration: Positive = 16.0
-    distance: Positive | None = None
+    distance: (
+        Annotated[Positive, searched(10.0, 75.0, "m", "gap at the start, from the front bumper to the parked vehicle")]
+        | None
+    ) = None
     grade: Grade = 0.0
     reactive_actors = False
     pre_crash = PreCrash.LEAD_STOPPED

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Roads, Scenario, XmlChanges, as_text
@@ -90,7 +91,9 @@ class Track(NamedTuple):
         """A body with these velocities along the lane and to its left [m/s] that faces where it moves, and along the
         lane while it stands; without a `size` it has that of its kind.
         """
-        length, width = BODIES[kind] if size is None else size
+        if size is None and kind not in BODIES:
+            raise InputError("Track.of", f"a body of the kind {kind!r} has no size", f"a size, or {one_of(BODIES)}")
+        length, width = size or BODIES[kind]
         speed = np.sqrt(np.square(vx) + np.square(vy))
         moves = speed > 0
         divisor = np.where(moves, speed, 1.0)

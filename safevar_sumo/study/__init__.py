@@ -20,13 +20,17 @@ from safevar_sumo.study.file import (
     user_modules as user_modules,
     write_study as write_study,
 )
+from safevar_sumo.study.parameters import (
+    FreeParameter as FreeParameter,
+    free_parameters as free_parameters,
+    searched as searched,
+)
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,
     ORIGINAL_DEGREE as ORIGINAL_DEGREE,
     PYMOO as PYMOO,
     SAFETY_DEGREE as SAFETY_DEGREE,
-    FreeParameter as FreeParameter,
     MatrixTable as MatrixTable,
     MatrixTest as MatrixTest,
     MetricsTable as MetricsTable,

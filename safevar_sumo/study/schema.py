@@ -24,6 +24,7 @@ from safevar_sumo.study.characteristics import (
     check_variation,
     mistake,
 )
+from safevar_sumo.study.parameters import FreeParameter, searched
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -99,9 +100,15 @@ class Weather(Table, frozen=True, kw_only=True):
     """
 
     name: str
-    road_friction: Annotated[float, Meta(gt=0, le=1.5)]
-    visibility: Annotated[float, Meta(gt=0, le=1.5)]
-    recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
+    road_friction: Annotated[
+        float, Meta(gt=0, le=1.5), searched(0.1, 1.2, "-", "road friction, factor on the tyres' friction")
+    ]
+    visibility: Annotated[
+        float, Meta(gt=0, le=1.5), searched(0.05, 1.5, "-", "visibility, factor on the range of the sensors")
+    ]
+    recognition_delay: Annotated[
+        float, Meta(ge=0, le=5), searched(0.0, 2.0, "s", "additional time that the sensors need in this weather")
+    ] = 0.0
     light: Literal["day", "night"] = "day"
     water: Annotated[float, Meta(ge=0, le=20)] = 0.0
 
@@ -196,20 +203,6 @@ class MatrixTable(Table, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if bool(self.tests) == bool(self.protocol):
             raise mistake(f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol")
-
-
-class FreeParameter(Table, frozen=True, kw_only=True):
-    """A parameter that may change: its bounds `lower` and `upper` in `unit`, and its `meaning`.
-
-    The search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown
-    magnitude.
-    """
-
-    lower: float
-    upper: float
-    unit: str
-    meaning: str
-    log: bool = False
 
 
 class RepairTable(Table, frozen=True, kw_only=True):

@@ -32,6 +32,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import VUT, Point, Scenario, Scene, TrackScenario, WorldScenario
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
+from safevar_sumo.sumo.cast_check import CAST_KEY
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
@@ -148,7 +149,12 @@ def stage_of(system: System, settings: FloatArray) -> Stage | None:
     step = system.scenes.step_of(scenarios[0])
     duration = max(float(np.max(scenario.duration)) for scenario in scenarios)
     n_samples = round(duration / step) + 1
-    return Stage(scenarios, n * len(scenarios), size, n_samples=n_samples, step=step)
+    try:
+        return Stage(scenarios, n * len(scenarios), size, n_samples=n_samples, step=step)
+    except InputError as error:
+        if error.source != CAST_KEY:
+            raise
+        raise InputError(system.source, f"{error.source}: {error.problem}", error.legal) from None
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:

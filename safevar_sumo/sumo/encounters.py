@@ -7,17 +7,17 @@ vehicle starts elsewhere and meets a target that moves otherwise (`Scenario.layo
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
-from msgspec.structs import force_setattr
+from msgspec import Struct
+from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.scenarios import SEARCHABLE, Point, TrackScenario, WorldScenario, searchable_in
+from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, Scenario, TrackScenario, WorldScenario, searchable_in
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import stage_networks
@@ -41,7 +41,7 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
                 part = f"[{widest.lower:g}, {widest.upper:g}]{unit_text(widest.unit)}"
                 raise InputError(source, problem, f"a part of {part}")
             first, other = points[0].weather, point.weather
-            if name in SEARCHABLE["weather"] and getattr(first, name) != getattr(other, name):
+            if name in WEATHER_PARAMETERS and getattr(first, name) != getattr(other, name):
                 problem = f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
                 raise InputError(source, problem, "a domain, or values in the weathers")
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
@@ -61,11 +61,18 @@ def encounter(point: Point, values: Mapping[str, Any]) -> Point:
     """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the same object if only
     the weather varies.
     """
-    of_weather, weather = SEARCHABLE["weather"].keys(), copy.copy(point.weather)
-    scenario: Any = point.scenario if values.keys() <= of_weather else copy.copy(point.scenario)
-    for name, value in values.items():
-        force_setattr(weather if name in of_weather else scenario, name, value)
-    return point._replace(scenario=scenario, weather=weather)
+    of_weather = {name: value for name, value in values.items() if name in WEATHER_PARAMETERS}
+    of_scenario = {name: value for name, value in values.items() if name not in of_weather}
+    weather = replace_fields(point.weather, **of_weather)
+    return point._replace(scenario=_with(point.scenario, of_scenario), weather=weather)
+
+
+def _with(scenario: Scenario, values: Mapping[str, Any]) -> Any:
+    """A scenario with other values of fields, created anew; the same object without any."""
+    if not values:
+        return scenario
+    create: Any = replace_fields if isinstance(scenario, Struct) else replace
+    return create(scenario, **values)
 
 
 def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:

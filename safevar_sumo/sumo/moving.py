@@ -11,6 +11,8 @@ import numpy as np
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import Track, TrackScenario
 from safevar_sumo.scenarios.tracks import SCREEN, first_in_strip
+from safevar_sumo.sumo.bodies import Body
+from safevar_sumo.sumo.cast_check import check_motion, check_shapes, check_start
 
 TIE = 1e-6
 """Margin of a body's sides [m]: a body that is exactly at an edge at a sample counts, whatever the last bit says."""
@@ -123,12 +125,25 @@ def row(column: Column, sample: int, group: IntArray | None) -> Column:
     return values[group] if group is not None and len(values) > 1 else values
 
 
-def casts_of(scenarios: Sequence[TrackScenario], times: FloatArray) -> list[Track]:
-    """The bodies of K scenarios, or of one whose parameters are arrays, with columns; body b is that of all scenarios'
-    bodies b.
+def cast_of(
+    scenarios: Sequence[TrackScenario], times: FloatArray, n_encounters: int, step: float, own: Body
+) -> list[Track]:
+    """The bodies of K scenarios, or of one in N encounters, with columns; body b is that of all scenarios' bodies b.
+    `own` is the vehicle under test at the start.
+
+    Raises
+    ------
+    InputError
+        If bodies cannot move as a scenario says.
     """
     casts = [scenario.tracks(times) for scenario in scenarios]
-    return [_joined(tracks) for tracks in zip_longest(*casts, fillvalue=NOBODY)]
+    for cast in casts:
+        check_shapes(cast, len(times), n_encounters, step)
+    joined = [_joined(tracks) for tracks in zip_longest(*casts, fillvalue=NOBODY)]
+    for track in joined:
+        check_motion(track, step)
+    check_start(joined, own)
+    return joined
 
 
 def _joined(tracks: Sequence[Track]) -> Track:

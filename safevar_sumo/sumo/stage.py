@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Quantity, Trace
 from safevar_sumo.scenarios import Scene, Track, TrackScenario
 from safevar_sumo.sumo.bodies import TOUCH, Body, Motion, distance_between, find_overlaps
-from safevar_sumo.sumo.moving import TIE, Column, Moving, casts_of, row
+from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
 
 APPROACH_SPEED = 0.5
 """Closing speed above which a vehicle approaches a body ahead [m/s]; once it is never faster again, it has avoided it.
@@ -32,10 +32,11 @@ class Stage:
         first = scenarios[0]
         self.length, self.width, self.setback = first.vut_length, first.vut_width, first.sensor_setback
         times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
-        self.casts = casts_of(scenarios, times)
+        own = self._own(np.zeros(1), np.zeros(1))
+        self.cast = cast_of(scenarios, times, n // size if len(scenarios) == 1 else 1, step, own)
         self.n, self.step = n, step
         self.group: IntArray | None = np.repeat(np.arange(n // size), size) if 1 < size < n else None
-        bodies = [Moving.of(track, step, self.width) for track in self.casts]
+        bodies = [Moving.of(track, step, self.width) for track in self.cast]
         level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.

@@ -53,7 +53,7 @@ class StageWorld(SumoWorld):
         super().__init__(api, n)
         self._stage, self._start, self._sample = stage, start, 0
         self._lane = LaneWorld(stage, start_speeds, self.step_length)
-        self._actors = [track for track in stage.casts if track.kind != SCREEN]
+        self._actors = [track for track in stage.cast if track.kind != SCREEN]
         self._edges = [str(api.vehicle.getRoute(id_)[0]) for id_ in self.ids(VUT)]
         """The edges on which the vehicles under test depart."""
 

@@ -19,9 +19,9 @@ from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
-from safevar_sumo.scenarios import SEARCHABLE
+from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study, free_parameters, load_study
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
 from safevar_sumo.sumo.system import assemble
@@ -142,7 +142,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
 def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     """In some, a pedestrian has left the road while other copies go on."""
     base, scenario, _ = CASES[case]
-    widest = SEARCHABLE[scenario["model"]]
+    widest = free_parameters(SCENARIOS[scenario["model"]])
     search = {name: domain(one.lower, one.upper, one.unit) for name, one in widest.items()}
     system = assemble(load_study(base, matrix=None, scenario={**scenario, "search": search}))
     corners = product(*((one.lower, one.upper) for one in widest.values()))

@@ -1,0 +1,140 @@
+"""A user's own scenario: its parameters are searched where they are declared, and what cannot be is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
+from tests.in_process import json_of
+from tests.made_up import drawn
+
+MINE = """
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.scenarios import Track, travelled
+from safevar_sumo.study import searched
+
+
+class Mine(Struct, frozen=True, kw_only=True):
+    '''A scooter comes out of a row past a parked van.'''
+
+    speed: float = 40.0
+    scooter: Annotated[float, Meta(ge=5, le=30, description="speed of the scooter", extra={"unit": "km/h"})] = 15.0
+    gap: Annotated[float, searched(20.0, 60.0, "m", "gap to the scooter when it moves out")] = 30.0
+    duration: float = 9.0
+
+    def tracks(self, times):
+        v = self.scooter / 3.6 + 0.0 * times
+        moves = (times > 1.0) & (times < 3.0)
+        y = -2.5 + np.clip(times - 1.0, 0.0, 2.0)
+        scooter = Track.of("scooter", "scooter", self.gap + travelled(v, times), y, v, 1.0 * moves, size=(1.8, 0.6))
+        return [scooter, Track.of("van", "van", self.gap + 20.0, -3.2, size=(5.5, 2.0))]
+"""
+SEARCH = {
+    "scooter": {"unit": "km/h", "original": 15, "lower": 8, "upper": 25},
+    "gap": {"unit": "m", "original": 50, "lower": 35, "upper": 55},
+}
+
+
+def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
+    folder.joinpath("own.py").write_text(MINE)
+    scenario = {"model": "own:Mine", "search": search}
+    return load_study("wear", matrix=None, scenario=scenario, **tables)
+
+
+def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
+    """Each encounter is that of a study with these parameters, and the original vehicle meets the same."""
+    system = assemble(mine(in_tmp, SEARCH))
+    settings = drawn(system, 6, 4)
+    found = evaluate(system, settings)
+    names, of_vehicle = system.characteristics.scenario.names, system.characteristics.of_vehicle
+    assert names == ("scooter", "gap")
+    for row, setting in enumerate(settings):
+        parameters = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))
+        alone = assemble(load_study("wear", matrix=None, scenario={"model": "own:Mine", "parameters": parameters}))
+        both = evaluate(alone, np.stack([setting[of_vehicle], alone.characteristics.original]))
+        assert both.outcome[0] == found.outcome[row]
+        assert both.f_safe.tolist() == [found.f_safe[row], found.metrics["original_safety_degree"][row]]
+    assert not verify_in_sumo(system, settings)
+
+
+def test_a_matrix_runs_over_them(in_tmp: Path) -> None:
+    (in_tmp / "own.py").write_text(MINE)
+    test = {"name": "scooter", "over": {"gap": [40, 50], "scooter": [10.0]}}
+    study = load_study("wear", matrix={"tests": [test]}, scenario={"model": "own:Mine"})
+    names = [point.name for point in assemble(study).points]
+    assert names == ["scooter, gap 40, scooter 10.0, wet", "scooter, gap 50, scooter 10.0, wet"]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("speed", {}, r"Mine has no such parameter to search"),
+        ("scooter", {"upper": 40}, r"scenario\.search\.scooter: .*\nexpected: a part of \[5, 30\] km/h"),
+        ("gap", {"unit": "km"}, r"scenario\.search\.gap\.unit = 'km'\nexpected: 'm'"),
+    ],
+)
+def test_what_a_class_does_not_declare_is_refused(
+    name: str, changes: dict[str, Any], message: str, in_tmp: Path
+) -> None:
+    domain = {"unit": "km/h", "original": 15, "lower": 8, "upper": 25, **changes}
+    with pytest.raises(InputError, match=message):
+        assemble(mine(in_tmp, {name: domain}))
+
+
+def test_the_list_of_scenarios_has_what_their_classes_declare() -> None:
+    rows = {row["name"]: row for row in json_of("list", "scenarios", "--json")["tables"]["scenarios"]["rows"]}
+    assert {*rows} == {*SCENARIOS}
+    assert "target_deceleration 0.5 to 9 m/s^2" in str(rows["car_to_car"])
+
+
+BODY = """from safevar_sumo.scenarios import Track
+import numpy as np
+
+
+class Mine:
+    speed, duration = 50.0, 3.0
+
+    def tracks(self, times):
+        return """
+CAR = "Track.of('car', 'car', {}, 0.0)"
+MISTAKES = {
+    "jump": (CAR.format("60 + np.where(times > 1, 30.0, 0.0)"), "at 1.05 s actor 'car' jumps, at 600 m/s"),
+    "no number": (CAR.format("np.where(times > 1, np.nan, 50.0)"), "at 1.05 s actor 'car' has x = nan"),
+    "short": (CAR.format("60.0 + times[:20]"), "actor 'car': x ends at 0.95 s"),
+    "flat": (CAR.format("60.0 + times[:, 0]"), r"x has the shape \(61,\)"),
+    "one name": (f"{CAR.format(60.0)}, {CAR.format(80.0)}", "at 0 s 2 actors are called 'car'"),
+    "each other": (
+        f"{CAR.format(60.0)}, Track.of('b', 'car', 62.0, 0.0)",
+        "at 0 s actor 'car' is 1.71 m inside actor 'b'",
+    ),
+    "vehicle": (CAR.format(0.0), "at 0 s actor 'car' is 1.92 m inside the vehicle under test"),
+    "direction": ("Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 1.0, 0.0)", "has a direction of length 1.41421"),
+    "fast": ("Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 0.0, 300.0)", "has a speed of 300 m/s"),
+    "size": ("Track.of('bus', 'bus', 60.0, 0.0)", "a body of the kind 'bus' has no size"),
+    "nobody": ("", r"returned \[\] from tracks"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_bodies_that_cannot_move_so_are_refused_with_actor_time_and_what_is_expected(
+    mistake: str, in_tmp: Path
+) -> None:
+    body, message = MISTAKES[mistake]
+    (in_tmp / "own.py").write_text(f"{BODY}[{body}]\n")
+    system = assemble(load_study("wear", matrix=None, scenario={"model": "own:Mine"}))
+    with pytest.raises(InputError, match=message) as caught:
+        simulate(system, system.characteristics.original[np.newaxis])
+    assert len(str(caught.value).splitlines()) == 2
