@@ -55,7 +55,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a standing car this is a
       time headway of 2 s;
     - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
-      by the letter the driver does not react.
+      by the letter the driver does not react while the leader brakes.
 
     While it reacts it releases the accelerator. After a stop it waits until the way is clear. Behind a leader that
     drives on after braking it does not accelerate while the gap g is shorter than the one g_0 with which it began to
@@ -105,7 +105,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         still_brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
         brakes = (braking_time >= self.perception_time - TIME_ROUNDING) & ((seen.closing_speed > 0) | still_brakes)
         is_near = time_to_reach(seen) < self.critical_ttc
-        danger = is_in_way & np.where(reaction.leader_has_braked, brakes, is_near)
+        danger = is_in_way & (brakes | (is_near & ~still_brakes))
         first_gap = np.where(is_in_way, np.where(np.isfinite(memory.first_gap), memory.first_gap, seen.gap), np.inf)
         command, reaction = self.react(
             seen,

@@ -276,6 +276,15 @@ def test_behind_a_leader_that_drives_on_the_competent_driver_follows_without_cha
     assert gaps[-1] > gaps[nearest] + 5
 
 
+def test_a_leader_who_drives_on_after_gentle_braking_is_a_danger_at_a_ttc_of_two_seconds() -> None:
+    """From 80 to 60 km/h at 2 m/s^2, then steady: closing at 20 km/h, he reacts at 11.1 m."""
+    leader = np.maximum(80 / 3.6 - 2.0 * np.maximum(np.arange(600) * STEP - 1, 0.0), 60 / 3.6)
+    gaps, speeds, _ = follow(CompetentDriver(), leader, 2.0)
+    released = int(np.argmax(speeds < 80 / 3.6 - 0.01))
+    assert gaps[released] == pytest.approx(2 * 20 / 3.6, abs=3 * 20 / 3.6 * STEP)
+    assert gaps.min() > 0
+
+
 @pytest.mark.parametrize("speed", range(30, 80, 7))
 def test_below_5_two_conventions_differ(speed: int) -> None:
     """CCRb: 4 m/s^2 from a headway of 1 s. By the letter nothing is a danger; any braking is one for the other."""
