@@ -23,7 +23,7 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_cells
+from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_matrix
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
@@ -45,11 +45,14 @@ class Selection(msgspec.Struct, frozen=True):
         Numbers of the points of a matrix to simulate; all if empty.
     arrays
         Whether one ADS drives all rows, with arrays as parameters.
+    each
+        Whether the evaluations have the rated results at each point of a matrix, `cells`.
     """
 
     parameters: tuple[str, ...] = ()
     points: tuple[int, ...] = ()
     arrays: bool = True
+    each: bool = False
 
     def of(self, system: System) -> System:
         """The system at the selected points."""
@@ -70,8 +73,6 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
         What moves the vehicles.
     batch_size
         Maximum number of settings in a batch.
-    cells
-        (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     selection
         Parameters of the ADS that vary, and points; by default no parameter, and all points.
     """
@@ -79,7 +80,6 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     study: Study
     engine: Engine = Engine.RECORDED
     batch_size: int = MAX_COPIES
-    cells: tuple[int, int] | None = None
     selection: Selection = EVERYTHING
 
 
@@ -177,8 +177,6 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     system = system_of(task.study)
     system.vehicle.compile()  # outside the time limit
     with end_if_longer(task.study.search.time_limit):
-        if task.cells is not None:
-            return evaluate_cells(system, rows, task.cells, task.engine)
         if task.selection != EVERYTHING:
             return _evaluate_parameters(task.selection.of(system), task, rows)
         return evaluate(system, rows, task.engine)
@@ -188,6 +186,8 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
     selection, n = task.selection, len(system.characteristics)
     settings, values = rows[:, :n], rows[:, n:]
+    if selection.each:
+        return evaluate_matrix(system, settings, task.engine, each=True)
     if not values.size:
         return evaluate(system, settings, task.engine, with_originals=False)
     if selection.arrays:

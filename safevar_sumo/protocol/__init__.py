@@ -6,6 +6,5 @@ from safevar_sumo.protocol.cells import (
     Cell as Cell,
     CellMatrix as CellMatrix,
     Protocol as Protocol,
-    cells_of_part as cells_of_part,
     protocol_of as protocol_of,
 )

@@ -302,19 +302,6 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
                         )
 
 
-def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
-    """Numbers of the cells in the part with the number `part` of all `parts`; cells with the same network share a part
-    as far as possible.
-    """
-
-    def network_of(number: int) -> tuple[str, bool, str]:
-        model, parameters, _ = protocol.cells[number].scenario
-        return model, "heading" in parameters or "start_share" in parameters, protocol.cells[number].matrix.test_name
-
-    numbers = sorted(range(len(protocol.cells)), key=network_of)
-    return numbers[len(numbers) * part // parts : len(numbers) * (part + 1) // parts]
-
-
 @lru_cache
 def protocol_of(name: str) -> Protocol:
     """A protocol by its name."""

@@ -15,7 +15,7 @@ from safevar_sumo.errors import check_name
 from safevar_sumo.protocol.cells import COLOURS, EXTENDED, NOT_RED, STANDARD, WARNING, CellMatrix, Protocol, protocol_of
 from safevar_sumo.records import KMH_PER_MS, BoolArray, CellResults, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable, Study, Weather
+from safevar_sumo.study import MatrixTable, MatrixTest, Study, Weather
 
 GREEN, RED = 0, len(COLOURS) - 1
 UNKNOWN = -1
@@ -155,7 +155,8 @@ def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -
 
 
 def is_rated(study: Study) -> bool:
-    return study.matrix is not None and bool(study.matrix.protocol)
+    """Whether a study's settings are rated: in all cells of a protocol, not at one point alone."""
+    return study.matrix is not None and bool(study.matrix.protocol) and not study.matrix.point
 
 
 def rater_of(study: Study, source: str) -> Rater | None:
@@ -166,7 +167,7 @@ def rater_of(study: Study, source: str) -> Rater | None:
     InputError
         If a claim names an unknown test, or a layer that does not count for the test or is simulated.
     """
-    if study.matrix is None or not study.matrix.protocol:
+    if study.matrix is None or not is_rated(study):
         return None
     protocol = protocol_of(study.matrix.protocol)
     for test, claims in study.rating.claims.items():
@@ -176,15 +177,6 @@ def rater_of(study: Study, source: str) -> Rater | None:
         for claim in claims:
             check_name(source, f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
     return Rater(protocol=protocol, claims=study.rating.claims)
-
-
-def reduce_to_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Study:
-    """Reduce a rated study to some of its cells; the result has no rating points."""
-    whole_matrix = expand_protocol(study, weather)
-    assert whole_matrix.matrix is not None
-    tests = [whole_matrix.matrix.tests[number] for number in numbers]
-    search = replace(study.search, objectives=[*OBJECTIVES])
-    return replace(whole_matrix, matrix=MatrixTable(tests=tests), rating=RatingTable(), search=search)
 
 
 def darken(weather: Weather) -> Weather:
@@ -203,8 +195,9 @@ def darken(weather: Weather) -> Weather:
 
 
 def expand_protocol(study: Study, weather: Weather) -> Study:
-    """Give the study a test for each cell of its protocol; tests by day have the study's weather."""
-    assert study.matrix is not None
+    """Give a study with a protocol a test for each of its cells; tests by day have the study's weather."""
+    if study.matrix is None or not study.matrix.protocol:
+        return study
     shared_parameters = {name: value for name, value in study.scenario.parameters.items() if name in SHARED_PARAMETERS}
     by_night, tests = darken(weather), []
     for cell in protocol_of(study.matrix.protocol).cells:
@@ -213,4 +206,4 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
         weathers: list[str | Weather] = [by_night if is_night else weather]
         tests.append(MatrixTest(name=cell.name, model=model, parameters=parameters, weathers=weathers))
     no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters
-    return replace(study, matrix=MatrixTable(tests=tests), scenario=no_parameters)
+    return replace(study, matrix=MatrixTable(tests=tests, point=study.matrix.point), scenario=no_parameters)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -11,20 +11,12 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import (
-    EVERYTHING,
-    VERIFIED_SETTINGS,
-    Selection,
-    Task,
-    carry_out,
-    evaluate_settings,
-)
+from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, compile_vehicle, evaluate_all
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.protocol import cells_of_part
-from safevar_sumo.protocol.rater import is_rated, rater_of
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.case import Case
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
@@ -32,8 +24,6 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
-PARTS_PER_WORKER = 2
-"""Number of parts per worker into which the cells of a rating are divided."""
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
 Interval = tuple[float, float]
@@ -179,40 +169,19 @@ class Evaluator:
             lambda count: bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower), number
         )
 
-    def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
-        """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
+    def at_each_point(self, settings: FloatArray, stage: str) -> CellResults:
+        """The rated results of M settings, shape (M, n), at every point of a matrix.
 
         Raises
         ------
         SimulationError
             If a setting cannot be simulated.
         """
-        compile_vehicle(self.study, self._pool, self.progress)
-        rater = rater_of(self.study, self.study.source)
-        assert rater is not None
-        cell_count = len(rater.protocol.cells)
-        parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
-        cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
-        jobs = [
-            (Task(study=self.study, batch_size=max(len(settings), 1), cells=(part, parts)), settings)
-            for part in range(parts)
-        ]
-        results, done = [], 0
-
-        def show_more_done(ended: Sequence[int]) -> None:
-            nonlocal done
-            done += sum(len(cells[part]) for part in ended)
-            self.progress(stage, done, cell_count)
-
-        show_more_done([])
-        for evaluations in carry_out(evaluate_settings, jobs, self._pool, show_more_done):
-            if evaluations.cells is None:
-                reason = evaluations.reason(int(np.argmax(evaluations.failed)))
-                raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
-            results.append(evaluations.cells)
-        self.simulated += len(settings)
-        order = np.argsort(np.concatenate(cells))  # restores the order of the cells
-        return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in zip(*results, strict=True))
+        evaluations = self.evaluate_selection(settings, Selection(each=True), stage)
+        if evaluations.cells is None:
+            reason = evaluations.reason(int(np.argmax(evaluations.failed)))
+            raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
+        return evaluations.cells
 
     def evaluate_original(self) -> Evaluations:
         """Evaluation of the original vehicle.

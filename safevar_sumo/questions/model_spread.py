@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
-from safevar_sumo.sumo.matrix import evaluate, system_at_point
+from safevar_sumo.sumo.matrix import at_point, evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -109,12 +109,12 @@ def prediction_band(
 
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
+    if point:
+        study = at_point(study, point, source="point")
     systems = [
         assemble(study_of_set, f"{study.source}: spread: set {k}" if k else study.source)
         for k, study_of_set in enumerate(studies_of_sets(study))
     ]
-    if point:
-        systems = [system_at_point(system, point, source="point") for system in systems]
     return [evaluate(system, settings) for system in systems]
 
 

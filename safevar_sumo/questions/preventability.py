@@ -24,7 +24,7 @@ from safevar_sumo.questions.tables import Column, Columns, with_interval
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
-from safevar_sumo.sumo.matrix import simulate, study_at
+from safevar_sumo.sumo.matrix import at_point, simulate
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_SIMULATIONS = 20_000
@@ -118,9 +118,9 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(DRIVERS)).assign(point="")
     for index in np.unique(worst).tolist():
         rows, point = np.flatnonzero(worst == index), system.points[index]
-        study = study_at(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
-        settings, at_point = collisions.settings[rows], system.at(point)
-        verdicts.loc[rows, list(DRIVERS)] = _judge_at_point(evaluator.for_study(study), at_point, settings)
+        study = at_point(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
+        settings, there = collisions.settings[rows], system.at(point)
+        verdicts.loc[rows, list(DRIVERS)] = _judge_at_point(evaluator.for_study(study), there, settings)
         verdicts.loc[rows, "point"] = point.name
     return verdicts
 

@@ -105,7 +105,7 @@ def rating(
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
     rater = assemble(study, study.source).rater
     assert rater is not None
-    cells = evaluator.for_study(study).simulate_cells(np.stack([*settings.values()]), "cells and robustness layers")
+    cells = evaluator.for_study(study).at_each_point(np.stack([*settings.values()]), "cells and robustness layers")
     return rate(study, rater, settings, cells)
 
 

@@ -159,14 +159,14 @@ def reduce_to_point(subject: Study | Case, point: str | None) -> Study | Case:
     InputError
         If the study has no such point.
     """
-    from safevar_sumo.sumo.matrix import study_at
+    from safevar_sumo.sumo.matrix import at_point
 
     if point is None:
         return subject
-    return study_at(subject, point, source="point") if isinstance(subject, Study) else at_point(subject, point)
+    return at_point(subject, point, source="point") if isinstance(subject, Study) else case_at(subject, point)
 
 
-def at_point(case: Case, point: str) -> Case:
+def case_at(case: Case, point: str) -> Case:
     """Results at one point of the study's matrix: their solutions and the original vehicle, simulated again there.
 
     Raises
@@ -176,10 +176,10 @@ def at_point(case: Case, point: str) -> Case:
     """
     import numpy as np
 
-    from safevar_sumo.sumo.matrix import evaluate, study_at
+    from safevar_sumo.sumo.matrix import at_point, evaluate
     from safevar_sumo.sumo.system import assemble
 
-    study, names = study_at(case.study, point, source="point"), list(case.characteristics.names)
+    study, names = at_point(case.study, point, source="point"), list(case.characteristics.names)
     system = assemble(study)
     scoring = system.measuring.scoring
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[names].to_numpy(float)])

@@ -31,7 +31,7 @@ from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_ha
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import contact_degree, point_record, simulate_all_points, study_at, vehicle_remarks
+from safevar_sumo.sumo.matrix import at_point, contact_degree, point_record, simulate_all_points, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -226,7 +226,7 @@ def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_n
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
     whole = study_in(subject)
-    study = whole if point is None else study_at(whole, point, source="point")
+    study = whole if point is None else at_point(whole, point, source="point")
     if isinstance(subject, Study) or not wanted:
         return Target(study, source)
     subject.require_solutions()

@@ -21,7 +21,7 @@ from safevar_sumo.questions.ask import Jobs, parse_question
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_figures
-from safevar_sumo.questions.subject import Results, at_point, changes_since
+from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, commands, replays, tested, trust
@@ -104,7 +104,7 @@ def report(
         for change in changes:
             warn(f"{path}: {change}")
     give = answer_to if ask else answer_or_reason
-    subjects = cases if point is None else [at_point(case, point) for case in cases]
+    subjects = cases if point is None else [case_at(case, point) for case in cases]
     with open_progress(progress) as show:
         studies = [
             ReportedStudy(

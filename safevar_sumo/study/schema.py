@@ -193,11 +193,13 @@ class MatrixTable(Table, frozen=True, kw_only=True):
     """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then
     rates every setting.
 
-    `aggregate` combines the points' safety degrees: `worst` takes the lowest one.
+    `aggregate` combines the points' safety degrees: `worst` takes the lowest one. With a `point`, by its name, only
+    this one is simulated, and nothing is rated.
     """
 
     tests: list[MatrixTest] = []
     protocol: Literal["", "euro_ncap_2026"] = ""
+    point: str = ""
     aggregate: Literal["worst"] = "worst"
 
     def __post_init__(self) -> None:

@@ -13,20 +13,11 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
-from safevar_sumo.protocol import cells_of_part
-from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
-from safevar_sumo.records import (
-    CellResults,
-    Evaluations,
-    FloatArray,
-    JsonObject,
-    Outcome,
-    SimulationRuns,
-    finite_or_none,
-)
+from safevar_sumo.protocol.rater import join_cells, rated_quantities
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, finite_or_none
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
-from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
+from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import drive_all, is_recorded, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
@@ -116,11 +107,8 @@ def evaluate(
     if takes_pairs:  # a variant and the original take turns: they share scenes
         originals = system.characteristics.with_original_vehicle(settings)
         vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
-    if system.rater is not None:
-        found = rate_settings(system, vehicles, engine)[0]
-    elif system.matrix:
-        results = simulate_all_points(system, vehicles, engine)
-        found = evaluations_at_worst_points(system, [result.evaluations for result in results])
+    if system.matrix:
+        found = evaluate_matrix(system, vehicles, engine)
     else:
         found = score(system, vehicles, drive_all(system, vehicles, engine))
     if not takes_pairs:
@@ -129,11 +117,11 @@ def evaluate(
     return replace(variants, metrics={**variants.metrics, ORIGINAL_DEGREE: found.f_safe[1::2]})
 
 
-def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple[Evaluations, CellResults]:
-    """Simulate settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their
-    results in every cell.
+def evaluate_matrix(system: System, settings: FloatArray, engine: Engine, *, each: bool = False) -> Evaluations:
+    """Evaluate settings, shape (N, n), at every point: at their worst ones; of a rated study also their rating points.
 
-    Traces are dropped, as they would take gigabytes.
+    With `each`, the evaluations have the rated results at every point, `cells`. Traces are dropped, as they would take
+    gigabytes.
     """
     results = {
         result.point.name: (result.evaluations, rated_quantities(result.runs))
@@ -142,20 +130,10 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine) -> tuple
     }
     at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
     cells, evaluations = join_cells(quantities), evaluations_at_worst_points(system, at_points)
-    if system.rater is None:  # the system has only some of the protocol's cells
-        return evaluations, cells
-    metrics = {**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
-    return replace(evaluations, metrics=metrics), cells
-
-
-def evaluate_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine) -> Evaluations:
-    """Evaluations of settings, shape (N, n), with their `cells`, in a part of a protocol's cells: `part` is (k, m) for
-    the k-th of m parts.
-    """
-    assert system.rater is not None
-    points = tuple(system.matrix[number] for number in cells_of_part(system.rater.protocol, *part))
-    evaluations, cells = rate_settings(replace(system, matrix=points, rater=None), settings, engine)
-    return replace(evaluations, cells=cells)
+    if system.rater is not None:
+        metrics = {**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
+        evaluations = replace(evaluations, metrics=metrics)
+    return replace(evaluations, cells=cells) if each else evaluations
 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
@@ -241,47 +219,22 @@ def system_at_worst_point(system: System, settings: FloatArray) -> System:
     return system.at(system.points[worst_points(system, at_points)[0]])
 
 
-def system_at_point(system: System, name: str, source: object) -> System:
-    """The system at a named point of a matrix; raises the errors of `study_at`."""
-    return system.at(_find_point(system, name, source))
-
-
-def _find_point(system: System, name: str, source: object) -> Point:
-    points = {point.name: point for point in system.matrix}
-    if name not in points:
-        similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)
-        legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
-        raise InputError(source, repr(name), legal if points else "a study with a matrix")
-    return points[name]
-
-
-def study_at(study: Study, name: str, source: object) -> Study:
-    """The study reduced to a named point of its matrix.
+def at_point(study: Study, name: str, source: object) -> Study:
+    """The study at a named point of its matrix alone.
 
     Raises
     ------
     InputError
         If no point has this name.
     """
-    system = assemble(study)
-    parameters = dict(_find_point(system, name, source).parameters)
-    assert study.matrix is not None
-    origin = replace_in(study.origin, point=name)
-    if system.rater is not None:
-        reduced_study = reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
-        return replace_in(reduced_study, origin=origin)
-    test_name, weather = parameters.pop("test"), parameters.pop("weather")
-    test = next(
-        test
-        for test in study.matrix.tests
-        if test.name == test_name
-        and test.over.keys() == parameters.keys()
-        and all(value in test.over[key] for key, value in parameters.items())
-    )
-    reduced_test = replace_in(
-        test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else []
-    )
-    return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]), origin=origin)
+    points = [point.name for point in assemble(study).matrix]
+    if study.matrix is None or name not in points:
+        similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)
+        legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
+        raise InputError(source, repr(name), legal if points else "a study with a matrix")
+    search = replace_in(study.search, objectives=[*OBJECTIVES]) if study.matrix.protocol else study.search
+    matrix, origin = replace_in(study.matrix, point=name), replace_in(study.origin, point=name)
+    return replace_in(study, matrix=matrix, origin=origin, search=search)
 
 
 def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:

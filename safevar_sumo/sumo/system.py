@@ -195,7 +195,7 @@ def _assemble(study: Study, source: str) -> System:
         for name in table:
             check_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
-    matrix = _matrix_points(study if rater is None else expand_protocol(study, weather), source)
+    matrix = _matrix_points(expand_protocol(study, weather), source)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network, f"{source}: {NETWORK_KEY}")
     if study.scenario.search:
@@ -304,7 +304,11 @@ def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
         if count > 1:
             legal = "unique names of tests, and each value once"
             raise InputError(source, f"matrix.tests: {count} points are {name!r}", legal)
-    return tuple(points)
+    if study.matrix is None or not study.matrix.point:
+        return tuple(points)
+    by_name = {point.name: point for point in points}
+    check_name(source, f"matrix.point = {study.matrix.point!r}", study.matrix.point, by_name)
+    return (by_name[study.matrix.point],)
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:

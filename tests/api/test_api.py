@@ -14,7 +14,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.study import load_study, tables_of
-from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
+from safevar_sumo.sumo.matrix import at_point, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -194,7 +194,7 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     points = simulate_all_points(system, system.characteristics.original[np.newaxis])
     worst = points[worst_points(system, [point.evaluations for point in points])[0]].point.name
     assert worst != points[-1].point.name  # the last one that is driven
-    alone = sv.simulate(study_at(study, worst, "the test")).trace
+    alone = sv.simulate(at_point(study, worst, "the test")).trace
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
 
 

@@ -19,7 +19,7 @@ from safevar_sumo.campaign.pool import Pool, WorkerLostError, open_pool
 from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
-from safevar_sumo.sumo.matrix import study_at
+from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
@@ -179,6 +179,6 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
     assert reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
     point = assemble(study).matrix[3].name
     assert (
-        reproduced(study_at(study, point, "test"), mass=original + 200)
+        reproduced(at_point(study, point, "test"), mass=original + 200)
         == f" --point '{point}' --set mass={original + 200}"
     )

@@ -101,7 +101,7 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     evaluator, matrix = Evaluator(STUDY, InlinePool(2)), assemble(STUDY).matrix
     colours = np.zeros((2, len(matrix)), dtype=np.int8)
     colours[:, :5] = [[0, 2, -1, 1, 0], [1, 0, 4, -1, 3]]  # worse, better, unknown before, unknown after, worst
-    monkeypatch.setattr(Evaluator, "simulate_cells", lambda self, settings, stage: None)
+    monkeypatch.setattr(Evaluator, "at_each_point", lambda self, settings, stage: None)
     monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
     original = evaluator.characteristics.original[np.newaxis]
     ((endings, worse_cells),) = compare_at_cells(evaluator, original)

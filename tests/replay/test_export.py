@@ -20,7 +20,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.results import write_imported
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import system_at_point
+from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import refused, run
 from tests.made_up import made_up_evaluations
@@ -62,8 +62,8 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
     out, chosen = results.with_name("out"), ("--point", point) if point else ()
     run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
-    at_point = system_at_point(system, point, "") if point else system
-    return out, compare_setting(load_study(study), at_point, setting)
+    there = assemble(at_point(load_study(study), point, "")) if point else system
+    return out, compare_setting(load_study(study), there, setting)
 
 
 def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:

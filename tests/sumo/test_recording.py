@@ -22,7 +22,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import study_at
+from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.recorded_world import distance_covered
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
@@ -164,7 +164,7 @@ def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
 
 
 def test_a_robot_drives_who_does_nothing_to_the_target_but_braking_for_nobody_is_told_with_its_points() -> None:
-    test = study_at(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear", "test")
+    test = at_point(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear", "test")
     assert reason(test, lambda seen: (0, 0)) == ""
     assert reason(test, lambda seen: (0, 1)) == BRAKES + NO_VERDICT
     assert reason(test, lambda seen: (0, 0.1 * (seen.time == 0))).startswith(

@@ -201,7 +201,7 @@ def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointCo
     """
     system, original = assemble(evaluator.study), evaluator.characteristics.original
     assert system.rater is not None
-    cells = evaluator.simulate_cells(np.vstack([original, settings]), "cells whose colour is worse")
+    cells = evaluator.at_each_point(np.vstack([original, settings]), "cells whose colour is worse")
     colours = system.rater.points(cells).colours.astype(int)
     # Steps by which a colour is worse; the original is in row 0.
     losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
