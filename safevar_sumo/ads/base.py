@@ -106,14 +106,16 @@ class PerVehicleAds(Ads):
 
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
         drivers = [self._create() for _ in range(n)]
-        for driver in drivers:
-            driver.start(nominal, step)
+        with np.errstate():
+            for driver in drivers:
+                driver.start(nominal, step)
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
         observations, pedals = list(_scalar_observations(seen)), [(0.0, 0.0)] * len(memory)
-        for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():  # vehicles whose run has not ended
-            pedals[i] = self._checked_pedals(memory[i].drive(observations[i]))
+        with np.errstate():
+            for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():  # vehicles whose run has not ended
+                pedals[i] = self._checked_pedals(memory[i].drive(observations[i]))
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:

@@ -11,8 +11,8 @@ from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from typing import Any
 
-from safevar_sumo.campaign.local import say_last_words
 from safevar_sumo.errors import InputError, SafevarError, describe_error
+from safevar_sumo.plugins.time_limit import say_last_words
 
 CLUSTER = (
     "the address of a Dask scheduler, such as tcp://host:8786; for tls:// certificates in Dask's configuration: "

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads.varied import VariedAds
-from safevar_sumo.campaign.local import end_if_longer
 from safevar_sumo.campaign.pool import Pool, WorkerLostError
 from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names

@@ -15,16 +15,12 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import IO, Any
+from typing import Any
 
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.time_limit import TIMEOUT_MARK, say_last_words
 from safevar_sumo.shipped import PACKAGE
-
-TIMEOUT_MARK = "Timeout ("
-"""What the interpreter writes first when a process exceeds its time limit."""
-_last_words: IO[str] | None = None
-"""Where this process, if it is a worker, writes what it was doing when it crashed or exceeded a time limit."""
 
 
 class ProcessWorker:
@@ -67,25 +63,6 @@ class ProcessWorker:
     def end(self) -> None:
         self._process.kill()
         self._executor.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def end_if_longer(time_limit: float) -> Iterator[None]:
-    """End this process, if it is a worker, when the context takes longer than a time limit [s]."""
-    if _last_words is None:
-        yield
-        return
-    faulthandler.dump_traceback_later(time_limit, exit=True, file=_last_words)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()
-
-
-def say_last_words(file: IO[str] | None) -> None:
-    """Make this process a worker, which writes to a file what it was doing when it exceeds a time limit."""
-    global _last_words
-    _last_words = file
 
 
 def _begin_work(path: ImportPath, last_words: Path) -> None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import inspect
 import math
 import operator
+import os
 import re
+import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +61,9 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         conditions = [_parse(text) for text in fail_if]
         if plot is not None:
             check_writable(plot, "plot", PICTURE_ENDINGS)
-        answer: Answer = call(**values)
         form = "json" if as_json else form
+        with nullcontext() if form == "text" else prints_to_standard_error():
+            answer: Answer = call(**values)
         if form != "text" or table or not values.get("quiet"):
             _print(answer, form, table)
         if plot is not None:
@@ -84,6 +88,22 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         callback=print_answer if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
+
+
+@contextmanager
+def prints_to_standard_error() -> Iterator[None]:
+    """Within the block, what user code, SUMO and workers print goes to standard error, so that standard output has the
+    answer alone.
+    """
+    sys.stdout.flush()
+    standard_output = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(standard_output, 1)
+        os.close(standard_output)
 
 
 def _argument(parameter: inspect.Parameter) -> click.Argument:

@@ -1,7 +1,8 @@
 """The contracts of users' classes: the methods that they must have, and what these may return; and errors of user code.
 
 A user's class is completed with the defaults of its base class, and its methods are replaced by ones that get read-only
-arguments and check what they return. An exception of user code becomes an error with its file and line.
+arguments and check what they return. An exception of user code becomes an error with its file and line. What user code
+tells numpy about floating-point errors (`np.seterr`) ends with the call: `np.errstate()` restores it.
 """
 
 from __future__ import annotations
@@ -180,7 +181,8 @@ class UserCode(NamedTuple):
         """
 
         def checked(*arguments: Any) -> FloatArray:
-            values = function(*map(read_only, arguments))
+            with np.errstate():
+                values = function(*map(read_only, arguments))
             shape = (count(arguments[0]),)
             return self.check_numbers(method, "values", values, shape, legal).astype(float)
 
@@ -236,8 +238,10 @@ def checked_class(code: UserCode, base: type) -> type:
     def checked_method(name: str, returned: Returned) -> Callable[..., UserValue]:
         def method(self: Any, *arguments: Any) -> UserValue:
             passed = [read_only(value) if i == returned.like else value for i, value in enumerate(arguments)]
-            result = getattr(super(cls, self), name)(*passed)
-            if result is None and not hasattr(getattr(base, name), ABSTRACT):
+            with np.errstate():
+                result = getattr(super(cls, self), name)(*passed)
+            is_optional = returned.then is None and not hasattr(getattr(base, name), ABSTRACT)
+            if result is None and is_optional:
                 return None
             return returned.check(code, name, result, arguments)
 

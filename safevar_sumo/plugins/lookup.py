@@ -16,6 +16,7 @@ from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, describe_error, did_you_mean, one_of
 from safevar_sumo.output import file_beside
@@ -130,7 +131,7 @@ class Lookup(NamedTuple):
         modules_before, dont_write_bytecode = set(sys.modules), sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         try:
-            with user_errors(self.source):
+            with user_errors(self.source), np.errstate():
                 return importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
             problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
@@ -230,7 +231,7 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str, sou
     InputError
         If the class does not take the parameters.
     """
-    with user_errors(source):
+    with user_errors(source), np.errstate():
         if issubclass(member.target, msgspec.Struct):
             return convert_table(source, parameters, member.target, key)
         try:

@@ -129,6 +129,11 @@ class Question:
         is_own = compute.__module__.partition(".")[0] == PACKAGE.name
         self.compute, self.name = compute, f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
         parameters = list(inspect.signature(compute).parameters.values())
+        if sum(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in parameters) < 2:
+            takes = f"takes ({', '.join(map(str, parameters))})"
+            raise InputError(
+                f"question {self.name!r}", takes, "(subject, evaluator), then other subjects, * and options"
+            )
         self.takes_results_only = str(parameters[0].annotation) == "Case"
         self.others = {
             parameter.name: str(parameter.annotation) == "Path"

@@ -61,7 +61,7 @@ def check_search(code: UserCode, method: str, search: Any, problem: Problem, rng
         raise code.wrong(method, quoted(search), "a generator: a method that yields settings and returns its result")
     yielded, budget, answer = set[bytes](), problem.evaluations, None
     while True:
-        with user_errors(code.source):
+        with user_errors(code.source), np.errstate():
             try:
                 output = search.send(answer)
             except StopIteration as end:

@@ -127,7 +127,7 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table by table."""
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
         raise InputError(path, f"cannot be read as TOML: {reason}", "the path of a study file") from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)

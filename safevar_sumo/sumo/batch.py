@@ -16,6 +16,7 @@ from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, open_rows, user_errors
+from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import (
     STANDSTILL,
@@ -103,10 +104,11 @@ def drive_all(
     SimulationError
         If SUMO fails.
     InputError
-        If a user's ADS fails.
+        If a user's ADS fails, or takes longer than the time limit.
     """
     points, n, (fleet, vehicles) = system.points, len(settings), system.at_encounters(settings)
-    with user_errors(system.source):
+    system.vehicle.compile()  # outside the time limit
+    with user_errors(system.source), end_if_longer(system.time_limit):
         stage = stage_of(system, settings)
         if not is_recorded(system, engine):
             with open_points_world(system, settings, stage) as sumo_world:

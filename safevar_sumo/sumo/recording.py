@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import msgpack, to_builtins
 
+from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
 from safevar_sumo.scenarios.base import lane_through
@@ -101,11 +102,11 @@ class Recording:
 
 class Scenes:
     """The scenes of a study, each recorded when it is first needed, with SUMO's options for the study's time step [s]
-    (None: that of the network).
+    (None: that of the network); errors name the study by `source`.
     """
 
-    def __init__(self, step_length: float | None = None) -> None:
-        self._step_length = step_length
+    def __init__(self, step_length: float | None = None, source: str = "study") -> None:
+        self._step_length, self._source = step_length, source
         self.options = () if step_length is None else ("--step-length", repr(step_length))
         self._recorded: dict[WorldScenario, Recording | str] = {}
 
@@ -124,12 +125,16 @@ class Scenes:
         ------
         SimulationError
             If SUMO fails.
+        UserCodeError
+            If a user's scenario fails.
         """
         missing = dict.fromkeys(scenario for scenario in scenarios if scenario not in self._recorded)
         reasons = {scenario: _reason_against_recording(scenario) for scenario in missing}
         new = [scenario for scenario, reason in reasons.items() if not reason]
-        keys = [(scenario, network, self.options) for scenario, network in zip(new, stage_networks(new), strict=True)]
-        self._recorded |= reasons | dict(zip(new, _recordings_of(keys) if keys else [], strict=True))
+        with user_errors(self._source):
+            networks = stage_networks(new)
+            keys = [(scenario, network, self.options) for scenario, network in zip(new, networks, strict=True)]
+            self._recorded |= reasons | dict(zip(new, _recordings_of(keys) if keys else [], strict=True))
         return [self._recorded[scenario] for scenario in scenarios]
 
     def reason_for_sumo(self, points: Sequence[Point]) -> str:

@@ -55,6 +55,7 @@ class System:
     - `scenes` are the recorded scenes of all points, and of points that it is reduced to.
     - `rater` rates results in the matrix of a protocol; None in a study that is not rated.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
+    - A simulation that takes longer than `time_limit` [s] counts as hung.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
@@ -71,6 +72,7 @@ class System:
     matrix: tuple[Point, ...] = ()
     rater: Rater | None = None
     scenes: Scenes = field(default_factory=Scenes)
+    time_limit: float = 300.0
     sees_nobody: bool = False
 
     @property
@@ -204,7 +206,7 @@ def _assemble(study: Study, source: str) -> System:
         original = {name: domain.original for name, domain in study.scenario.search.items()}
         scenario, weather, *_ = encounter(points[0], original)
         matrix = tuple(encounter(point, original) for point in matrix)
-    region, scenes = region_of(study, source), Scenes(study.step_length)
+    region, scenes = region_of(study, source), Scenes(study.step_length, source)
     if study.scenario.search:
         measuring = _with_safe_original(study, measuring, scenes, scenario)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
@@ -224,6 +226,7 @@ def _assemble(study: Study, source: str) -> System:
         scenes=scenes,
         matrix=matrix,
         rater=rater,
+        time_limit=study.search.time_limit,
     )
 
 

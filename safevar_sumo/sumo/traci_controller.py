@@ -85,7 +85,7 @@ class TraciController(Ads):
         global _active_view
         _active_view = view
         try:
-            with user_errors(self._source):
+            with user_errors(self._source), np.errstate():
                 function(traci_module(), VUT)
         finally:
             _active_view = None

@@ -23,7 +23,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import refused
+from tests.in_process import json_of, refused
 
 ROOT = Path(__file__).parents[2]
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
@@ -202,3 +202,25 @@ def test_before_a_total_is_known_a_terminal_says_searching() -> None:
         pass
     last = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue()).splitlines()[-1].rstrip()
     assert re.fullmatch(r"searching [━╸╺ ]+", last)
+
+
+def test_what_user_code_prints_leaves_the_json_alone(in_tmp: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Also what other processes and compiled code print."""
+    Path("loud.py").write_text(
+        "import os\nfrom safevar_sumo.ads import ScalarAds\n\nprint('loaded')\n\n\nclass Loud(ScalarAds):\n"
+        "    def drive(self, seen):\n        print('drives')\n        os.write(1, b'writes')\n        return 0.3, 0.0\n"
+    )
+    Path("loud.toml").write_text('extends = "smoke"\nname = "loud"\n[ads]\nmodel = "loud:Loud"\n')
+    for question in (("simulate", "loud.toml"), ("risk", "loud.toml", "--samples", "4", "--jobs", "1")):
+        assert json_of(*question)["question"] == question[0]
+        out, err = capfd.readouterr()
+        assert "writes" in err
+        assert not out
+
+
+def test_a_question_with_one_parameter_is_refused(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(in_tmp))
+    Path("asks.py").write_text(
+        "from safevar_sumo.questions.ask import question\n\n\n@question\ndef one(subject): ...\n"
+    )
+    refused("asks:one", "smoke", message=("question 'asks:one': takes (subject)", "(subject, evaluator"))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.records import differences
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -244,6 +245,13 @@ def scenario(method: str, body: str) -> str:
         ("observe", "result = (result[0]._replace(over=result[0].gap), result[1])", "returned over"),
         ("observe", "result = (result[0]._replace(gap='near'), result[1])", "returned gap = 'near'"),
         ("encounter", "result = result._replace(separation=result.separation[0])", "returned separation of shape (3,)"),
+        ("begin", "raise ValueError('boom')", "user code raised in begin: ValueError: boom"),
+        ("observe", "raise ValueError('boom')", "user code raised in observe: ValueError: boom"),
+        (
+            "encounter",
+            "return result\n\n    def actors(self, roads):\n        result = None",
+            "returned None from actors",
+        ),
         (
             "encounter",
             "result = result._replace(in_conflict=result.in_conflict | True, distance=result.distance * np.nan)",
@@ -251,7 +259,34 @@ def scenario(method: str, body: str) -> str:
         ),
     ],
 )
-def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
-    message = failing(mine(scenario(method, body), SCENARIO))
+@pytest.mark.parametrize("reacts", [True, False])
+def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, reacts: bool, mine: Mine) -> None:
+    module = scenario(method, body).replace("2.0\n", f"2.0\n    reactive_actors = {reacts}\n", 1)
+    message = failing(mine(module, SCENARIO))
     assert expected in message
     assert ("mine.py" if "raised" in message else "scenario.model = 'mine:Mine'") in message
+
+
+def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:
+    """The package divides by closing speeds of 0."""
+    strict = "import numpy as np\n\nnp.seterr(all='raise')\n" + CONSTANT.format(0.2)
+    strict = strict.replace("def drive(self, seen):\n", "def drive(self, seen):\n        np.seterr(all='raise')\n")
+    before, expected = np.geterr(), evaluate(system := mine(CONSTANT.format(0.2)), original_of(system))
+    found = evaluate(mine(strict), original_of(system))
+    assert not [*differences(expected.results, found.results)]
+    assert np.geterr() == before
+
+
+def test_a_simulation_in_this_process_that_takes_longer_than_the_limit_names_the_line(mine: Mine) -> None:
+    system = mine(CONSTANT.format("__import__('time').sleep(60)"), f"{ADS}[search]\ntime_limit = 0.2\n")
+    with pytest.raises(UserCodeError, match=r"longer than the time limit of 0\.2 s \(.*mine\.py:6\)"):
+        evaluate(system, original_of(system))
+
+
+def test_user_code_that_catches_all_errors_ends_at_the_time_limit_too(mine: Mine) -> None:
+    module = CONSTANT.format("[wait() for _ in range(9)]") + (
+        "\n\ndef wait():\n    try:\n        __import__('time').sleep(60)\n    except Exception:\n        pass\n"
+    )
+    system = mine(module, f"{ADS}[search]\ntime_limit = 0.2\n")
+    with pytest.raises(UserCodeError, match="longer than the time limit"):
+        evaluate(system, original_of(system))

@@ -74,8 +74,9 @@ class Mine:
         (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "returned no settings from search"),
         (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
         (IDLE.format(body="return iter([problem.original.settings])"), "returned <list_iterator"),
+        (IDLE.format(body="return None"), "returned None from search"),
     ],
-    ids=["lower", "nothing", "empty", "iterator"],
+    ids=["lower", "nothing", "empty", "iterator", "None"],
 )
 def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(
     module: str, problem: str, mine: Mine, folder: Path, tmp_path: Path

@@ -32,6 +32,7 @@ MISTAKES = [
     ("[metrics]\nttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
     ("[vehicle.characteristics.max_rpm]\noriginal = nan", "vehicle.characteristics.max_rpm.original = nan"),
     ("[ads", "cannot be read as TOML"),
+    (f"files = {3000 * '['}{3000 * ']'}", "cannot be read as TOML: maximum recursion depth exceeded"),
     ('name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
     ('title = "x"', "name is missing"),
     (

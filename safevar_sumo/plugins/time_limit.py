@@ -1,0 +1,91 @@
+"""The time limit of a simulation: one that takes longer counts as hung.
+
+It ends a worker, whose pool reports where it was; in any other process, where the system has timers, it is an error.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import IO
+
+from safevar_sumo.errors import SimulationError, UserCodeError
+from safevar_sumo.plugins.files import is_user_file
+
+TIMEOUT_MARK = "Timeout ("
+"""What the interpreter writes first when a process exceeds its time limit."""
+_last_words: IO[str] | None = None
+"""Where this process, if it is a worker, writes what it was doing when it crashed or exceeded a time limit."""
+_is_limited = False
+"""Whether a time limit is counting."""
+
+
+class _TimeIsUp(KeyboardInterrupt):
+    """Passes user code as Ctrl-C does; its argument is the error for the user."""
+
+
+def say_last_words(file: IO[str] | None) -> None:
+    """Make this process a worker, which writes to a file what it was doing when it exceeds a time limit."""
+    global _last_words
+    _last_words = file
+
+
+@contextmanager
+def end_if_longer(time_limit: float) -> Iterator[None]:
+    """End this process, if it is a worker, when the context takes longer than a time limit [s]; raise an error in the
+    main thread of any other process. Within such a context another one has no effect.
+
+    Raises
+    ------
+    UserCodeError
+        With the line of user code that took too long.
+    SimulationError
+        If no user code did.
+    """
+    global _is_limited
+    has_timer = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    if _is_limited or not (has_timer or _last_words is not None):
+        yield
+        return
+    _is_limited = True
+    try:
+        with _end_process(time_limit, _last_words) if _last_words is not None else _raise_error(time_limit):
+            yield
+    finally:
+        _is_limited = False
+
+
+@contextmanager
+def _end_process(time_limit: float, last_words: IO[str]) -> Iterator[None]:
+    faulthandler.dump_traceback_later(time_limit, exit=True, file=last_words)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+@contextmanager
+def _raise_error(time_limit: float) -> Iterator[None]:
+    def refuse(_signal: int, frame: FrameType | None) -> None:
+        problem = f"a simulation took longer than the time limit of {time_limit:g} s"
+        while frame is not None:
+            if is_user_file(frame.f_code.co_filename):
+                place = f"{frame.f_code.co_filename}:{frame.f_lineno}"
+                legal = "code that ends, or more time"
+                raise _TimeIsUp(UserCodeError("search.time_limit", f"{problem} ({place})", legal, place))
+            frame = frame.f_back
+        raise _TimeIsUp(SimulationError(f"{problem}, search.time_limit"))
+
+    previous_handler = signal.signal(signal.SIGALRM, refuse)
+    previous_timer = signal.setitimer(signal.ITIMER_REAL, time_limit)
+    try:
+        yield
+    except _TimeIsUp as end:
+        raise end.args[0] from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, *previous_timer)
+        signal.signal(signal.SIGALRM, previous_handler)
