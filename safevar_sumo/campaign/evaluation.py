@@ -30,6 +30,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
 """Number of settings of a study to verify in SUMO in questions."""
+KNOWN_SYSTEMS = 16
+"""Number of systems that a process keeps: questions about the fits of a vehicle change between them."""
 COMMAND_PREFIX = "; to reproduce it: "
 
 
@@ -88,7 +90,7 @@ def system_of(study: Study) -> System:
     return _assemble_packed(msgspec.msgpack.encode(study))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=KNOWN_SYSTEMS)
 def _assemble_packed(packed_study: bytes) -> System:
     study = msgspec.msgpack.decode(packed_study, type=Study)
     return assemble(study, study.source)

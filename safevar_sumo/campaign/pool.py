@@ -10,15 +10,19 @@ import os
 import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import FIRST_EXCEPTION, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
+from contextvars import copy_context
+from copy import copy
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol
+from threading import Event
+from typing import Any, Protocol, TypeVar
 
 from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, SafevarError, check_whole
 
+Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two looks at the jobs under way [s]."""
 MAX_DEATHS = 1
@@ -31,6 +35,10 @@ class WorkerLostError(SafevarError):
     def __init__(self, job: int, cause: str) -> None:
         super().__init__(cause)
         self.job = job
+
+
+class AbandonedError(SafevarError):
+    """Nobody waits for the results any more."""
 
 
 class Worker(Protocol):
@@ -61,6 +69,8 @@ class Pool:
 
     def __init__(self, workers: int, start: Callable[[int], Worker]) -> None:
         self.workers, self._start = workers, start
+        self._places: Sequence[int] = range(workers)
+        self._is_abandoned = Event()
         self._started, self.verified = dict[int, Worker](), Counter[bytes]()
         self.compiled = set[str]()
 
@@ -81,9 +91,11 @@ class Pool:
             If another worker dies of the same job.
         """
         results, deaths = dict[int, Any](), Counter[int]()
-        waiting, idle = deque(range(len(jobs))), deque(range(self.workers))
+        waiting, idle = deque(range(len(jobs))), deque(self._places)
         ended, under_way = SimpleQueue[Future[Any]](), dict[Future[Any], tuple[int, int]]()
         while len(results) < len(jobs):
+            if self._is_abandoned.is_set():
+                raise AbandonedError
             while waiting and idle:
                 place, number = idle.popleft(), waiting.popleft()
                 future = self._begin(place, function, jobs[number])
@@ -109,6 +121,40 @@ class Pool:
             else:
                 raise error
         return [results[number] for number in range(len(jobs))]
+
+    def share_out(self, functions: Sequence[Callable[[Pool], Result]]) -> list[Result]:
+        """The results of functions that give jobs to a pool, each in a thread with some of the workers; when one
+        raises an error, the others end.
+        """
+        count = min(len(functions), self.workers)
+        if count < 2:
+            return [function(self) for function in functions]
+        free, is_abandoned = SimpleQueue[Pool](), Event()
+        for number in range(count):
+            free.put(self._part(self._places[number::count], is_abandoned))
+
+        def call(function: Callable[[Pool], Result]) -> Result:
+            part = free.get()
+            try:
+                return function(part)
+            finally:
+                free.put(part)
+
+        with ThreadPoolExecutor(count) as threads:
+            futures = [threads.submit(copy_context().run, call, function) for function in functions]
+            try:
+                for future in wait(futures, return_when=FIRST_EXCEPTION).done:
+                    future.result()  # raises the error that ended the waiting
+                return [future.result() for future in futures]
+            finally:
+                is_abandoned.set()
+                threads.shutdown(cancel_futures=True)
+
+    def _part(self, places: Sequence[int], is_abandoned: Event) -> Pool:
+        """A pool of some of the workers, which knows what all of them know."""
+        part = copy(self)
+        part.workers, part._places, part._is_abandoned = len(places), places, is_abandoned
+        return part
 
     def close(self) -> None:
         """End all workers."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -26,6 +27,7 @@ from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
+Found = TypeVar("Found")
 Interval = tuple[float, float]
 """Lower and upper end."""
 CRITERION_SETTINGS = 1024
@@ -246,6 +248,32 @@ class Evaluator:
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
         return Evaluator(study, self._pool, self.progress, self._verified if verified is None else verified)
+
+
+def side_by_side(
+    evaluators: Sequence[Evaluator], measure: Callable[[Evaluator], Found], stage: str = ""
+) -> list[Found]:
+    """What `measure` finds with each evaluator of one pool; as many at the same time as there are workers. Progress
+    is shown for `stage`, or by the evaluators if they have no company.
+    """
+    if len(evaluators) < 2:
+        return [measure(one) for one in evaluators]
+    pool, show = evaluators[0]._pool, evaluators[0].progress
+    done = 0
+
+    def measure_on(evaluator: Evaluator, part: Pool) -> Found:
+        nonlocal done
+        evaluator._pool, evaluator.progress = part, show_no_progress
+        try:
+            found = measure(evaluator)
+        finally:
+            evaluator._pool, evaluator.progress = pool, show
+        done += 1
+        show(stage, done, len(evaluators))
+        return found
+
+    show(stage, done, len(evaluators))
+    return pool.share_out([partial(measure_on, evaluator) for evaluator in evaluators])
 
 
 @contextmanager

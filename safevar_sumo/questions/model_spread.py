@@ -5,12 +5,13 @@ equally well.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.evaluator import Evaluator, Found, side_by_side
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
@@ -18,10 +19,6 @@ from safevar_sumo.sumo.matrix import at_point, evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-if TYPE_CHECKING:
-    from safevar_sumo.questions.evaluator import Evaluator
-
-Found = TypeVar("Found")
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
@@ -120,11 +117,13 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
 
 def across(evaluator: Evaluator, fits: int, measure: Callable[[Evaluator], Found]) -> list[Found]:
     """What `measure` finds with the study's own parameters, then with each other of the first `fits` parameter sets;
-    these are not verified in SUMO, because scene and equations are those of the study.
+    several at the same time, in threads. The others are not verified in SUMO, because scene and equations are those of
+    the study.
     """
     study = evaluator.study
     others = studies_of_sets(study)[1:fits] if study.spread else []
-    return [measure(evaluator), *(measure(evaluator.for_study(other, verified=0)) for other in others)]
+    evaluators = [evaluator, *(evaluator.for_study(other, verified=0) for other in others)]
+    return side_by_side(evaluators, measure, "fits of the vehicle model")
 
 
 def studies_of_sets(study: Study) -> list[Study]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import msgspec
@@ -36,6 +37,8 @@ from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
 from safevar_sumo.vehicles.base import Prepared
 
+_ONE_AT_A_TIME = RLock()
+"""Held while a system is assembled, which unloads users' modules and may drive in SUMO."""
 CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
 """The legal forms of a controller written for TraCI."""
 
@@ -169,7 +172,7 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
-    with user_errors(source):
+    with user_errors(source), _ONE_AT_A_TIME:
         return _assemble(study, source)
 
 
