@@ -7,15 +7,16 @@ motorcyclist stands (CMRs) or brakes (CMRb).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios.base import PreCrash
+from safevar_sumo.scenarios.base import PreCrash, Scenario
 from safevar_sumo.scenarios.euro_ncap import (
     SAME_DIRECTION,
     Direction,
@@ -28,7 +29,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     SpeedProfile,
     lateral_offset,
 )
-from safevar_sumo.scenarios.tracks import BODIES, KMH, Track, first_in_strip, travelled
+from safevar_sumo.scenarios.tracks import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Track, first_in_strip, travelled
 from safevar_sumo.study import searched
 
 FINAL_SPEED = 2.0
@@ -38,6 +39,14 @@ STEADY_SPEED_LIMIT = 80.0
 """
 
 
+BESIDE = (-50.0, -40.0)
+"""Places beside the path where a benign target moves along [% of the vehicle's width from its left corner]."""
+LANE_WIDTH = 3.5
+"""Distance of the next lane [m]."""
+HEADWAYS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
+"""Distances of a car in the next lane at the start, as time headways [s]; every fourth is enough where other scenes
+differ more from each other.
+"""
 VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start")
 """The mark of the vehicle's speed, which a study may search."""
 
@@ -115,6 +124,13 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     target_speed: Annotated[float, Meta(gt=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")] | None = None
     acceleration_distance: Metres | None = None
     time_to_impact: Seconds = 6.0
+
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """The target moves along beside the vehicle's path; a car is in the next lane."""
+        for place in BESIDE:
+            name = f"{self.test}, {self.speed:g} km/h, beside at {place:g} %"
+            yield name, replace(self, impact_location=place)
+        yield from next_lane(self.speed, HEADWAYS[::4], self.vut_length, self.vut_width)
 
     def obstacle(self) -> str:
         """The target, which is ahead."""
@@ -201,6 +217,10 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """Gap to the target at the start [m]."""
         return self.parameter("headway") * self.speed * KMH
 
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """A car is in the next lane."""
+        return next_lane(self.speed, HEADWAYS, self.vut_length, self.vut_width)
+
     @property
     def direction(self) -> Direction:
         """Direction of the target."""
@@ -251,3 +271,13 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         in_braking = self.brakes_at + (root - closing_speed) / b
         braking = np.where(gap_at_braking > closed_by_braking, after_braking, in_braking)
         return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[()]
+
+
+def next_lane(
+    speed: float, headways: Sequence[float], vut_length: float = VUT_LENGTH, vut_width: float = VUT_WIDTH
+) -> Iterator[tuple[str, Scenario]]:
+    """Benign scenes in which a car stands in the next lane at these headways [s], each with a description."""
+    place = 100 * (LANE_WIDTH / vut_width + 0.5)
+    for headway in headways:
+        car = CarToCar(speed=speed, headway=headway, vut_length=vut_length, vut_width=vut_width, impact_location=place)
+        yield f"{speed:g} km/h, a car in the next lane {headway:g} s ahead", car

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -314,6 +314,10 @@ class Scenario:
     def remarks(self) -> list[str]:
         """Remarks for the user on the scenario's parameters."""
         return []
+
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """Scenes like this one in which nobody needs to brake, each with a description; none by default."""
+        return ()
 
     def obstacle(self) -> str:
         """What the vehicle hits in a collision, in words."""

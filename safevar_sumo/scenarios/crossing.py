@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios.base import PreCrash
+from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
+from safevar_sumo.scenarios.base import PreCrash, Scenario
 from safevar_sumo.scenarios.euro_ncap import (
     FROM_LEFT,
     FROM_RIGHT,
@@ -44,6 +47,12 @@ ROUNDING_STEP = 0.5
 """A time to impact above `TIME_TO_IMPACT` is rounded up to a multiple of this step [s]."""
 STOP_DISTANCE = 5.0
 """Distance past the middle of the lane at which a pedestrian stops [m]."""
+SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
+"""Distances from the vehicle's path at which a benign pedestrian stops [m]."""
+LEADS = (1.5, 2.0)
+"""Times by which a benign pedestrian is at the place of the impact before the vehicle [s]: the path is clear half a
+second later.
+"""
 PRE_CRASH = {TESTS[test].target: TESTS[test].pre_crash for test in ("CPFA", "CPNCO", "CBNA", "CCCscp", "CMCscp")}
 """Pre-crash types by target."""
 
@@ -127,6 +136,10 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     lateral_start, acceleration_distance
         Distance of the standing target from the middle of the lane, and distance within which it reaches its speed [m].
         Without a `lateral_start` cyclists, motorcyclists and cars start at their speed.
+    short
+        Distance before the vehicle's path at which a pedestrian stops, who otherwise stops 5 m past the middle [m].
+    lead
+        Time by which a target with a `lateral_start` is at the place of the impact before the vehicle [s].
     start_share
         Share of the usual distance to the impact at which the target starts [-].
     heading
@@ -172,6 +185,8 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     side: Literal["near", "far"] | None = None
     lateral_start: Annotated[float, Meta(gt=0, le=12)] | None = None
     acceleration_distance: Metres | None = None
+    short: Metres | None = None
+    lead: Annotated[float, Meta(ge=0, le=10)] = 0.0
     start_share: Annotated[float, Meta(gt=0, le=1)] = 1.0
     heading: Heading = 0.0
     hidden: bool | None = None
@@ -181,12 +196,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     @property
     def stop(self) -> float:
         """Position at which a pedestrian stops, past the middle of the lane [m]."""
-        return STOP_DISTANCE
-
-    @property
-    def lead(self) -> float:
-        """Time by which the target is at the place of the impact before the vehicle [s]."""
-        return 0.0
+        if self.short is None:
+            return STOP_DISTANCE
+        return -(self.vut_width + BODIES[self.parameter("target")].length) / 2 - self.short
 
     @property
     def pre_crash(self) -> PreCrash:
@@ -221,6 +233,17 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         y = start.impact_left + start.direction.left * path
         crossing = Track("target", target, *BODIES[target], x, y, *start.direction, speed)
         return [crossing, *self._parked_cars(impact)] if self.parameter("hidden") else [crossing]
+
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next lane."""
+        row = f"{self.test}, {self.speed:g} km/h"
+        if self.is_on_foot and self.parameter("lateral_start") is not None and not self.heading:
+            middle = replace(self, impact_location=50.0, start_share=1.0)
+            for short in SHORT_OF_PATH:
+                yield f"{row}, stops {short:g} m short", replace(middle, short=short)
+            for lead in LEADS:
+                yield f"{row}, leaves {lead:g} s before", replace(middle, hidden=False, lead=lead)
+        yield from next_lane(self.speed, HEADWAYS[::4], self.vut_length, self.vut_width)
 
     def _parked_cars(self, impact: Any) -> list[Track]:
         """The parked cars beside the lane, and the row that hides the target."""

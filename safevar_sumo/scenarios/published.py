@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import product
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.records import KMH_PER_MS, BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
 from safevar_sumo.scenarios.base import (
     CROSSING_LANE,
     NETWORK_KEY,
@@ -19,12 +23,14 @@ from safevar_sumo.scenarios.base import (
     Layout,
     PreCrash,
     Roads,
+    Scenario,
     Scene,
     World,
     WorldScenario,
     XmlChanges,
     as_text,
 )
+from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.study import searched
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
@@ -33,6 +39,12 @@ ROUNDING = 1e-6
 VUT_LANE, FOOTPATH_LANE = "approach_0", "footpath_0"
 WALKING_SPEED, LATERAL_START = 1.8, 5.16
 """The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic file."""
+
+
+SLOW_SPEEDS = (10.0, 15.0, 20.0)
+"""Speeds near which vehicles reach the pedestrian [km/h]."""
+CITY_SPEEDS = (20.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
+"""Speeds with a car in the next lane, of a vehicle that starts at rest [km/h]."""
 
 
 def approach(roads: Roads | World) -> Frame:
@@ -128,6 +140,13 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
         if self.distance is None:
             return None
         return approach(roads).crossing_position(roads, CROSSING_LANE) - self.distance
+
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for nobody."""
+        target_speed = WALKING_SPEED * KMH_PER_MS
+        near = Crossing(test="CPNA", target_speed=target_speed, time_to_impact=7.0)
+        for walk, speed in product((near, replace(near, test="CPFA")), SLOW_SPEEDS):
+            yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         frame, times = approach(roads), np.arange(samples)[:, np.newaxis]
@@ -238,6 +257,11 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     def _front(self) -> Any:
         """Position of the vehicle's front on its lane at the start [m]."""
         return VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
+
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """A car is in the next lane."""
+        for speed in CITY_SPEEDS:
+            yield from next_lane(speed, HEADWAYS)
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         frame, still = Frame.of(roads.lane("road_0")), np.zeros((samples, 1))

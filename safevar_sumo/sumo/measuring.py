@@ -48,16 +48,14 @@ class Measuring(NamedTuple):
     scoring: Scoring
 
 
-def measuring_of(study: Study, lookup: Lookup) -> Measuring:
-    """Look up the metrics and objectives that a study names.
+def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
+    """Look up the metrics and objectives that a study names; `has_stops`: one of its scenarios brakes fully.
 
     Raises
     ------
     InputError
         If a metric or measure of change does not exist, is invalid, or has a name that is taken.
     """
-    tests = [] if study.matrix is None else study.matrix.tests
-    has_stops = "stop" in (study.scenario.model, *(test.model for test in tests))
     further = [
         metric for metric, is_meant in ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops)) if is_meant
     ]

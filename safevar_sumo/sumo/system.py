@@ -190,7 +190,10 @@ def _assemble(study: Study, source: str) -> System:
             "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None"
         )
         raise InputError(source, problem, expected)
-    measuring = measuring_of(study, Lookup.of(study, source))
+    rater = rater_of(study, source)
+    matrix = _matrix_points(expand_protocol(study, weather), source)
+    has_stops = any(one.brakes_fully for one in (scenario, *(point.scenario for point in matrix)))
+    measuring = measuring_of(study, Lookup.of(study, source), has_stops=has_stops)
     tables_of_metrics = {
         "published": study.published,
         "repeatability": study.repeatability,
@@ -199,8 +202,6 @@ def _assemble(study: Study, source: str) -> System:
     for key, table in tables_of_metrics.items():
         for name in table:
             check_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
-    rater = rater_of(study, source)
-    matrix = _matrix_points(expand_protocol(study, weather), source)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network, f"{source}: {NETWORK_KEY}")
     if study.scenario.search:

@@ -20,9 +20,9 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.repair import attack, smallest, write_repair
+from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.questions.repair.problem import Parameter, RepairProblem
 from safevar_sumo.records import FloatArray, differences
-from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
@@ -326,7 +326,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
     blind = {"model": "aeb", "parameters": {"reach": 0.001}}
     system = assemble(sv.load_study(name, ads=blind))
-    benign = replace(system, matrix=tuple(benign_points(system.points)))
+    benign = replace(system, matrix=tuple(benign_scenes(sv.load_study(name), system)))
     assert len({scene.name for scene in benign.matrix}) == len(benign.matrix) >= 40
     for result in simulate_all_points(benign, system.characteristics.original[None]):
         assert not result.evaluations.collided[0], result.point.name

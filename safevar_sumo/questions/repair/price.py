@@ -10,10 +10,10 @@ import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.evaluation import with_parameters
+from safevar_sumo.plugins import user_errors
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
-from safevar_sumo.scenarios.benign import benign_points
 from safevar_sumo.study import MatrixTable, Study
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
@@ -61,8 +61,8 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
 
 
 def benign_scenes(study: Study, system: System) -> list[Point]:
-    """The benign scenes that a study names, else those like its shipped scenarios, in the original encounter and with
-    all searched parameters of the scenario at their lower or upper ends; there may be none.
+    """The benign scenes that a study names, else those that its scenarios know, in the original encounter and with all
+    searched parameters of the scenario at their lower or upper ends; there may be none.
     """
     if study.repair.benign:
         return list(assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix)
@@ -71,7 +71,13 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
         dict(zip(searched.names, end.tolist(), strict=True))
         for end in (searched.original, searched.lower, searched.upper)
     ]
-    return benign_points(encounter(point, values) for values in ends for point in system.points)
+    scenes = dict[str, Point]()
+    with user_errors(system.source):
+        for point in (encounter(point, values) for values in ends for point in system.points):
+            for description, scenario in point.scenario.benign():
+                name = f"{description}, {point.weather.name}"
+                scenes.setdefault(name, Point(scenario, point.weather, name))
+    return list(scenes.values())
 
 
 def needless_braking(system: System, benign: list[Point]) -> list[bool]:

@@ -1,0 +1,116 @@
+"""What is shipped has no privilege: its source in a user's file gives the same results, to the bit."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from safevar_sumo.ads import ADS
+from safevar_sumo.questions.repair.price import benign_scenes
+from safevar_sumo.results import load_runs
+from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.search import ALGORITHMS
+from safevar_sumo.study import Study, free_parameters, load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import VEHICLES
+from tests.in_process import searched
+from tests.made_up import drawn
+
+BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
+"""A study with each scenario; all others are driven by the car of `wear`."""
+FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
+"""Those that are copied in every run of the tests; all others are slow together."""
+
+
+def each(names: Iterable[str]) -> list[Any]:
+    return [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in names]
+
+
+def copied(model: type, folder: Path) -> str:
+    """The name of a class in a copy of its source, in a user's folder."""
+    source = Path(inspect.getfile(model)).read_text()
+    (folder / f"copy_of_{model.__name__.lower()}.py").write_text(source)
+    return f"copy_of_{model.__name__.lower()}:{model.__name__}"
+
+
+def results_of(study: Study) -> Mapping[str, np.ndarray]:
+    system = assemble(study)
+    found: Mapping[str, np.ndarray] = evaluate(system, drawn(system, 8, 2)).results
+    return found
+
+
+def assert_equal(ours: Study, theirs: Study) -> None:
+    expected, found = results_of(ours), results_of(theirs)
+    assert expected.keys() == found.keys()
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def with_scenario(name: str, model: str, **tables: Any) -> Study:
+    """A study of one scenario, and the same of its copy."""
+    study = load_study(BASES.get(name, "wear"), scenario={"model": name}, **{"matrix": None, **tables})
+    return msgspec.structs.replace(study, scenario=msgspec.structs.replace(study.scenario, model=model))
+
+
+@pytest.mark.parametrize("name", each(SCENARIOS))
+def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(name: str, in_tmp: Path) -> None:
+    own, free = copied(SCENARIOS[name], in_tmp), free_parameters(SCENARIOS[name])
+    assert_equal(with_scenario(name, name), with_scenario(name, own))
+    if not free:
+        return
+    key, one = next(iter(free.items()))
+    middle = (one.lower + one.upper) / 2
+    matrix = {"tests": [{"name": "it", "over": {key: [one.lower, middle]}}]}
+    assert_equal(with_scenario(name, name, matrix=matrix), with_scenario(name, own, matrix=matrix))
+    search = {key: {"lower": middle, "upper": one.upper, "original": one.upper, "unit": one.unit}}
+    base = load_study(BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search})
+    copy = msgspec.structs.replace(base, scenario=msgspec.structs.replace(base.scenario, model=own))
+    assert_equal(base, copy)
+
+
+@pytest.mark.parametrize("name", ["crossing", "along", "car_to_car", "pedestrian_crossing", "lead_vehicle_stopped"])
+def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_tmp: Path) -> None:
+    names = []
+    for model in (name, copied(SCENARIOS[name], in_tmp)):
+        study = with_scenario(name, model)
+        names.append([point.name for point in benign_scenes(study, assemble(study))])
+    assert names[0] == names[1] != []
+
+
+@pytest.mark.parametrize("name", each(VEHICLES))
+def test_a_vehicle_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
+    base = next(study for study in ("sun", "lgsvl", "native", "wear") if load_study(study).vehicle.model == name)
+    ours = load_study(base, matrix=None)
+    vehicle = msgspec.structs.replace(ours.vehicle, model=copied(VEHICLES[name], in_tmp))
+    assert_equal(ours, msgspec.structs.replace(ours, vehicle=vehicle))
+
+
+@pytest.mark.parametrize("name", each(ADS))
+def test_a_driving_system_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
+    base = next((one for one in ("sun", "lgsvl", "native", "wear") if load_study(one).ads.model == name), None)
+    parameters = {} if base is None else load_study(base).ads.parameters
+    own = copied(ADS[name], in_tmp)
+    ours, theirs = (
+        load_study(base or "wear", matrix=None, ads={"model": model, "parameters": parameters}) for model in (name, own)
+    )
+    assert_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("name", each(["nsga2", "rs"]))
+def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(name: str, in_tmp: Path) -> None:
+    """Random numbers go with an algorithm's name, so the copy has it, too."""
+    module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
+    (in_tmp / "named.py").write_text(f"from {module} import {class_}\n\n{name} = {class_}\n")
+    tables = []
+    for number, model in enumerate((name, f"named:{name}")):
+        search = {"algorithms": [model], "runs": 1, "population": 10, "evaluations": 40}
+        rows = load_runs(searched(load_study("smoke", search=search), in_tmp / f"results{number}")).solutions
+        tables.append(rows.drop(columns=["algorithm", "handle"], errors="ignore").to_csv(index=False))
+    assert tables[0] == tables[1]
