@@ -49,6 +49,10 @@ def convert_table(source: object, raw: Any, table: type[T], prefix: str = "") ->
         raise InputError(source, error.problem, error.legal) from None
 
 
+NO_KEY = "origin"
+"""Field of a study that no file may have."""
+
+
 def _mistake(source: object, raw: Any, table: Any, prefix: str, message: str) -> InputError:
     """The error for a message of msgspec, which ends with the place of the mistake."""
     problem, _, location = message.partition(" - at `$")
@@ -85,10 +89,11 @@ def _mistake(source: object, raw: Any, table: Any, prefix: str, message: str) ->
 
 def _unknown_key(source: object, path: str, key: str, kind: Any, table: Any) -> InputError:
     """The error for an unknown key, with the nearest key of its own table, or of another table in the whole one."""
-    own = kind.__struct_fields__
+    own = [name for name in kind.__struct_fields__ if name != NO_KEY]
     places = {
         inner: f"{field.name}.{inner}"
         for field in msgspec.structs.fields(table)
+        if field.name != NO_KEY
         for inner in getattr(field.type, "__struct_fields__", ())
     } | {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)

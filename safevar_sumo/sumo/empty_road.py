@@ -56,4 +56,5 @@ def _problem(runs: SimulationRuns) -> str:
         return ""
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
-    return f"never reaches the encounter (it gets {distance:.1f}{of_needed} m)"
+    commanded = f"with at most {trace.throttle[:end, 0].max():.2g} of the throttle and {brake.max():.2g} of the brake"
+    return f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})"

@@ -21,6 +21,7 @@ from safevar_sumo.results.manifest import evaluation_keys
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study import Limit, Origin, limits_of, load_study, study_names, tables_of, write_study
 from safevar_sumo.study.file_schema import schema_text
+from safevar_sumo.sumo.system import assemble
 
 SUN = load_study("sun").vehicle.characteristics
 ALL_FIXED = "".join(
@@ -83,7 +84,13 @@ MISTAKES = [
         "metrics: also = ['max_jerk', 'max_jerk']\nexpected: each metric once",
     ),
     ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
-    ('[vehicle]\nmodel = "tesla"', "vehicle: characteristics is missing"),
+    (
+        '[vehicle]\nmodel = "tesla"',
+        "vehicle.model = 'tesla' has no characteristics: vehicle.characteristics is missing",
+    ),
+    ('[vehicle]\nmodel = "carl"', "vehicle.characteristics is missing; did you mean 'carla'?"),
+    ("colour = 1", "colour: there is no such key\nexpected: one of ads, constraints, correlations, limits, matrix"),
+    ("colour = 1", "name, published"),
     ('extends = "mine.toml"', "extends = 'mine.toml' leads back to "),
     ('[scenario]\nkind = "fmu"', "scenario.kind = 'fmu'\nexpected: no kind"),
     ('[spread]\n"ads.parameters.brake_gapp" = [1]', "spread.'ads.parameters.brake_gapp' is no parameter of the study"),
@@ -160,7 +167,7 @@ MISTAKES = [
     ),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Typo"]', "Typo"),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Trajectory/Heading"]', "is simulated"),
-    ('extends = "euro_ncap_rating"\n[matrix]\nprotocol = ""', "tests, or a protocol"),
+    ('[matrix]\naggregate = "worst"', "matrix: 0 tests and protocol = ''\nexpected: tests, or a protocol"),
     ("[search.nsga2]\ntournament_size = 1", "search.nsga2.tournament_size = 1"),
     ("[search.nsga2]\ntournament_sizes = 7", "did you mean 'tournament_size'?"),
     ("[search.nsga]\ntournament_size = 7", "did you mean 'nsga2'?"),
@@ -285,3 +292,11 @@ def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> 
     assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(load_study("native")))
     assert "limits" not in tables_of(load_study("native"))
     assert load_study(tables_of(study)).limits == study.limits
+
+
+def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
+    scenario = {"model": "crossing", "parameters": {"test": "CPNA", "speed": 30}}
+    study = load_study({"extends": "wear", "name": "mine", "scenario": scenario, "matrix": {"tests": []}})
+    assert study.matrix is None
+    assert [point.scenario.test for point in assemble(study).points] == ["CPNA"]
+    assert load_study(tables_of(study)).matrix is None

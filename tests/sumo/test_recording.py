@@ -137,7 +137,10 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
 
 FIRST = "On a first drive, with nobody in sight, the original vehicle "
 NO_VERDICT = ". So its drives with somebody in sight do not show how it reacts to them: no verdict."
-STANDS = f"{FIRST}never reaches the encounter (it gets 0.0 of 11.9 m){NO_VERDICT}"
+STANDS = (
+    f"{FIRST}never reaches the encounter (it gets 0.0 of 11.9 m, with at most 0 of the throttle and 0 of the brake)"
+    f"{NO_VERDICT}"
+)
 BRAKES = f"{FIRST}brakes without an obstacle"
 
 
@@ -148,9 +151,12 @@ def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, obj
 @pytest.mark.parametrize(
     ("pedals", "expected"),
     [
-        (lambda seen: (0, 1), STANDS),
+        (lambda seen: (0, 1), STANDS.replace("0 of the brake", "1 of the brake")),
         (lambda seen: (0, 0), STANDS),
-        (lambda seen: (0.02, seen.gap < 5), STANDS.replace("0.0 of", "0.5 of")),
+        (
+            lambda seen: (0.02, seen.gap < 5),
+            STANDS.replace("0.0 of", "0.5 of").replace("0 of the thr", "0.02 of the thr"),
+        ),
         (lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5), BRAKES + NO_VERDICT),
         (lambda seen: (seen.speed < 5, seen.speed > 5), ""),  # a cruise control with the pedals' full strokes
         # Stands on its brake, but only because of the pedestrian.

@@ -37,7 +37,10 @@ CHECKS: Mapping[str, str] = {
         "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the "
         "vehicles; keep what a vehicle remembers in its memory or its own instance, not in a class or a module"
     ),
-    "reaction": "check that the code reads the quantity that it should react to, with the right sign and unit",
+    "reaction": (
+        "command enough throttle while nobody is in sight, where `gap` is infinite; check that the code reads the "
+        "quantity that it should react to, with the right sign and unit"
+    ),
 }
 """The checks, with advice on a failure. All but `reaction`, of which every answer itself warns, also keep a study from
 starting.
