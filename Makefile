@@ -28,6 +28,7 @@ benchmark: .venv/installed-test
 	$(RUN) benchmarks/evaluation.py
 	$(RUN) benchmarks/campaign.py
 	$(RUN) benchmarks/growth.py
+	$(RUN) benchmarks/answers.py
 
 .venv/installed: $(PACKAGE)
 	$(PYTHON) -m venv .venv

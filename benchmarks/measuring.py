@@ -27,6 +27,8 @@ MEANINGS = {
     "two_workers_of_ceiling": "share of that ceiling that two workers reach",
     "outside_simulation": "share of all processor time that is not simulation",
     "cluster": "a Dask cluster of two workers is so many times as fast as two processes",
+    "answer": "an answer takes so many times what its simulations cost in large batches",
+    "answer_simulating": "its simulations take so many times that",
     "growth_time": "the last evaluations take so many times what the first took",
     "growth_memory": "a worker holds so many times the memory that it held after the first 5,000 evaluations",
     "growth_mebibytes": "a worker holds so many MiB more than after the first 5,000 evaluations",
@@ -50,7 +52,7 @@ def print_records(records: Iterable[Record], *, as_json: bool) -> None:
     for record in records:
         print(
             (
-                f"{record.study:8} {record.population:6d}  {record.measure:18} {record.ratio:7.2f}  "
+                f"{record.study:8} {record.population:7d}  {record.measure:18} {record.ratio:7.2f}  "
                 f"{MEANINGS[record.measure]}"
             ),
             flush=True,
