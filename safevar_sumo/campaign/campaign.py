@@ -76,7 +76,8 @@ def run_campaign(
     SafevarError
         If a journal cannot be written, another process works on a run, or the study is at fault.
     """
-    results = ResultsDirectory(directory, study, identity_of(study, system), system.measuring.scoring)
+    use = check_code(study, pool)
+    results = ResultsDirectory(directory, study, identity_of(study, system, use.modules), system.measuring.scoring)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     engine_used, reason = choose_engine(system, engine)
@@ -88,7 +89,9 @@ def run_campaign(
     show_journals = journal_progress(study, keys, directory, progress)
     show_journals([])
     compile_vehicle(study, pool, progress)
-    check_code(study, pool)
+    if undeclared := [name for name in use.opened if name not in results.manifest["files"]]:
+        files = ", ".join(undeclared)
+        warn(f"study {study.name!r}: user code reads {files}, which no `files` of the study names: edits go unnoticed")
     no_verdict = ask_why_no_verdict(study, pool)
     if no_verdict:
         warn(f"study {study.name!r}: {no_verdict}")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Iterable
 from pathlib import Path
 
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins import Files, code_files, digests, files_in
+from safevar_sumo.plugins import Files, code_files, digests, digests_by_name, files_in
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
@@ -15,22 +16,23 @@ from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
 
 
-def identity_of(study: Study, system: System) -> JsonObject:
+def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonObject:
     """The layers of a manifest except the study: plain values that are the same in every process.
 
+    `used` are names of further files, which user code was seen to load; those that exist belong to the identity.
     `files` are digests of files; `results` is the version of the results; `platform` are properties of the machine
     that may affect the last bit of a result.
     """
     return {
-        "files": files_of(study, system),
+        "files": files_of(study, system, used),
         "results": RESULTS,
         "platform": {"system": platform.system(), "machine": platform.machine()},
     }
 
 
-def files_of(study: Study, system: System) -> Files:
-    """Digests, by name, of the files that a study's results depend on: of its networks, its user code and FMUs, and the
-    data files that it names.
+def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
+    """Digests, by name, of the files that a study's results depend on: of its networks, its user code and FMUs, the
+    data files that it names, and those of the names `used` that exist.
     """
     places = study.origin.places
     networks = {point.scenario.network for point in system.points}
@@ -38,4 +40,5 @@ def files_of(study: Study, system: System) -> Files:
     network_files = {network.path(name) for network in opened for name, _ in network.digests}
     fmus = {Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)}
     data = {file for path in data_files(study).values() for file in files_in(Path(path))}
-    return digests(network_files | code_files(user_modules(study), places) | fmus | data, places)
+    known = digests(network_files | code_files(user_modules(study), places) | fmus | data, places)
+    return dict(sorted((digests_by_name(used, places) | known).items()))

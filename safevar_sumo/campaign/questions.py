@@ -28,6 +28,7 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import manifest_of
 from safevar_sumo.study import Study, user_code_names
@@ -149,8 +150,9 @@ def _why_no_verdict(task: Task) -> str:
     return why_no_verdict(system_of(task.study)) or ""
 
 
-def check_code(study: Study, pool: Pool) -> None:
-    """Check the user code of a study in a worker, unless it has passed before with the same files.
+def check_code(study: Study, pool: Pool) -> Use:
+    """Check the user code of a study in a worker, unless it has passed before with the same files; returns what it used
+    there.
 
     Raises
     ------
@@ -158,19 +160,25 @@ def check_code(study: Study, pool: Pool) -> None:
         With file, line and advice of the first finding that makes results wrong.
     """
     if not user_code_names(study):
-        return
+        return Use({}, [])
     identity = json.dumps(manifest_of(study, identity_of(study, system_of(study))), sort_keys=True)
     digest = hashlib.sha256(identity.encode()).hexdigest()
-    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / digest
-    if marker.exists():
-        return
-    carry_out(_refuse_defects, [(Task(study=study),)], pool)
+    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
+    with suppress(OSError, msgspec.MsgspecError):
+        known = msgspec.json.decode(marker.read_bytes(), type=Use)
+        if known.modules == digests_by_name(known.modules, study.origin.places):
+            return known
+    use: Use = carry_out(_refuse_defects, [(Task(study=study),)], pool)[0]
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
+        marker.write_bytes(msgspec.json.encode(use))
+    return use
 
 
-def _refuse_defects(task: Task) -> None:
+def _refuse_defects(task: Task) -> Use:
     from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
 
-    refuse_defects(task.study)
+    unload_user_modules()
+    with record_use(task.study.origin.places) as use:
+        refuse_defects(task.study)
+    return use

@@ -98,7 +98,7 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
 
 def refuse_other_inputs(task: Task, share: Share) -> None:
     """Raise an error if the inputs of a study's results are not those with which it began."""
-    now = manifest_of(task.study, identity_of(task.study, system_of(task.study)))
+    now = manifest_of(task.study, identity_of(task.study, system_of(task.study), share.manifest["files"]))
     for _, text, _ in differences(share.manifest, now):
         raise InputError(
             f"study {task.study.name!r}",

@@ -23,6 +23,7 @@ from safevar_sumo.plugins.files import (
     Files as Files,
     code_files as code_files,
     digests as digests,
+    digests_by_name as digests_by_name,
     file_by_name as file_by_name,
     files_in as files_in,
     is_shipped as is_shipped,
@@ -36,3 +37,4 @@ from safevar_sumo.plugins.lookup import (
     only_from as only_from,
     unload_user_modules as unload_user_modules,
 )
+from safevar_sumo.plugins.use import Use as Use, record_use as record_use

@@ -88,11 +88,16 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
     folders
         The folders of the study's file and of the files that it extends.
     """
-    named = {_name_of(Path(os.path.abspath(path)), folders): path for path in paths}
+    named = {name_of_file(Path(os.path.abspath(path)), folders): path for path in paths}
     return {name: sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH] for name, path in sorted(named.items())}
 
 
-def _name_of(path: Path, folders: Sequence[str]) -> str:
+def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
+    """Digests of the files with these names, as far as they exist."""
+    return digests((Path(path) for name in names if (path := file_by_name(name, folders))), folders)
+
+
+def name_of_file(path: Path, folders: Sequence[str]) -> str:
     """A file's path relative to the first folder that contains it; its whole path if none does."""
     folder = next((folder for folder in _naming_folders(folders) if path.is_relative_to(folder)), path.anchor)
     return path.relative_to(folder).as_posix() if folder != path.anchor else path.as_posix()

@@ -37,7 +37,7 @@ class Member(NamedTuple):
 
 _added_folders: list[str] = []
 _user_modules: set[str] = set()
-"""Names of all modules that the import of user code has loaded."""
+"""Names of all modules that user code has loaded, as far as is known."""
 
 
 class Lookup(NamedTuple):
@@ -144,6 +144,11 @@ class Lookup(NamedTuple):
 
 def _derives(candidate: Any, base: type) -> bool:
     return inspect.isclass(candidate) and issubclass(candidate, base)
+
+
+def note_user_modules(names: Iterable[str]) -> None:
+    """Note modules that user code has loaded after its import, so that they are unloaded with it."""
+    _user_modules.update(names)
 
 
 def unload_user_modules() -> None:

@@ -209,7 +209,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:
         return []
-    present = manifest_of(study, identity_of(study, assemble(study, str(directory))))
+    present = manifest_of(study, identity_of(study, assemble(study, str(directory)), manifest.get("files", {})))
     changes = [text for _, text, matters in differences(manifest, present) if matters]
     if changes and not as_it_is_now:
         more = len(changes) - MAX_CHANGES_NAMED

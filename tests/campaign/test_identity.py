@@ -19,12 +19,13 @@ from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import load_runs, manifest
+from safevar_sumo.results import load_runs, manifest, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
 from tests.campaign import formulas
 from tests.campaign.formulas import FormulaPool
+from tests.in_process import refused, run
 
 
 def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_finished(tmp_path: Path) -> None:
@@ -108,6 +109,59 @@ def test_imported_modules_whole_packages_and_named_files_count_wherever_the_comm
     assert files(place) == result
     shutil.copytree(place, place.parent / "copy")
     assert files(place.parent / "copy") == result, "no name holds where the study lies"
+
+
+HIDDEN = """
+import importlib
+import json
+from pathlib import Path
+
+from safevar_sumo.ads import ScalarAds
+
+HERE = Path(__file__).parent
+SCALE = json.loads((HERE / "scale.json").read_text())
+
+
+class Hidden(ScalarAds):
+    gap = None
+
+    def drive(self, seen):
+        helper = importlib.import_module("hel" + "per")
+        if self.gap is None:
+            (HERE / "log.txt").write_text("it drives")
+            self.gap = float(open(HERE / "gap.txt").read()) * SCALE
+        return (0.0, 1.0) if seen.gap < self.gap + helper.MORE else (0.5, 0.0)
+"""
+
+
+@pytest.mark.parametrize("workers", ["in this process", pytest.param("processes", marks=pytest.mark.slow)])
+def test_what_user_code_imports_by_a_computed_name_counts_and_what_it_opens_is_named(
+    workers: str, in_tmp: Path, request: pytest.FixtureRequest
+) -> None:
+    if workers == "processes":
+        request.getfixturevalue("worker_processes")
+    there = in_tmp / "there"
+    there.mkdir()
+    for name, text in {"hidden.py": HIDDEN, "helper.py": "MORE = 1.0\n", "gap.txt": "8.0", "scale.json": "1.0"}.items():
+        (there / name).write_text(text)
+    search = "population = 5\nevaluations = 20\nruns = 1\nalgorithms = ['rs']\n"
+    (there / "it.toml").write_text(f'extends = "smoke"\n[ads]\nmodel = "hidden:Hidden"\n[search]\n{search}')
+    command = ("study", str(there / "it.toml"), "--out", "out", "--jobs", "1", "--quiet")
+    message = "user code reads gap.txt, scale.json, which no `files` of the study names: edits go unnoticed"
+    for _ in range(2):
+        assert message in run(*command).stderr, "also if the check is not needed again"
+    assert {"hidden.py", "helper.py"} <= set(read_manifest(Path("out"))["files"])
+    assert not {"gap.txt", "log.txt"} & set(read_manifest(Path("out"))["files"])
+    run("rules", "out", "--samples", "20")
+    (there / "it.toml").write_text((there / "it.toml").read_text().replace("[search]", 'files = ["gap.txt"]\n[search]'))
+    assert "user code reads scale.json, which" in run(*command[:2], "--out", "other", *command[4:]).stderr
+    (there / "it.toml").write_text((there / "it.toml").read_text().replace('files = ["gap.txt"]\n', ""))
+    (there / "helper.py").write_text("MORE = 2.0\n")
+    refused(*command, message=("helper.py has changed since", "another --out"))
+    refused("rules", "out", "--samples", "20", message=("helper.py has changed since",))
+    assert "helper.py has changed since" in run("rules", "out", "--samples", "20", "--as-it-is-now").stderr
+    (there / "helper.py").unlink()
+    refused("rules", "out", "--samples", "20", message=("helper.py no longer exists",))
 
 
 @pytest.mark.parametrize(
