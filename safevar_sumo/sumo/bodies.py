@@ -183,29 +183,37 @@ def distance_between(body: Track, middle: FloatArray, length: float, width: floa
     """Distances [m] of a body and of vehicles of this size in the lane's middle, with their middles at `middle`: the
     least distance of a corner of either rectangle to the other one; 0 if they overlap.
     """
-    nearest = np.full(middle.shape, np.inf)
-    for x, y in corners_of(body):
-        nearest = np.minimum(nearest, _outside(x - middle, y, length, width))
-    for end, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        x, y = middle + end * length / 2 - body.x, side * width / 2 - body.y
-        lengthwise, across = x * body.along + y * body.left, y * body.along - x * body.left
-        nearest = np.minimum(nearest, _outside(lengthwise, across, body.length, body.width))
+    squares = [_square_outside(x - middle, y, length, width) for x, y in corners_of(body)]
+    # In the body's axes the four corners of a vehicle are its middle plus what all vehicles share.
+    x = middle - body.x
+    lengthwise, across = x * body.along - body.y * body.left, -x * body.left - body.y * body.along
+    for end, side in (
+        (length / 2, width / 2),
+        (length / 2, -width / 2),
+        (-length / 2, width / 2),
+        (-length / 2, -width / 2),
+    ):
+        ahead, left = end * body.along + side * body.left, side * body.along - end * body.left
+        squares.append(_square_outside(lengthwise + ahead, across + left, body.length, body.width))
+    cosine, sine = np.abs(body.along), np.abs(body.left)
     # Bodies that cross each other have no corner in the other one.
-    x, cosine, sine = body.x - middle, np.abs(body.along), np.abs(body.left)
     overlaps = (
         (np.abs(x) < (length + body.length * cosine + body.width * sine) / 2)
         & (np.abs(body.y) < (width + body.length * sine + body.width * cosine) / 2)
-        & (np.abs(x * body.along + body.y * body.left) < (body.length + length * cosine + width * sine) / 2)
-        & (np.abs(body.y * body.along - x * body.left) < (body.width + length * sine + width * cosine) / 2)
+        & (np.abs(lengthwise) < (body.length + length * cosine + width * sine) / 2)
+        & (np.abs(across) < (body.width + length * sine + width * cosine) / 2)
     )
-    return np.where(overlaps, 0.0, nearest)
+    nearest = squares[0]
+    for square in squares[1:]:
+        nearest = np.minimum(nearest, square)
+    return np.where(overlaps, 0.0, np.sqrt(nearest))
 
 
-def _outside(x: Quantity, y: Quantity, length: Quantity, width: Quantity) -> Quantity:
-    """How far points are outside a rectangle around the origin [m]."""
+def _square_outside(x: Quantity, y: Quantity, length: Quantity, width: Quantity) -> Quantity:
+    """The square of how far points are outside a rectangle around the origin [m^2]."""
     dx = np.maximum(np.abs(x) - length / 2, 0.0)
     dy = np.maximum(np.abs(y) - width / 2, 0.0)
-    return np.sqrt(dx * dx + dy * dy)
+    return dx * dx + dy * dy
 
 
 def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:

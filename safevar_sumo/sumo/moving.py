@@ -33,8 +33,8 @@ class Moving(NamedTuple):
     track
         The body's track with such columns.
     edge, far, half_width
-        Position along the lane of the first point in the vehicle's path, or of the body's rear, and of its far end;
-        half its extent across the lane [m].
+        Position along the lane of the body's rear (of who faces along the lane, of its first point in the vehicle's
+        path) and of its far end; half its extent across the lane [m].
     vx, vy, least_vx, most_vx
         Speeds along the lane and to its left; the least and largest speed along it from now on [m/s].
     lateral, lateral_speed
@@ -45,6 +45,8 @@ class Moving(NamedTuple):
         never faster again has avoided it.
     level
         `IN_PATH`, `BESIDE` or 0; below 0 for a body that is not met at all.
+    is_rotated, faces_along
+        Whether it is ever rotated against the lane, and whether it always faces along it.
     """
 
     track: Track
@@ -61,6 +63,8 @@ class Moving(NamedTuple):
     is_cleared: BoolArray
     is_avoidable: BoolArray
     level: IntArray
+    is_rotated: bool
+    faces_along: bool
 
     @classmethod
     def of(cls, track: Track, step: float, path: float) -> Moving:
@@ -69,7 +73,9 @@ class Moving(NamedTuple):
         half_length = (track.length * cosine + track.width * sine) / 2
         half_width = (track.length * sine + track.width * cosine) / 2
         rear = track.x - half_length
-        edge = np.where(_rotated(track), first_in_strip(track, path / 2), rear) if _rotated(track).any() else rear
+        edge, is_lengthwise = rear, _rotated(track) & (cosine > sine)
+        if is_lengthwise.any():
+            edge = np.where(is_lengthwise, first_in_strip(track, path / 2), rear)
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
         is_in_path = slim((np.abs(track.y) < path / 2 + half_width + TIE) & (track.kind != SCREEN))
@@ -93,12 +99,20 @@ class Moving(NamedTuple):
             is_cleared=slim(has_entered & ~will_touch),
             is_avoidable=slim(has_entered & is_in_path[-1]),
             level=np.full_like(level, -1) if track.kind == SCREEN else level,
+            is_rotated=bool(_rotated(track).any()),
+            faces_along=bool((cosine == 1).all()),
         )
 
-    @property
-    def is_rotated(self) -> bool:
-        """Whether the body is ever rotated against the lane."""
-        return bool(_rotated(self.track).any())
+    def covers(self, other: Moving) -> bool:
+        """Whether another body that stands is always inside this one, which then hides all that the other one does."""
+        mine, its = self.track, other.track
+        return (
+            self.faces_along
+            and other.faces_along
+            and len(its.x) == len(its.y) == 1
+            and bool((np.abs(its.x - mine.x) <= (mine.length - its.length) / 2 + TIE).all())
+            and bool((np.abs(its.y - mine.y) <= (mine.width - its.width) / 2 + TIE).all())
+        )
 
 
 def _rotated(track: Track) -> BoolArray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Quantity, Trace
 from safevar_sumo.scenarios import Scene, Track, TrackScenario
+from safevar_sumo.scenarios.tracks import SCREEN
 from safevar_sumo.sumo.bodies import TOUCH, Body, Motion, distance_between, find_overlaps
 from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
 
@@ -19,6 +20,8 @@ LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
 LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a closing speed that is a divisor [m/s]."""
+BLOCK = 16_384
+"""Number of distances that are computed at once: so many fit into a processor's cache."""
 OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
 """What makes a body be seen only if there is no other [m of gap]: it is beside the way, hidden, passed, or scenery."""
 
@@ -42,6 +45,12 @@ class Stage:
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
         self._met = [k for k, body in enumerate(bodies) if body.level.max() >= min(level.max(), 1)]
         self._bodies = bodies
+        self._hides = [
+            k
+            for k, body in enumerate(bodies)
+            if not any(other.covers(body) for other in bodies if other is not body and other.track.kind == SCREEN)
+        ]
+        self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
         self._ended = np.zeros((len(bodies), n_samples, self.n), dtype=bool)
         # Who comes from beside has been approached as soon as it is in the path.
         self._approached = [~self._row(body.is_in_path, 0) for body in bodies]
@@ -60,7 +69,7 @@ class Stage:
             gap, closing = self._row(body.edge) - front, speed - self._row(body.vx)
             is_passed = (self._row(body.far) < front - self.length) & (speed >= self._row(body.most_vx))
             ended = np.asarray(is_passed | self._row(body.is_cleared))
-            if body.is_avoidable.any():
+            if self._is_avoidable[k]:
                 self._approached[k] = self._approached[k] | (closing > APPROACH_SPEED)
                 is_never_faster = (gap > 0) & (speed <= self._row(body.least_vx))
                 ended = ended | (self._approached[k] & self._row(body.is_avoidable) & is_never_faster)
@@ -73,19 +82,17 @@ class Stage:
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
         """Whether nobody is on the line from the sensors to a body's middle."""
         track, visible = self._bodies[number].track, ALL_TRUE
-        for k, other in enumerate(self._bodies):
+        for k in self._hides:
             if k != number:
                 line = (front - self.setback, 0.0, self._row(track.x), self._row(track.y))
-                visible = visible & ~self._blocks(other, *line)
+                visible = visible & ~self._blocks(self._bodies[k], *line)
         return visible
 
     def _blocks(self, other: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity) -> BoolArray:
         """Whether a body is on the line between two points: the slab test in the body's own axes."""
-        of_x, of_y, along, left = (
-            self._row(column) for column in (other.track.x, other.track.y, other.track.along, other.track.left)
-        )
-        dx, dy, rx, ry = to_x - x, to_y - y, x - of_x, y - of_y
-        if other.is_rotated or not (np.abs(along) == 1).all():
+        dx, dy, rx, ry = to_x - x, to_y - y, x - self._row(other.track.x), y - self._row(other.track.y)
+        if not other.faces_along:
+            along, left = self._row(other.track.along), self._row(other.track.left)
             dx, dy = dx * along + dy * left, dy * along - dx * left
             rx, ry = rx * along + ry * left, ry * along - rx * left
         enter: Quantity = -np.inf
@@ -182,38 +189,43 @@ class Stage:
         """The distance to the nearest body that still counts, and how fast it shrinks, at all samples of a trace whose
         positions are those of the vehicles' fronts.
         """
-        shape, front, speed = trace.speed.shape, trace.position, trace.speed
+        shape, n_rows = trace.speed.shape, max(BLOCK // trace.speed.shape[1], 1)
         distance, closing, in_conflict = np.full(shape, np.inf), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
-        for k in self._met:
-            body = self._bodies[k]
-            edge, far, vx, vy, y, half_width = (
-                self._table(column, len(front))
-                for column in (body.edge, body.far, body.vx, body.vy, body.track.y, body.half_width)
-            )
-            counts = ~self._ended[k, : len(front)] & self._table(self._counts[k], len(front))
-            ahead, behind = edge - front, front - self.length - far
-            dx = np.maximum(np.maximum(ahead, behind), 0.0)
-            dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
-            apart = np.sqrt(dx * dx + dy * dy)
-            approach = np.where(ahead > behind, speed - vx, vx - speed) * dx - np.sign(y) * vy * dy
-            rate = approach / np.maximum(apart, LEAST_DISTANCE)
-            if body.is_rotated:
-                apart = self._exact_distance(body, front)
-            is_nearer = counts & (apart < distance)
-            distance = np.where(is_nearer, apart, distance)
-            closing = np.where(is_nearer, rate, closing)
-            in_conflict |= counts
+        for start in range(0, shape[0], n_rows):
+            samples = slice(start, min(start + n_rows, shape[0]))
+            for k in self._met:
+                apart, rate = self._apart(k, samples, trace.position[samples], trace.speed[samples])
+                counts = ~self._ended[k, samples] & self._table(self._counts[k], samples)
+                is_nearer = counts & (apart < distance[samples]) if len(self._met) > 1 else counts
+                np.copyto(distance[samples], apart, where=is_nearer)
+                np.copyto(closing[samples], rate, where=is_nearer)
+                in_conflict[samples] |= counts
         return Encounter(distance, distance, closing, in_conflict)
 
-    def _table(self, column: Column, n_samples: int) -> Column:
-        """The first samples of a column, for each vehicle or for all of them."""
-        values = column[:n_samples]
-        return values if self.group is None or values.shape[1] == 1 else values[:, self.group]
+    def _apart(
+        self, number: int, samples: slice, front: FloatArray, speed: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The distances of vehicles to a body at some samples, and how fast they shrink."""
+        body = self._bodies[number]
+        edge, far, vx, vy, y, half_width = (
+            self._table(column, samples)
+            for column in (body.edge, body.far, body.vx, body.vy, body.track.y, body.half_width)
+        )
+        ahead, behind = edge - front, front - self.length - far
+        dx = np.maximum(np.maximum(ahead, behind), 0.0)
+        dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
+        apart = np.sqrt(dx * dx + dy * dy) if dy.any() else dx
+        approach = (speed - vx) * np.where(ahead > behind, dx, -dx) - np.sign(y) * vy * dy
+        rate = approach / np.maximum(apart, LEAST_DISTANCE)
+        if body.is_rotated:
+            track = Track(*body.track[:2], *(self._table(column, samples) for column in body.track[2:]))
+            apart = distance_between(track, front - self.length / 2, self.length, self.width)
+        return apart, rate
 
-    def _exact_distance(self, body: Moving, front: FloatArray) -> FloatArray:
-        """Distances of vehicles and a rotated body at all samples."""
-        track = Track(*body.track[:2], *(self._table(column, len(front)) for column in body.track[2:]))
-        return distance_between(track, front - self.length / 2, self.length, self.width)
+    def _table(self, column: Column, samples: slice) -> Column:
+        """A column at some samples, for each vehicle or for all of them."""
+        values = column[samples] if len(column) > 1 else column
+        return values if self.group is None or values.shape[1] == 1 else values[:, self.group]
 
 
 class _Seen(NamedTuple):
