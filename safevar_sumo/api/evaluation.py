@@ -68,7 +68,8 @@ def evaluate(
         One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated,
         f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined),
         collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated, invalid-test if it leaves a
-        test's speed before the driving system acts. These have no metrics, and are neither failures nor successes.
+        test's speed before the driving system acts. These have no metrics, and are neither failures nor successes. If
+        the study searches its scenario, feasible says whether the original is safe in the same encounter.
 
     Raises
     ------
@@ -88,6 +89,8 @@ def evaluate(
     groups = [(("", 0), evaluations)]  # one group, of no algorithm and run
     frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
+    if (scoring := system.measuring.scoring).safe_original is not None:
+        frame["feasible"] = scoring.feasible_rows(frame)
     return frame.set_axis(index)
 
 

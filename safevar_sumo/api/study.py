@@ -21,9 +21,14 @@ from safevar_sumo.questions.ask import Jobs, Range
 from safevar_sumo.questions.case import UnanswerableError, are_collisions
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.comparisons import titles_of
-from safevar_sumo.questions.research_questions.fronts import feasible_rows
 from safevar_sumo.questions.subject import Results, load
-from safevar_sumo.questions.words import ending_in_words, list_of_changes, number_of, question_command
+from safevar_sumo.questions.words import (
+    demanded_in_words,
+    ending_in_words,
+    list_of_changes,
+    number_of,
+    question_command,
+)
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
@@ -180,6 +185,7 @@ def _verdict(results: Results, system: System) -> str:
         return "No solution."
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = f"{len(failures)} of {len(solutions)} different solutions are unsafe: {case.unsafe.description}."
+    counts = " ".join([counts, *demanded_in_words(results.study)])
     if failures.empty:
         return counts
     fewest = failures.iloc[0]
@@ -206,7 +212,7 @@ def summarise(results: Results) -> Answer:
     for name in study.search.labels:
         simulated, solutions = (frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions))
         outcomes = Counter(simulated["outcome"])
-        feasible = simulated[feasible_rows(case, simulated)]
+        feasible = simulated[case.scoring.feasible_rows(simulated)]
         counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
         collisions, best = int(are_collisions(feasible).sum()), feasible["f_safe"].min()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
@@ -13,6 +13,9 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Legal, UserCode, quoted
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, MetricsTable, unit_text
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
@@ -170,6 +173,14 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
             return np.zeros(len(evaluations))
         shortfall = self.safe_original - evaluations.column(ORIGINAL_DEGREE)
         return np.where(np.isnan(shortfall), np.inf, np.maximum(shortfall, 0.0))
+
+    def feasible_rows(self, frame: pd.DataFrame) -> BoolArray:
+        """In which rows the original vehicle is safe in the same encounter: all, unless the study searches its
+        scenario.
+        """
+        if self.safe_original is None or ORIGINAL_DEGREE not in frame:
+            return np.ones(len(frame), dtype=bool)
+        return np.asarray(frame[ORIGINAL_DEGREE] >= self.safe_original)
 
     def values(self, evaluations: Evaluations) -> FloatArray:
         """Values of the objectives, smaller being better; shape (M, objectives)."""

@@ -224,6 +224,8 @@ def build_case(
     solutions, evaluations = (
         frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations)
     )
+    if scoring.safe_original is not None:
+        evaluations = evaluations.assign(feasible=scoring.feasible_rows(evaluations))
     return Case(
         name=study.name,
         study=study,

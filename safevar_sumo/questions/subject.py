@@ -60,7 +60,8 @@ class Results:
     @property
     def evaluations(self) -> pd.DataFrame:
         """One row per simulated setting of every run, in the order of the run's requests; same columns as
-        `solutions`.
+        `solutions`. If the study searches its scenario, `feasible` is true where the original vehicle is safe in the
+        same encounter: only these count.
         """
         return self.case.evaluations
 

@@ -110,7 +110,16 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
         return []
     names, those = join_phrases(study.scenario.search), "those" if left_out is None else f"{left_out:,}"
     left_out_in_words = f"left out: {those} in which the original is not safe"
-    return [f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}."]
+    return [
+        f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}.",
+        *demanded_in_words(study),
+    ]
+
+
+def demanded_in_words(study: Study) -> list[str]:
+    """What the original vehicle must keep in a searched encounter, in a sentence; empty for any other study."""
+    margin = f"at least {study.scenario.margin:g} m, scenario.margin, between bodies"
+    return [f"The original is safe in an encounter where it keeps {margin}."] if study.scenario.search else []
 
 
 def constraints_in_words(study: Study) -> list[str]:

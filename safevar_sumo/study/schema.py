@@ -67,14 +67,26 @@ class ModelTable(Table, frozen=True, kw_only=True):
             raise mistake(f"{self.model!r} is no FMU, but has inputs or outputs", 'kind = "fmu", or no such keys')
 
 
+ORIGINAL_MARGIN = 0.3
+"""Distance that the original vehicle must keep in an encounter that is searched, unless the study says another [m]."""
+
+
 class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     """The scenario: its `model` and `parameters`; and those of its parameters, and of the weather's, that are searched
     together with the vehicle, under `search` by name.
 
-    The original vehicle drives in the same encounter as each variant, and must be safe there.
+    The original vehicle drives in the same encounter as each variant, and must keep at least `margin` [m] between
+    bodies there: otherwise the encounter does not count, as it shows nothing of the variant.
     """
 
     search: dict[str, Domain] = {}
+    margin: Annotated[float, Meta(ge=0, le=100)] = ORIGINAL_MARGIN
+
+    def __post_init__(self) -> None:
+        if self.margin != ORIGINAL_MARGIN and not self.search:
+            raise mistake(
+                f"margin = {self.margin:g}, and nothing is searched", "a table search beside it, or no margin"
+            )
 
 
 class VehicleTable(Table, frozen=True, kw_only=True):

@@ -17,7 +17,6 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.metrics.unsafe import margin_of
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
@@ -236,7 +235,7 @@ def _assemble(study: Study, source: str) -> System:
 
 def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scenario: Scenario) -> Measuring:
     """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
-    limit = margin_of(study, None)
+    limit = study.scenario.margin
     if scenario.centre_to_centre:
         assert isinstance(scenario, WorldScenario)
         (scene,) = scenes.of([scenario])

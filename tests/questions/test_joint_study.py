@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+import safevar_sumo as sv
+from safevar_sumo.errors import InputError
 from safevar_sumo.questions import evaluator
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.tolerance import scans
+from safevar_sumo.results.manifest import identity_digest, manifest_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -23,6 +26,8 @@ STUDY = """
 extends = "rain"
 name = "tiny"
 title = "Which vehicle, at which gap?"
+[scenario]
+margin = 0.4
 [scenario.search]
 distance = { unit = "m", original = 12.129, lower = 8, upper = 18, meaning = "gap at the start" }
 [search]
@@ -32,15 +37,16 @@ evaluations = 80
 runs = 1
 """
 LEFT_OUT = r"in an encounter of its own \(distance\); left out: {} in which the original is not safe"
+DEMANDED = r"The original is safe in an encounter where it keeps at least 0\.4 m, scenario\.margin, between bodies\."
 COUNTED = LEFT_OUT.format(r"[\d,]+")
 CAUSE = "in an encounter with .* where the original is safe, the vehicle collides"
 QUESTIONS = {
-    "risk tiny.toml --samples 300": COUNTED,
+    "risk tiny.toml --samples 300": f"{COUNTED}. {DEMANDED}",
     "risk results --samples 300": COUNTED,
     "rules tiny.toml --samples 300": COUNTED,
     "explain tiny.toml --limit 500 --top 2 --fits 0": f"{CAUSE}.* {COUNTED}",
     "explain results --limit 500 --top 2 --fits 0": CAUSE,
-    "tables results": "are less safe than the original vehicle in the same encounter",
+    "tables results": rf"are less safe than the original vehicle in the same encounter\. {DEMANDED}",
     "simulate results --fewest": "In this encounter the original vehicle stops",
 }
 
@@ -91,6 +97,21 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
     expected = [((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum() for name in ("nsga2", "rs")]
     assert [one["collisions"] for one in rows] == expected
     assert sum(expected) < (drawn["outcome"] == "collision").sum()
+
+
+def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feasible(case: Case) -> None:
+    assert case.scoring.safe_original == 0.4
+    frame = case.evaluations
+    assert (frame["feasible"] == (frame["original_safety_degree"] >= 0.4)).all()
+    assert 0 < frame["feasible"].mean() < 1
+    evaluated = sv.evaluate(case.study, frame[[*case.characteristics.names]].head(8), filtered=False, jobs=1)
+    assert (evaluated["feasible"] == frame["feasible"].head(8)).all()
+    assert "feasible" not in sv.evaluate("smoke", [{}], jobs=1)
+    strict = load_study(case.study, scenario={"margin": 2.0})
+    assert assemble(strict).measuring.scoring.safe_original == 2
+    assert identity_digest(manifest_of(strict, {})) != identity_digest(manifest_of(case.study, {}))
+    with pytest.raises(InputError, match=r"scenario: margin = 2, and nothing is searched"):
+        load_study("rain", scenario={"margin": 2.0})
 
 
 @pytest.mark.slow
@@ -163,7 +184,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path
     ],
 )
 def test_a_question_without_meaning_is_refused(typed: str, told: str, joint: Path) -> None:
-    (joint / "unsafe.toml").write_text(f"{STUDY}\n[model_error]\nsafety_degree = 2.5\n")
+    (joint / "unsafe.toml").write_text(STUDY.replace("margin = 0.4", "margin = 2.5"))
     refused(*typed.split(), message=(told,))
 
 

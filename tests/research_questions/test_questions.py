@@ -400,3 +400,15 @@ def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
         [made_up(row(), study=made_up_study(name=name, weather=name)) for name in (other, clearer)]
     )
     assert [one.name for one in pair] == [clearer, other]
+
+
+def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> None:
+    """Equal ones of two runs are not equal solutions of a run."""
+    rows = [row("nsga2", run) for run in (0, 0, 0, 1)] + [row("rs", 0)]
+    answer, twice = answer_questions([made_up(*rows)]), "2 of 5 solutions equal an earlier one of their run"
+    for name in ("rq1", "rq2", "collisions"):
+        assert twice in " ".join(answer.only(name).tables["remarks"]["remark"])
+    assert twice not in " ".join(answer.only("rq1-runs").tables["remarks"]["remark"])
+    assert answer.numbers["solutions"] == 5
+    different = answer_questions([made_up(row("nsga2", 0), row("nsga2", 1), row("rs", 0))])
+    assert "equal an earlier" not in " ".join(different.tables["remarks"]["remark"])

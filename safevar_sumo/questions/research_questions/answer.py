@@ -21,7 +21,7 @@ from safevar_sumo.questions.research_questions.figures import draw_change_counts
 from safevar_sumo.questions.research_questions.fronts import count_evaluations, describe_evaluations, few_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, OVER_RUNS, POOLED, TABLES, WEATHER
-from safevar_sumo.questions.words import number_of
+from safevar_sumo.questions.words import demanded_in_words, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
 
@@ -157,7 +157,16 @@ def _verdict(case: Case) -> str:
         return f"{text}."
     of_all = len(case.solutions_of(NSGA2))
     where = " in the same encounter" if case.study.scenario.search else ""
-    return f"{text}; {critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle{where}."
+    less_safe = f"{critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle{where}."
+    return " ".join([f"{text}; {less_safe}", *demanded_in_words(case.study)])
+
+
+def _equal_solutions(case: Case) -> str:
+    """How many solutions of pooled tables are equal to another one of their run, in a sentence; "" if none is."""
+    same = ["algorithm", *(["run"] if case.has_runs else []), *case.characteristics.names]
+    count = int(case.solutions.duplicated(same).sum())
+    of_all = f"{count} of {number_of(len(case.solutions), 'solution')}"
+    return f"{of_all} equal an earlier one of their run, and count here, as in the paper's method." if count else ""
 
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
@@ -186,6 +195,8 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
         elif table == "rq2" and len(case.evaluations):
             texts = describe_evaluations(case, count_evaluations(case))
             yield f"{prefix}settings that a run simulates, mean: {texts}."
+    if table in POOLED and (equal := _equal_solutions(case)):
+        yield f"{prefix}{equal}"
     if table in ("rq1-runs", "rq2-runs"):
         tests = frame.dropna(subset="effect_size")
         if len(tests):

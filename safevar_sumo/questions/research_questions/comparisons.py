@@ -29,7 +29,6 @@ from safevar_sumo.questions.research_questions.fronts import (
     MORE_IS_BETTER,
     compute_indicators,
     count_evaluations,
-    feasible_rows,
 )
 from safevar_sumo.questions.research_questions.statistics import (
     ALPHA,
@@ -183,7 +182,7 @@ def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the other algorithms.
     """
     ends = count_evaluations(case).set_index(["algorithm", "run"])["requested"]
-    collisions = case.evaluations[are_collisions(case.evaluations) & feasible_rows(case, case.evaluations)]
+    collisions = case.evaluations[are_collisions(case.evaluations) & case.scoring.feasible_rows(case.evaluations)]
     first = collisions.groupby(["algorithm", "run"])["evaluation"].min().reindex(ends.index) + 1
     runs = pd.DataFrame({"time": first.fillna(ends), "found": first.notna()}).groupby(level="algorithm", sort=False)
     samples = {str(name): (rows["time"].to_numpy(), rows["found"].to_numpy()) for name, rows in runs}

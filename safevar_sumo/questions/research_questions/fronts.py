@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.questions.case import Case, UnanswerableError
-from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import ORIGINAL_DEGREE
+from safevar_sumo.records import FloatArray
 
 MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
@@ -49,12 +48,6 @@ def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     """The objectives' values, smaller being better, shape (rows, objectives); NaN where undefined."""
     signs = [objective.sign for objective in case.scoring.objectives]
     return frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs
-
-
-def feasible_rows(case: Case, frame: pd.DataFrame) -> BoolArray:
-    """In which rows the original vehicle is safe in the same encounter: all, unless the study searches its scenario."""
-    limit = case.scoring.safe_original
-    return np.ones(len(frame), dtype=bool) if limit is None else (frame[ORIGINAL_DEGREE] >= limit).to_numpy()
 
 
 def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
@@ -180,7 +173,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         solutions = {*returned.get((algorithm, run), ())}
         is_solution = np.array([setting in solutions for setting in _settings_of(group, names)])
         points = normalised(minimised_values(case, group), reference)
-        is_defined = np.isfinite(points).all(axis=1) & is_solution & feasible_rows(case, group)
+        is_defined = np.isfinite(points).all(axis=1) & is_solution & case.scoring.feasible_rows(group)
         numbers = group["evaluation"].to_numpy()
         counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
         front, volumes = points[:0], []
