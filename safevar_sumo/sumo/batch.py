@@ -125,7 +125,7 @@ def drive_all(
             encounters = system.at_encounters(settings[::size])[0].scenario
             assert isinstance(encounters, WorldScenario)
             scene = scenes_of_encounters(scene, encounters, n // size)
-        world = RecordedWorld([scene], size)
+        world = RecordedWorld(scene, size)
         return drive(fleet, vehicles, world, observer_of(fleet.points[0].scenario, world, None), listen)
 
 

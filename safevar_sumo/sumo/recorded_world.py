@@ -1,6 +1,6 @@
-"""Vehicles that drive in recorded scenes, without SUMO.
+"""Vehicles that drive in a recorded scene, without SUMO.
 
-The vehicles move along the scenes' lanes by SUMO's ballistic update, and collide where bodies overlap. Their positions
+The vehicles move along the scene's lanes by SUMO's ballistic update, and collide where bodies overlap. Their positions
 equal SUMO's to the last bit, because this module repeats the operations of `MSVehicle::updateState`,
 `MSLane::interpolateLanePosToGeometryPos` and `PositionVector::positionAtOffset` in the same order.
 """
@@ -37,21 +37,21 @@ def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) 
 
 
 class RecordedWorld:
-    """K recorded scenes of one road with `size` vehicles in each; a `World` in which other actors move as recorded.
+    """A recorded scene with `size` vehicles; a `World` in which other actors move as recorded.
 
-    Scenarios see the first scene. Instead of K scenes there may be one whose `start`, `speed` and tracks are arrays of
-    one value for each of K vehicles (`encounters.py`).
+    The scene may stand for K scenes with `size` vehicles in each: then its `start`, `speed` and tracks are arrays with
+    one value for each (`encounters.py`).
     """
 
-    def __init__(self, recordings: Sequence[Recording], size: int) -> None:
+    def __init__(self, recording: Recording, size: int) -> None:
         self._size = size
-        self._scene = recordings[0]  # road and vehicle under test are the same in all
-        self._motion, self._sizes = _joined_tracks(recordings)
+        self._scene = recording
+        self._motion, self._sizes = _joined_tracks(recording)
         self.n, self.step_length = size * self._motion.shape[1], self._scene.step_length
         self.sample: Any = 0
-        self._speeds = np.repeat(np.hstack([recording.speed for recording in recordings]), size)
+        self._speeds = np.repeat(recording.speed, size)
         self._lane_number = np.zeros(self.n, dtype=np.intp)
-        self._lane_position = np.repeat(np.hstack([recording.start for recording in recordings]), size)
+        self._lane_position = np.repeat(recording.start, size)
         self._lanes = self._scene.way.at(self._lane_number)
         self._fronts: FloatArray | None = None
         self._struck: dict[int, int] = {}
@@ -227,22 +227,18 @@ class RecordedWorld:
         return Body.behind(self.vehicle_positions(VUT)[vehicles], along, length, width, self._speeds[vehicles])
 
 
-def _joined_tracks(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:
-    """The motion of A actors in K scenes, shape (T, K, A, 5); and their lengths, widths and whether they are persons,
-    shape (K, A, 3).
-
-    Both are NaN where a scene has fewer actors; the motion also after a scene's end.
+def _joined_tracks(recording: Recording) -> tuple[FloatArray, FloatArray]:
+    """The motion of A actors in K scenes, shape (T, K, A, 5), NaN after an actor's last sample; and their lengths,
+    widths and whether they are persons, shape (K, A, 3).
     """
-    n_actors = max(len(recording.tracks) for recording in recordings)
-    n_samples = max((len(track.motion) for recording in recordings for track in recording.tracks.values()), default=1)
-    k_of = [slice(k, k + 1) for k in range(len(recordings))] if len(recordings) > 1 else [slice(None)]
-    n_scenes = max(len(recordings), np.size(recordings[0].speed))
-    motion = np.full((n_samples, n_scenes, n_actors, 5), np.nan)
-    sizes = np.full((n_scenes, n_actors, 3), np.nan)
-    for k, recording in zip(k_of, recordings, strict=True):
-        for actor, track in enumerate(recording.tracks.values()):
-            motion[: len(track.motion), k, actor] = track.motion.reshape(len(track.motion), -1, 5)
-            sizes[k, actor] = track.length, track.width, track.is_person
+    tracks = [*recording.tracks.values()]
+    n_samples = max((len(track.motion) for track in tracks), default=1)
+    n_scenes = np.size(recording.speed)
+    motion = np.full((n_samples, n_scenes, len(tracks), 5), np.nan)
+    sizes = np.full((n_scenes, len(tracks), 3), np.nan)
+    for actor, track in enumerate(tracks):
+        motion[: len(track.motion), :, actor] = track.motion.reshape(len(track.motion), -1, 5)
+        sizes[:, actor] = track.length, track.width, track.is_person
     return motion, sizes
 
 

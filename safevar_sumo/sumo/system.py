@@ -82,6 +82,11 @@ class System:
         """Points at which a setting is simulated: the points of the matrix, or the study's only scenario."""
         return self.matrix or (Point(self.scenario, self.weather),)
 
+    @property
+    def step(self) -> float:
+        """Time step of the simulations [s]."""
+        return self.scenes.step_of(self.points[0].scenario)
+
     def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
         """The system at the encounters of N settings, shape (N, n): its only point, with arrays as the parameters that
         the study searches; and the settings of the vehicles. Both are as they were if the study searches none.
@@ -241,7 +246,7 @@ def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scen
         (scene,) = scenes.of([scenario])
         if isinstance(scene, str):
             raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
-        world = RecordedWorld([scene], 1)
+        world = RecordedWorld(scene, 1)
         first, _ = scenario.observe(world, world.step_length, world.begin(scenario))
         limit += (scene.length + float(first.obstacle_length)) / 2
     return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))

@@ -24,7 +24,6 @@ from safevar_sumo.questions.explain.failures import (
     compare_at_cells,
     compare_at_points,
     find_failures,
-    time_step,
 )
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
 from safevar_sumo.questions.preventability import (
@@ -214,7 +213,7 @@ def _solutions_frame(population: Population, evaluator: Evaluator, reasons: Reas
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
-        "robust_share": robust_shares(evaluator, settings, time_step(study), unsafe, factors).mean(axis=1),
+        "robust_share": robust_shares(evaluator, settings, assemble(study).step, unsafe, factors).mean(axis=1),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
         "avoided_by": [avoided_by(next(judged)) if flag else None for flag in is_judged],
@@ -235,7 +234,7 @@ def _causes_table(
     robust = np.full(len(causes), np.nan)
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
-        robust = robust_shares(evaluator, settings, time_step(study), unsafe).mean(axis=1)
+        robust = robust_shares(evaluator, settings, assemble(study).step, unsafe).mean(axis=1)
     shrunk, fits_holding = find_limits(evaluator, causes, unsafe), np.sum(holding, axis=0)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:

@@ -26,7 +26,7 @@ from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import contact_degree, evaluate, simulate, simulate_all_points, worst_points
+from safevar_sumo.sumo.matrix import contact_degree, evaluate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
 Reasons = dict[int, str]
@@ -147,7 +147,7 @@ def _failures_that_matter(population: Population, evaluator: Evaluator, limit: i
     if not population.rows:
         return reasons
     if not is_rated(evaluator.study) and not population.unsafe.of(population.original)[0]:
-        step = time_step(evaluator.study)
+        step = assemble(evaluator.study).step
         index = find_smallest_robust_failure(evaluator, failures, step, population.unsafe, limit)
         if index is not None:
             reasons[population.rows[index]] = ROBUST
@@ -156,12 +156,6 @@ def _failures_that_matter(population: Population, evaluator: Evaluator, limit: i
         row = population.rows[order[0]]
         reasons[row] = f"{reasons[row]}; {reason}" if row in reasons else reason
     return reasons
-
-
-def time_step(study: Study) -> float:
-    """The time step of the simulations [s]."""
-    system = assemble(study)
-    return simulate(system.at(system.points[0]), system.characteristics.original[np.newaxis]).trace.step
 
 
 PointComparison = tuple[str, tuple[str, ...]]
