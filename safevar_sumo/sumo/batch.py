@@ -30,7 +30,7 @@ from safevar_sumo.records import (
     SimulationRuns,
     Trace,
 )
-from safevar_sumo.scenarios import VUT, Point, Scenario, Scene, TrackScenario, WorldScenario
+from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, Scenario, Scene, TrackScenario, WorldScenario
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
 from safevar_sumo.sumo.cast_check import CAST_KEY
@@ -82,6 +82,10 @@ def reason_for_sumo(system: System) -> str:
     """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded scenes suffice."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
+    searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
+    played = (one.scenario for one in system.points if isinstance(one.scenario, WorldScenario))
+    if searched and any(type(scenario).layout is WorldScenario.layout for scenario in played):
+        return f"each encounter has traffic of its own, by {', '.join(sorted(searched))}"
     return system.scenes.reason_for_sumo(system.points)
 
 

@@ -11,6 +11,7 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo import reason_for_sumo
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -76,6 +77,43 @@ def test_a_matrix_runs_over_them(in_tmp: Path) -> None:
     study = load_study("wear", matrix={"tests": [test]}, scenario={"model": "own:Mine"})
     names = [point.name for point in assemble(study).points]
     assert names == ["scooter, gap 40, scooter 10.0, wet", "scooter, gap 50, scooter 10.0, wet"]
+
+
+TRAFFIC = """
+from typing import Annotated
+
+from msgspec import Struct
+
+from safevar_sumo.scenarios.published import LeadVehicleStopped
+from safevar_sumo.study import searched
+
+
+class Mine(Struct, frozen=True, kw_only=True):
+    distance: Annotated[float, searched(20.0, 60.0, "m", "gap to the parked vehicle")] = 50.0
+    network: str = "lead_vehicle_stopped"
+    duration: float = 16.0
+    reactive_actors = False
+
+    def actors(self, roads):
+        return {"vehicle[@id='vut']": {"departPos": str(80.3 - self.distance)}}
+"""
+
+
+def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path) -> None:
+    methods = "".join(
+        f"\n    def {name}(self, *arguments):\n        return LeadVehicleStopped().{name}(*arguments)\n"
+        for name in ("begin", "observe", "encounter")
+    )
+    (in_tmp / "own.py").write_text(TRAFFIC + methods)
+    search = {"distance": {"unit": "m", "original": 50, "lower": 30, "upper": 60}}
+    system = assemble(load_study("native", scenario={"model": "own:Mine", "search": search}))
+    assert "by distance" in reason_for_sumo(system)
+    settings = drawn(system, 3, 4)
+    found = evaluate(system, settings)
+    for row, setting in enumerate(settings):
+        parameters = {"distance": float(setting[-1])}
+        alone = assemble(load_study("native", scenario={"model": "lead_vehicle_stopped", "parameters": parameters}))
+        assert evaluate(alone, setting[:-1][np.newaxis]).outcome[0] == found.outcome[row]
 
 
 @pytest.mark.parametrize(
