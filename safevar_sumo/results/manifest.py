@@ -149,14 +149,11 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
-    """Those of a study's tables that affect evaluations; the model's error is the margin that originals have to keep
-    in a study that searches its scenario.
-    """
+    """Those of a study's tables that affect evaluations."""
     vehicle, search, scenario = tables["vehicle"], tables["search"], tables["scenario"]
     searched = {}
     if "search" in scenario:
         searched["scenario"] = {**scenario, "search": _without_descriptions(scenario["search"])}
-        searched["model_error"] = tables.get("model_error", {})
     return {
         **{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS},
         **searched,

@@ -117,13 +117,13 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
 def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_not_continued(tmp_path: Path) -> None:
     def joint(meaning: str = "", upper: float = 20.0, margin: float = 0.3) -> Study:
         distance = {"unit": "m", "original": 12, "lower": 8, "upper": upper, "meaning": meaning}
-        return load_study("smoke", scenario={"search": {"distance": distance}}, model_error={"safety_degree": margin})
+        return load_study("smoke", scenario={"search": {"distance": distance}, "margin": margin})
 
     ResultsDirectory(tmp_path, joint()).begin(evaluations(2.5))
     ResultsDirectory(tmp_path, joint(meaning="gap at the start"))
     for other, message in (
         (joint(upper=21), "upper was 20.0 and is 21.0"),
-        (joint(margin=1), "degree was 0.3 and is 1"),
+        (joint(margin=1), r"scenario\.margin was None and is 1\.0 now"),
     ):
         with pytest.raises(InputError, match=message):
             ResultsDirectory(tmp_path, other)

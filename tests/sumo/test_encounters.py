@@ -176,9 +176,9 @@ def planted(**changes: Any) -> Study:
             "runs": 1,
             "seed": 1,
         },
-        "model_error": {"safety_degree": MARGIN},
         **changes,
     }
+    tables["scenario"]["margin"] = MARGIN
     return load_study(tables)
 
 
