@@ -80,6 +80,11 @@ def show_no_progress(stage: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
+def show_within(progress: Progress, whole: str, stage: str, done: int, total: int) -> None:
+    """Show a stage of something larger, which is named before it."""
+    progress(f"{whole}: {stage}", done, total)
+
+
 class _Count(ProgressColumn):
     """How much is done of a known total."""
 

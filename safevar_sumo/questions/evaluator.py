@@ -14,7 +14,7 @@ import numpy as np
 
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict, compile_vehicle, evaluate_all
+from safevar_sumo.campaign.questions import COMPILING, ask_why_no_verdict, compile_vehicle, evaluate_all
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -81,6 +81,43 @@ class Evaluator:
         groups = [self._evaluate_shown(settings[is_feasible], stage, self._verified), not_simulated]
         rows = np.argsort(~is_feasible, kind="stable")  # of `settings`, as `groups` have them
         return Evaluations.concatenate(groups).take(np.argsort(rows))  # restores the order of the settings
+
+    def plan(self, *stages: str) -> None:
+        """Let progress number these stages of a question: `2 of 5, boundaries`."""
+        show = self.progress
+
+        def show_numbered(stage: str, done: int, total: int) -> None:
+            number = f"{stages.index(stage) + 1} of {len(stages)}, " if stage in stages else ""
+            show(f"{number}{stage}", done, total)
+
+        self.progress = show_numbered
+
+    @contextmanager
+    def stage(self, name: str, total: int) -> Iterator[None]:
+        """Show all that is evaluated within the context, by evaluators of other studies, too, as one stage of about
+        `total` settings.
+        """
+        show = self.progress
+        earlier = 0
+        """Settings of the calls before the one under way."""
+        under_way = 0
+
+        def show_part(stage: str, done: int, of: int) -> None:
+            nonlocal earlier, under_way
+            if stage == COMPILING:
+                show(stage, done, of)
+                return
+            if not done:
+                earlier += under_way
+                under_way = of
+            show(name, earlier + done, max(total, earlier + of))
+
+        show(name, 0, total)
+        self.progress = show_part
+        try:
+            yield
+        finally:
+            self.progress = show
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.

@@ -19,6 +19,8 @@ from safevar_sumo.sumo.matrix import at_point, evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
+FITS_AT_ONCE = "fits of the vehicle model"
+"""The stage of progress in which several fits are asked at the same time."""
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
@@ -123,7 +125,7 @@ def across(evaluator: Evaluator, fits: int, measure: Callable[[Evaluator], Found
     study = evaluator.study
     others = studies_of_sets(study)[1:fits] if study.spread else []
     evaluators = [evaluator, *(evaluator.for_study(other, verified=0) for other in others)]
-    return side_by_side(evaluators, measure, "fits of the vehicle model")
+    return side_by_side(evaluators, measure, FITS_AT_ONCE)
 
 
 def studies_of_sets(study: Study) -> list[Study]:

@@ -27,6 +27,8 @@ from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import at_point, simulate
 from safevar_sumo.sumo.system import System, assemble
 
+REFERENCE_DRIVERS = "reference drivers in the same vehicle"
+"""The stage of progress."""
 MAX_SIMULATIONS = 20_000
 """Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated.
 """
@@ -138,7 +140,7 @@ def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) 
             continue
         ads = ModelTable(model=model, parameters={**approach, **parameters})
         with_driver = evaluator.for_study(replace(evaluator.study, ads=ads, spread={}))
-        runs = with_driver.evaluate(with_original, "reference drivers in the same vehicle")
+        runs = with_driver.evaluate(with_original, REFERENCE_DRIVERS)
         avoided = np.where(runs.valid, ~runs.collided, np.nan)
         verdicts[driver] = avoided[1:] if avoided[0] == 1 else np.full(len(settings), np.nan)
     return np.column_stack(list(verdicts.values()))

@@ -29,6 +29,8 @@ from safevar_sumo.study.characteristics import Uniform
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
+SAMPLING, SENSITIVITY = "sampling vehicles", "sensitivity analysis"
+"""Stages of progress."""
 BASE_POINTS = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
 RESAMPLES = 200
@@ -65,9 +67,11 @@ def risk(
     study, model = evaluator.study, VariationModel(evaluator.study)
     criterion = evaluator.choose_criterion(unsafe, subject)
     rng, batches = np.random.default_rng(study.search.seed), []
-    for start in range(0, samples, VEHICLES_PER_CALL):
-        vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng, study.source)
-        batches.append(evaluator.evaluate(vehicles, "sampling vehicles"))
+    evaluator.plan(SAMPLING, SENSITIVITY)
+    with evaluator.stage(SAMPLING, samples):
+        for start in range(0, samples, VEHICLES_PER_CALL):
+            vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng, study.source)
+            batches.append(evaluator.evaluate(vehicles, SAMPLING))
     drawn = Evaluations.concatenate(batches)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
     failures, total = int(criterion.of(simulated).sum()), len(simulated)
@@ -123,7 +127,7 @@ def sobol_indices(evaluator: Evaluator, model: VariationModel, criterion: Unsafe
     names, seed = list(evaluator.characteristics.names), evaluator.study.search.seed % 2**32
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
-    evaluations = evaluator.evaluate(model.settings(points), "sensitivity analysis")
+    evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
     is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
     def indices_of(output: FloatArray) -> Any:

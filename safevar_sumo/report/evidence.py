@@ -45,7 +45,7 @@ from safevar_sumo.report.page import usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, read_manifest
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_of
-from safevar_sumo.terminal import Progress, open_progress
+from safevar_sumo.terminal import Progress, open_progress, show_within
 
 
 def evidence(
@@ -102,13 +102,9 @@ def _pack_study(
     described = PackedStudy(f"{number}-{study.name}", questions, list(case.finished_runs), count_outcomes(case))
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
-    packed = Packed(described, files, study.origin.places, jobs, partial(_show_within, progress, study.name))
+    packed = Packed(described, files, study.origin.places, jobs, partial(show_within, progress, study.name))
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
-
-
-def _show_within(progress: Progress, whole: str, stage: str, done: int, total: int) -> None:
-    progress(f"{whole}: {stage}", done, total)
 
 
 def _files_of_user(study: Study, named: Mapping[str, str], questions: Sequence[str]) -> dict[str, bytes]:

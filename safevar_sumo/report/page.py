@@ -6,7 +6,9 @@ import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -27,7 +29,7 @@ from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, commands, replays, tested, trust
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.terminal import Progress, open_progress, show_no_progress
+from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -105,22 +107,30 @@ def report(
             warn(f"{path}: {change}")
     give = answer_to if ask else answer_or_reason
     subjects = cases if point is None else [case_at(case, point) for case in cases]
+    asked = [
+        alone or ([] if ask else usual_questions(case, path, point)) for case, path in zip(subjects, paths, strict=True)
+    ]
+    numbers = count(1)
+    total = sum(map(len, asked)) + len(joint)
+
+    def answered(text: str, about: Sequence[Case], directories: Sequence[Path]) -> Answer:
+        """The answer to the next question, whose stages progress shows with its number."""
+        within = f"question {next(numbers)} of {total}, {text.split()[0]}"
+        return give(text, about, directories, point, jobs, partial(show_within, show, within))
+
     with open_progress(progress) as show:
         studies = [
             ReportedStudy(
                 directory=path,
                 case=case,
                 versions=read_manifest(path)["versions"],
-                answers=[
-                    give(text, [case], [path], point, jobs, show)
-                    for text in alone or ([] if ask else usual_questions(case, path, point))
-                ],
+                answers=[answered(text, [case], [path]) for text in texts],
                 point=point or "",
                 later_changes=changes,
             )
-            for path, case, changes in zip(paths, subjects, later_changes, strict=True)
+            for path, case, changes, texts in zip(paths, subjects, later_changes, asked, strict=True)
         ]
-        shared = [give(text, subjects, paths, point, jobs, show) for text in joint]
+        shared = [answered(text, subjects, paths) for text in joint]
         pictures = list[JsonObject]()
         if paper:
             show("tables and figures", 0, 1)

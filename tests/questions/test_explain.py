@@ -239,3 +239,18 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     assert len(select_affordable_rows(settings, evaluator, 70)) == 10, (
         "of three changes no, one and two of them: 1 + 3 + 3 simulations"
     )
+
+
+def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
+    """Two calls of 3 and 2 settings, the second by an evaluator of another study; about 4 were expected."""
+    shown = list[tuple[str, int, int]]()
+    evaluator = made_up_evaluator(1, nowhere)
+    evaluator.progress = lambda *values: shown.append(values)
+    evaluator.plan("first", "all calls")
+    with evaluator.stage("all calls", 4):
+        evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")
+        evaluator.for_study(evaluator.study).evaluate(np.array([[4.0], [5.0]]), "another")
+    evaluator.evaluate(np.array([[6.0]]), "unplanned")
+    named = [(done, total) for stage, done, total in shown if stage == "2 of 2, all calls"]
+    assert list(dict.fromkeys(named)) == [(0, 4), (3, 4), (3, 5), (5, 5)]
+    assert shown[-1] == ("unplanned", 1, 1)

@@ -16,8 +16,17 @@ from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.across_fits import Ranges, conclusions_across_fits
-from safevar_sumo.questions.explain.causes import Cause, count_distinct_causes, count_needed, find_limits, settings_of
+from safevar_sumo.questions.explain.causes import (
+    BOUNDARIES,
+    SUBSETS,
+    Cause,
+    count_distinct_causes,
+    count_needed,
+    find_limits,
+    settings_of,
+)
 from safevar_sumo.questions.explain.failures import (
+    TO_EXPLAIN,
     Population,
     Reasons,
     choose_failures,
@@ -26,10 +35,12 @@ from safevar_sumo.questions.explain.failures import (
     find_failures,
 )
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
+from safevar_sumo.questions.model_spread import FITS_AT_ONCE
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
     LETTER,
+    REFERENCE_DRIVERS,
     TITLES,
     avoided_by,
     avoided_shares,
@@ -135,6 +146,7 @@ def explain(
         Number of vehicle models that fit the published data about as well (sets of [spread]) with which each conclusion
         is drawn again; 0 leaves this out.
     """
+    evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES)
     study, population = evaluator.study, find_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)

@@ -8,7 +8,7 @@ size by size, until some are unsafe. These are minimal, as no smaller subset is 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from itertools import combinations, islice, pairwise
 from math import comb
@@ -23,6 +23,8 @@ from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
+SUBSETS, BOUNDARIES = "subsets of the changes", "boundaries"
+"""Stages of progress."""
 MAX_SUBSETS = 20_000
 """Maximum number of subsets simulated in one call, which bounds the memory."""
 
@@ -51,42 +53,41 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     ]
     originals = characteristics.with_original_vehicle(settings)
     causes: list[list[Cause]] = [[] for _ in settings]
-    for size in range(max(map(len, changed), default=0) + 1):
-        subsets = (
-            (row, list(columns))
-            for row, columns_changed in enumerate(changed)
-            if not causes[row]  # no smaller subset is one; of this size, all subsets are simulated
-            for columns in combinations(columns_changed, size)
-        )
-        while chunk := list(islice(subsets, MAX_SUBSETS)):
-            partial_settings = originals[[row for row, _ in chunk]]
-            for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
-                partial[columns] = settings[row, columns]
-            evaluations = evaluator.evaluate(partial_settings, f"subsets of {size} changes")
-            for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
-                row, columns = chunk[index]
-                changes = {characteristics.names[column]: float(settings[row, column]) for column in columns}
-                outcome, degree = str(evaluations.outcome[index]), float(evaluations.f_safe[index])
-                encounter = {
-                    item.name: float(settings[row, characteristics.names.index(item.name)])
-                    for item in characteristics.scenario
-                }
-                causes[row].append(Cause(changes, outcome, degree, encounter))
+    with evaluator.stage(SUBSETS, sum(_subset_counts(map(len, changed)))):
+        for size in range(max(map(len, changed), default=0) + 1):
+            subsets = (
+                (row, list(columns))
+                for row, columns_changed in enumerate(changed)
+                if not causes[row]  # no smaller subset is one; of this size, all subsets are simulated
+                for columns in combinations(columns_changed, size)
+            )
+            while chunk := list(islice(subsets, MAX_SUBSETS)):
+                partial_settings = originals[[row for row, _ in chunk]]
+                for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
+                    partial[columns] = settings[row, columns]
+                evaluations = evaluator.evaluate(partial_settings, SUBSETS)
+                for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
+                    row, columns = chunk[index]
+                    changes = {characteristics.names[column]: float(settings[row, column]) for column in columns}
+                    outcome, degree = str(evaluations.outcome[index]), float(evaluations.f_safe[index])
+                    encounter = {
+                        item.name: float(settings[row, characteristics.names.index(item.name)])
+                        for item in characteristics.scenario
+                    }
+                    causes[row].append(Cause(changes, outcome, degree, encounter))
     return causes
+
+
+def _subset_counts(numbers: Iterable[int]) -> list[int]:
+    """About how many subsets of so many changes are tried: up to half of them, as in the shipped studies."""
+    return [sum(comb(number, size) for size in range((number + 1) // 2 + 1)) for number in numbers]
 
 
 def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
     """All rows of `settings`, or a random sample of them, so that finding their minimal causes takes at most about
     `max_evaluations`.
-
-    The estimate assumes causes with half of the changes, about as in the shipped studies.
     """
-    costs = np.array(
-        [
-            sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
-            for changes in evaluator.characteristics.number_changed(settings).astype(int).tolist()
-        ]
-    )
+    costs = np.array(_subset_counts(evaluator.characteristics.number_changed(settings).astype(int).tolist()))
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
@@ -237,7 +238,8 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
     thresholds = np.divide(
         characteristics.threshold, np.abs(ends - original), out=np.zeros(ends.shape), where=is_scaled
     )
-    shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1))
+    with evaluator.stage(BOUNDARIES, len(starts) * (LINE_SETTINGS - 1 + ROUNDS * (PARTS_PER_ROUND - 1))):
+        shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1))
     limits, first_lines = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0], np.cumsum([0, *line_counts])
     return [
         Limits(
@@ -280,7 +282,7 @@ def find_boundary_shares(
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high  # without a rounding error; known to be unsafe
         inner = settings_on_lines(starts, ends, shares[:, :-1])
-        evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), "boundaries")
+        evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), BOUNDARIES)
         is_unsafe, is_valid = (
             np.column_stack([flags.reshape(number, parts - 1), np.ones(number, dtype=bool)])
             for flags in (unsafe.of(evaluations), evaluations.valid)

@@ -31,6 +31,8 @@ from safevar_sumo.sumo.system import System, assemble
 
 Reasons = dict[int, str]
 """The rows of the chosen failures, with the reasons for their choice."""
+TO_EXPLAIN = "settings to explain"
+"""A stage of progress."""
 ROBUST = "smallest robust"
 """The reason for choosing the robust failure with the fewest changes."""
 REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest": "smallest changes"}
@@ -101,7 +103,7 @@ def find_failures(
         chosen = list(dict.fromkeys([*named_rows, *distinct]))  # the named ones first
         settings, handles = table[characteristics].to_numpy(dtype=float)[chosen], handles_of(table)
         names, recorded = [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen]
-    evaluations, left_out = evaluator.evaluate(settings, "settings to explain"), 0
+    evaluations, left_out = evaluator.evaluate(settings, TO_EXPLAIN), 0
     if isinstance(subject, Study):
         counts = np.flatnonzero(~evaluations.infeasible)
         left_out = len(evaluations) - len(counts)

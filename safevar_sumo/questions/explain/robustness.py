@@ -11,6 +11,8 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
+NEIGHBOURS = "neighbours"
+"""The stage of progress."""
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
 STEP_FACTORS: Sequence[float] = (1.0, 0.5, 2.0)
@@ -40,13 +42,14 @@ def robust_shares(
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
     neighbours, shares = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed), []
-    for factor in factors:
-        step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
-        evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
-        is_unsafe, is_valid = (
-            flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid)
-        )
-        shares.append((is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1))
+    with evaluator.stage(NEIGHBOURS, len(neighbours) * len(factors)):
+        for factor in factors:
+            step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
+            evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)
+            is_unsafe, is_valid = (
+                flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid)
+            )
+            shares.append((is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1))
     return np.transpose(shares)
 
 
