@@ -93,9 +93,9 @@ class Evaluator:
         self.progress = show_numbered
 
     @contextmanager
-    def stage(self, name: str, total: int) -> Iterator[None]:
+    def stage(self, name: str, total: int) -> Iterator[Callable[[int], None]]:
         """Show all that is evaluated within the context, by evaluators of other studies, too, as one stage of about
-        `total` settings.
+        `total` settings; the function that it yields takes a better estimate of how many are left.
         """
         show = self.progress
         earlier = 0
@@ -112,10 +112,14 @@ class Evaluator:
                 under_way = of
             show(name, earlier + done, max(total, earlier + of))
 
+        def expect(left: int) -> None:
+            nonlocal total
+            total = earlier + under_way + left
+
         show(name, 0, total)
         self.progress = show_part
         try:
-            yield
+            yield expect
         finally:
             self.progress = show
 

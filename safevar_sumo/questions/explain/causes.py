@@ -53,8 +53,10 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     ]
     originals = characteristics.with_original_vehicle(settings)
     causes: list[list[Cause]] = [[] for _ in settings]
-    with evaluator.stage(SUBSETS, sum(_subset_counts(map(len, changed)))):
+    with evaluator.stage(SUBSETS, sum(_subset_counts(map(len, changed)))) as expect:
         for size in range(max(map(len, changed), default=0) + 1):
+            left = [len(columns) for columns, found in zip(changed, causes, strict=True) if not found]
+            expect(sum(_subset_counts(left, size)))
             subsets = (
                 (row, list(columns))
                 for row, columns_changed in enumerate(changed)
@@ -78,9 +80,11 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     return causes
 
 
-def _subset_counts(numbers: Iterable[int]) -> list[int]:
-    """About how many subsets of so many changes are tried: up to half of them, as in the shipped studies."""
-    return [sum(comb(number, size) for size in range((number + 1) // 2 + 1)) for number in numbers]
+def _subset_counts(numbers: Iterable[int], least: int = 0) -> list[int]:
+    """About how many subsets of at least so many of each number of changes are tried: up to half of them, as in the
+    shipped studies.
+    """
+    return [sum(comb(number, size) for size in range(least, (number + 1) // 2 + 1)) for number in numbers]
 
 
 def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
