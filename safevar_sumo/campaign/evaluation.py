@@ -30,7 +30,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
 """Number of settings of a study to verify in SUMO in questions."""
-KNOWN_SYSTEMS = 16
+KNOWN_SYSTEMS = 64
 """Number of systems that a process keeps: questions about the fits of a vehicle change between them."""
 COMMAND_PREFIX = "; to reproduce it: "
 

@@ -41,6 +41,7 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "correlations",
     "limits",
     "repair",
+    "wider",
 )
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")

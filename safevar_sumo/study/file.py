@@ -185,8 +185,8 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
 
 
 def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
-    """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`."""
-    tables = _merge(base.tables, overrides)
+    """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none its wider study."""
+    tables = _merge({key: value for key, value in base.tables.items() if key != "wider"}, overrides)
     changed_keys = [
         key
         for key in ("weather", "vehicle", "ads", "scenario", "matrix")

@@ -262,7 +262,8 @@ class Study(Table, frozen=True, kw_only=True):
     model's further error, by metric, for a vehicle that differs from the original by the full width of a domain;
     `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
     `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits` are the values, by
-    name, up to which characteristics may wear in service; `repair` states what a repair of the ADS may change.
+    name, up to which characteristics may wear in service; `repair` states what a repair of the ADS may change;
+    `wider` names a study of the same vehicle in a wider scope, in which limits are tried as well.
     """
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
@@ -287,6 +288,7 @@ class Study(Table, frozen=True, kw_only=True):
     constraints: list[Constraint] = []
     limits: dict[str, Limit] = {}
     repair: RepairTable = RepairTable()
+    wider: str = ""
     origin: Origin = Origin()
 
     def __post_init__(self) -> None:

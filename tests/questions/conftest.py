@@ -45,7 +45,7 @@ def made_up_study(n: int) -> Study:
         for name in "abcdefghijkl"[:n]
     }
     return msgspec.structs.replace(
-        smoke, name="made-up", vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows)
+        smoke, name="made-up", spread={}, vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows)
     )
 
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,10 +23,11 @@ from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Margin, Range, question
+from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
-from safevar_sumo.questions.model_spread import across
-from safevar_sumo.questions.repair.attack import Proof, find_failures, prove
+from safevar_sumo.questions.models import Models, fit_names, models_of
+from safevar_sumo.questions.repair.attack import find_failures, prove_change
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import Search
@@ -49,14 +49,13 @@ CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
 SHOWN_LIMITS = 3
 """Number of limits of full braking that the verdict names."""
-SIZES, SIZED_VEHICLES = tuple(k / 8 for k in range(17)), 16
-"""Shares of a repair's change that are tried with each fit of the vehicle, and the number of counterexamples for it."""
+JOINING_VEHICLES = 64
+"""Number of the worst known vehicles that a change must survive with a fit in which it failed."""
 REPAIRS = {
     "parameters": Column("", "the parameters that change, with their new values", ".10g", is_shown=False),
     "change": Column("", "what changes, in words"),
     "changed": Column("-", "number of parameters that change", is_shown=False),
-    "over_fits": Column("", "least and largest value that the fits of the vehicle need, by parameter", is_shown=False),
-    "fits": Column("-", "number of fits with which up to twice the change suffices", is_shown=False),
+    "fits": Column("-", "number of fits of the vehicle with which it was attacked and holds", is_shown=False),
     "largest_change": Column("-", "largest change of a parameter, as a share of its range"),
     "metres_earlier": Column("m", "how much earlier a new vehicle brakes, at most over all points", ".2f"),
     "metres_earlier_mean": Column("m", "how much earlier it brakes on average over all points", ".2f", is_shown=False),
@@ -80,7 +79,7 @@ def repair(
     promise: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
     margin: Margin = None,
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
-    fits: Annotated[int, Range(0, 1000)] = 12,
+    fits: Annotated[int | None, Range(0, 1000)] = None,
     out: Annotated[str | None, "FILE.toml"] = None,
 ) -> Answer:
     """Find the smallest change of the driving system that survives promised wear, and its price.
@@ -99,7 +98,8 @@ def repair(
         Parameter of the driving system that may change; may be repeated. By default those under [repair], else those
         that come with a shipped driving system.
     fits
-        Number of fitted parameter sets of the vehicle over which a repair gets a range; 0 without.
+        Number of vehicle models that fit the published data about as well (sets of [spread]) in which a repair holds:
+        the margin with the study's own, no collision with any other; by default all, 0 for the study's own alone.
     out
         Study file to write with the first repair; it extends the study.
     """
@@ -109,12 +109,16 @@ def repair(
         raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
     if out is not None:
         _check_file(Path(out), study)
-    problem = RepairProblem(
-        evaluator=evaluator,
-        promise=Promise.of(study, evaluator.region, promise),
-        parameters=parameters_of(study, change),
-        unsafe=Unsafe(keep=margin_of(study, margin), contact=contact_degree(assemble(study))),
-    )
+    unsafe_today = Unsafe(keep=margin_of(study, margin), contact=contact_degree(assemble(study)))
+    promised, parameters = Promise.of(study, evaluator.region, promise), parameters_of(study, change)
+    models = models_of(evaluator, unsafe_today, fits)
+    problems = [
+        RepairProblem(
+            evaluator=model.evaluator, promise=promised, parameters=parameters, unsafe=model.unsafe, fit=model.fit
+        )
+        for model in models.members
+    ]
+    problem = problems[0]
     vehicles = _first_vehicles(problem, subject)
     if not len(vehicles):
         text = f"{study.name!r}: the new vehicle keeps {problem.unsafe.keep:g} m in no encounter that was tried"
@@ -126,13 +130,24 @@ def repair(
     is_repairable = degrees >= problem.margin
     is_repairable[~is_repairable] = problem.repairable(vehicles[~is_repairable])
     worst_vehicles = vehicles[is_repairable]
-    survivors, worst_vehicles = _find_survivors(problem, worst_vehicles) if len(worst_vehicles) else ([], vehicles)
-    sizes = [_sizes_over_fits(problem, change, worst_vehicles[:SIZED_VEHICLES], fits) for change, _ in survivors]
+    found = _find_survivors(problems, worst_vehicles) if len(worst_vehicles) else Survivors([], len(problems), ())
     worst = float(degrees[is_repairable][0] if is_repairable.any() else degrees[0])
-    answer = _answer_of(problem, survivors, sizes, worst, _not_repairable(problem, vehicles[~is_repairable]))
+    not_repairable = _not_repairable(problem, vehicles[~is_repairable])
+    answer = _answer_of(problem, models, found, worst, not_repairable)
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
+
+
+class Survivors(NamedTuple):
+    """The smallest changes that survive everything, each with its proof; none if no change does.
+
+    They hold in `fits` fits, and not in those with the numbers `broken`.
+    """
+
+    changes: list[tuple[FloatArray, Proof]]
+    fits: int
+    broken: tuple[int, ...]
 
 
 def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray:
@@ -147,43 +162,50 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
     return rows[problem.holds(rows)]
 
 
-def _find_survivors(problem: RepairProblem, vehicles: FloatArray) -> tuple[list[tuple[FloatArray, Proof]], FloatArray]:
-    """Search, attack and prove in turns until the smallest changes survive everything, none if no change does; and all
-    vehicles that they survived, counterexamples first.
+def _find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> Survivors:
+    """The smallest changes that survive in all fits; where none does, those of the study's own fit, and the fits in
+    which an attack breaks one of them.
     """
-    search, proofs, attacks, failed_proofs = Search(problem, vehicles), dict[bytes, Proof](), 0, 0
+    changes = _survivors_in(problems, vehicles)
+    if changes or len(problems) == 1:
+        return Survivors(changes, len(problems), ())
+    changes = _survivors_in(problems[:1], vehicles)
+    broken = [
+        problem.fit
+        for problem in problems[1:]
+        if any(find_failures([problem], change, vehicles, 0) for change, _ in changes)
+    ]
+    return Survivors(changes, len(problems) - len(broken), tuple(broken))
+
+
+def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
+    """Search, attack and prove in turns until the smallest changes survive everything; none if no change does."""
+    search, proofs = Search(problems, vehicles), dict[bytes, Proof]()
+    attacks, failed_proofs = 0, 0
     for _ in range(MAX_ROUNDS):
         changes = search.smallest_changes()
         unproved = [change for change in changes if change.tobytes() not in proofs]
         if not unproved:
-            return [(change, proofs[change.tobytes()]) for change in changes], search.settings
+            return [(change, proofs[change.tobytes()]) for change in changes]
         for change in unproved:
             attacks += 1
-            failures = find_failures(problem, change, search.settings, attacks)
-            if not len(failures):
-                proof, failures = prove(problem, change, attacks, failed_proofs)
-                if len(failures):
-                    failed_proofs += 1
-                else:
-                    proofs[change.tobytes()] = proof
-            search.add(failures)
-    return [], search.settings
+            failures = find_failures(problems, change, search.settings, attacks)
+            if not failures:
+                proof, failures = prove_change(problems, change, attacks, failed_proofs)
+                failed_proofs += bool(failures)
+                proofs |= {} if failures else {change.tobytes(): proof}
+            for number, settings in failures.items():
+                if number not in search.settings_of:
+                    search.add(number, _joining(problems[number], vehicles))
+                search.add(number, settings)
+    return []
 
 
-def _sizes_over_fits(problem: RepairProblem, change: FloatArray, vehicles: FloatArray, fits: int) -> FloatArray:
-    """With each fit of the vehicle, the smallest of `SIZES` with which this share of a change keeps vehicles safe;
-    infinite if none does.
-    """
-    sizes = np.array(SIZES) if problem.changed_values(change) else np.zeros(1)
-    changes = np.clip(problem.today + sizes[:, np.newaxis] * (change - problem.today), 0.0, 1.0)
-
-    def smallest(each: Evaluator) -> float:
-        fitted = replace(problem, evaluator=each)
-        degrees, _ = fitted.degrees(changes, vehicles[fitted.holds(vehicles)], "fits of the vehicle")
-        is_safe = (degrees >= problem.margin).all(axis=1)
-        return float(sizes[np.argmax(is_safe)]) if is_safe.any() else np.inf
-
-    return np.array(across(problem.evaluator, fits, smallest))
+def _joining(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
+    """The worst known vehicles that count with another fit."""
+    rows = vehicles[:JOINING_VEHICLES]
+    rows = rows[problem.holds(rows)]
+    return rows[problem.repairable(rows)]
 
 
 def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:
@@ -203,20 +225,16 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
 
 
 def _answer_of(
-    problem: RepairProblem,
-    survivors: Sequence[tuple[FloatArray, Proof]],
-    sizes: Sequence[FloatArray],
-    worst_today: float,
-    not_repairable: list[dict[str, float]],
+    problem: RepairProblem, models: Models, found: Survivors, worst_today: float, not_repairable: list[dict[str, float]]
 ) -> Answer:
-    """The answer from the changes that survive, each with its proof and its sizes over the fits of the vehicle: today's
-    parameters alone if they do.
+    """The answer from the changes that survive, each with its proof: today's parameters alone if they do.
 
     `worst_today` is the safety degree of today's driving system with the worst vehicle of the promise that was tried
     and that a driving system can keep safe [m]; below 0, minus the speed of the impact [m/s].
     """
+    survivors = found.changes
     kept_today = bool(survivors) and not problem.changed_values(survivors[0][0])
-    repairs = [] if kept_today else [_row(problem, *pair, each) for pair, each in zip(survivors, sizes, strict=True)]
+    repairs = [] if kept_today else [_row(problem, *pair, found.fits) for pair in survivors]
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
         "margin": problem.unsafe.keep,
@@ -225,7 +243,9 @@ def _answer_of(
         "kept_today": kept_today,
         "repairs": len(repairs),
         "not_repairable": not_repairable,
-        "simulations": problem.evaluator.simulated,
+        "simulations": sum(model.evaluator.simulated for model in models.members),
+        "fits": found.fits if survivors else 0,
+        "fits_tried": len(models.members),
     }
     wear = f"({problem.promise.in_words}) with {problem.unsafe.keep:g} m left"
     if kept_today:
@@ -235,18 +255,12 @@ def _answer_of(
             f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried has a safety "
             f"degree of {degree}, and {_proof_in_words(survivors[0][1])}."
         )
-        if len(sizes[0]) > 1:
-            verdict += f" It keeps it with {np.isfinite(sizes[0]).sum()} of {len(sizes[0])} fits of the vehicle."
     elif repairs:
         verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors[0][1])}."
-        if len(sizes[0]) > 1:
-            ranges = join_phrases(
-                f"{name} {low:g} to {high:g}" for name, (low, high) in repairs[0]["over_fits"].items()
-            )
-            verdict += f" {repairs[0]['fits']} of {len(sizes[0])} fits of the vehicle need {ranges}."
     else:
         names = join_phrases(parameter.name for parameter in problem.parameters)
         verdict = f"No change of one or two of {names} was found that survives this wear {wear}."
+    verdict += _fits_in_words(models, found)
     if not_repairable:
         fewest = sorted(not_repairable, key=len)
         parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
@@ -255,8 +269,18 @@ def _answer_of(
     return Answer(question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables)
 
 
-def _row(problem: RepairProblem, change: FloatArray, proof: Proof, sizes: FloatArray) -> JsonObject:
-    """A repair, its range, its price and its proof, by the names of columns."""
+def _fits_in_words(models: Models, found: Survivors) -> str:
+    """In how many fits of the vehicle the answer holds, in a sentence; empty with one model."""
+    count = len(models.members)
+    if count == 1 or not found.changes:
+        return ""
+    broken = f", not in {fit_names(found.broken)}, where it collides" if found.broken else ""
+    left_out = f"; left out: {fit_names(models.left_out)}, where the original is unsafe" if models.left_out else ""
+    return f" It holds in {found.fits} of {count} fits of the vehicle, attacked with each{broken}{left_out}."
+
+
+def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) -> JsonObject:
+    """A repair, its price and its proof, by the names of columns."""
     values = problem.changed_values(change)
     texts = [
         f"{name} {today:.6g} -> {values[name]:.10g}{unit_text(row.unit)} ({row.meaning})"
@@ -264,16 +288,9 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof, sizes: FloatA
         if name in values
     ]
     size = float(np.max(np.abs(change - problem.today)))
-    enough = sizes[np.isfinite(sizes)]
-    ends = [problem.today + each * (change - problem.today) for each in (enough.min(), enough.max())]
-    over_fits = {
-        parameter.name: sorted(end)
-        for parameter, end in zip(problem.parameters, problem.values(np.clip(ends, 0, 1)).T.tolist(), strict=True)
-        if parameter.name in values
-    }
     row = {"parameters": values, "change": ", ".join(texts), "changed": len(values), "largest_change": size}
-    row |= {"over_fits": over_fits, "fits": len(enough)}
-    return {**row, **price_of(problem.study, values, problem.encounters), **proof._asdict()}
+    row |= {"fits": fits, "proof_samples": proof.samples, "proof_failures": proof.failures, "at_most": proof.at_most}
+    return {**row, **price_of(problem.study, values, problem.encounters)}
 
 
 def _repair_in_words(repair: JsonObject, wear: str) -> str:
@@ -292,7 +309,7 @@ def _repair_in_words(repair: JsonObject, wear: str) -> str:
 
 def _proof_in_words(proof: Proof) -> str:
     return (
-        f"of {proof.proof_samples:,} fresh worn vehicles {proof.proof_failures} are unsafe (at most "
+        f"of {proof.samples:,} fresh worn vehicles {proof.failures} are unsafe (at most "
         f"{100 * proof.at_most:.2g} %, with {100 * CONFIDENCE:g} % confidence)"
     )
 

@@ -1,73 +1,66 @@
-"""Attacks on a change of the parameters, and its proof on fresh wear."""
+"""Attacks on a change of the parameters in all fits of the vehicle, and its proof on fresh wear."""
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-from safevar_sumo.questions.evaluator import proof_size
+from safevar_sumo.questions.attack import attack
+from safevar_sumo.questions.box import Judgement, Proof, prove
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.records import FloatArray
 
-RANDOM = 1024
-"""Number of random settings that attack first, with the counterexamples: they find failures far from the worst."""
-GENERATIONS, PARENTS, CHILDREN, STEP = 8, 32, 512, 0.1
-"""Generations of an attack; the worst settings, which are the parents of a generation; its children; a characteristic's
-step, as a share of the way to a random value.
-"""
+BUDGET = 5000
+"""Number of simulations of an attack, over all fits."""
+KNOWN = 256
+"""Number of the worst known settings with which an attack begins; with each other fit an eighth."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
+Failures = dict[int, FloatArray]
+"""Failures by the number of the problem, of one fit, in which they are, shape (M, n)."""
 
 
-class Proof(NamedTuple):
-    """`proof_failures` of `proof_samples` vehicles drawn after the parameters were chosen; at most the share `at_most`
-    of all are unsafe, with `CONFIDENCE`.
+def find_failures(problems: Sequence[RepairProblem], change: FloatArray, known: FloatArray, number: int) -> Failures:
+    """Attack a change in all fits: promised settings that it does not keep safe, and a driving system could; `number`
+    counts the attacks, for their random numbers.
     """
+    own = problems[0]
+    rng = np.random.default_rng((own.study.search.seed, number))
+    judges = [partial(problem.left, change, stage="attack") for problem in problems]
+    starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
+    found = attack(own.promise, judges, starts, BUDGET, rng)
+    is_unsafe = found.left < 0
+    numbers = np.unique(found.judges[is_unsafe]).tolist()
+    return {row: np.unique(found.settings[is_unsafe & (found.judges == row)], axis=0) for row in numbers}
 
-    proof_samples: int
-    proof_failures: int
-    at_most: float
 
+def prove_change(
+    problems: Sequence[RepairProblem], change: FloatArray, number: int, attempt: int
+) -> tuple[Proof, Failures]:
+    """Draw fresh wear for a change: its proof with the study's own fit, and the unsafe settings; only without them the
+    change is proved.
 
-def find_failures(problem: RepairProblem, change: FloatArray, known: FloatArray, number: int) -> FloatArray:
-    """Attack a change with known and random settings and their offspring: its worst failures, shape (M, n).
-
-    A failure is a promised setting that the change does not keep safe, and a driving system could. `number` counts the
-    attacks, for their random numbers. A child has each characteristic of one of two parents. On average, one of its
-    characteristics mutates: with equal probability to a random value, or a step towards one.
+    As many settings again each meet one of the other fits, at random. `number` counts the attacks, for the random
+    numbers, and `attempt` the proofs that failed before.
     """
-    promise, rng = problem.promise, np.random.default_rng((problem.study.search.seed, number))
-    children = np.concatenate([known, problem.draw(RANDOM, rng)])
-    parents, degrees = children[:0], np.zeros(0)
-    for _ in range(GENERATIONS):
-        new_degrees = problem.degrees_with(change, children, "attack")
-        is_repairable = new_degrees >= problem.margin
-        is_repairable[~is_repairable] = problem.repairable(children[~is_repairable])
-        parents = np.concatenate([parents, children[is_repairable]])
-        degrees = np.append(degrees, new_degrees[is_repairable])
-        worst = np.argsort(degrees, kind="stable")[:PARENTS]
-        parents, degrees = parents[worst], degrees[worst]
-        pairs, shape = parents[rng.integers(len(parents), size=(2, CHILDREN))], (CHILDREN, len(promise.lower))
-        children = np.where(rng.random(shape) < 0.5, *pairs)
-        random = promise.at(rng.random(shape))
-        draw = rng.random(shape) * np.count_nonzero(promise.lower < promise.upper)
-        children = np.select([draw < 0.5, draw < 1.0], [random, children + STEP * (random - children)], children)
-        children = children[problem.holds(children)]
-    return np.unique(parents[degrees < problem.margin], axis=0)
+    own, seed = problems[0], problems[0].study.search.seed
 
+    def judge(settings: FloatArray) -> Judgement:
+        left = own.left(change, settings, "proof on fresh wear")
+        return Judgement(left < 0, np.zeros(len(left), dtype=bool), np.isfinite(left))
 
-def prove(problem: RepairProblem, change: FloatArray, number: int, attempt: int) -> tuple[Proof, FloatArray]:
-    """Draw fresh wear for a change: its proof, and the unsafe settings; only without them the change is proved.
-
-    After k attempts that failed this one may be wrong with probability alpha / 2^k, alpha = 1 - `CONFIDENCE`, so that
-    it draws more. `number` counts the attacks, for the random numbers.
-    """
-    error, draws = proof_size(attempt, MAX_UNSAFE_SHARE)
-    fresh = problem.draw(draws, np.random.default_rng((problem.study.search.seed, 7, number)))
-    unsafe = fresh[problem.degrees_with(change, fresh, "proof on fresh wear") < problem.margin]
-    is_repairable = problem.repairable(unsafe)
-    samples = len(fresh) - int(np.count_nonzero(~is_repairable))  # what no driving system keeps safe proves nothing
-    at_most = -math.expm1(math.log(error) / samples) if samples else 1.0
-    return Proof(samples, int(np.count_nonzero(is_repairable)), at_most), unsafe[is_repairable]
+    rng = np.random.default_rng((seed, 7, number))
+    proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)
+    failures = {0: unsafe} if len(unsafe) else {}
+    if failures or len(problems) == 1:
+        return proof, failures
+    settings = own.draw(proof.samples, rng)
+    fits = rng.integers(1, len(problems), size=len(settings))
+    for row in range(1, len(problems)):
+        of_fit = settings[fits == row]
+        is_unsafe = problems[row].left(change, of_fit, "proof on fresh wear") < 0
+        if is_unsafe.any():
+            failures[row] = of_fit[is_unsafe]
+    return proof, failures

@@ -17,6 +17,7 @@ from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
 from safevar_sumo.questions.preventability import approach_parameters
 from safevar_sumo.questions.words import join_phrases
@@ -61,16 +62,8 @@ class Parameter(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Promise:
-    """The promised wear: all settings from `lower` to `upper`, shape (n,), that keep the study's constraints.
-
-    The ends of characteristics that stay as in the original are equal. Parameters of the scenario that the study
-    searches take their whole domain.
-    """
-
-    region: FeasibleRegion
-    lower: FloatArray
-    upper: FloatArray
+class Promise(Box):
+    """The promised wear: a box in which parameters of the scenario that the study searches take their whole domain."""
 
     @classmethod
     def of(cls, study: Study, region: FeasibleRegion, texts: Sequence[str]) -> Promise:
@@ -98,19 +91,6 @@ class Promise:
         if (lower == upper)[everything.of_vehicle].all():
             raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
         return cls(region, lower, upper)
-
-    def at(self, points: FloatArray) -> FloatArray:
-        """The settings at points of the unit cube, shape (M, n)."""
-        return self.lower + points * (self.upper - self.lower)
-
-    def holds(self, settings: FloatArray) -> BoolArray:
-        """Which settings are promised, shape (M,)."""
-        is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
-        return np.asarray(is_within & self.region.feasible(settings))
-
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Settings drawn uniformly among the promised ones."""
-        return self.region.draw_feasible(lambda count: self.at(rng.random((count, len(self.lower)))), number)
 
     def to_dict(self) -> dict[str, list[float]]:
         """The ends of every characteristic that may wear, and of every parameter of the scenario that varies."""
@@ -172,7 +152,7 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
     """A study's ADS with P parameters that may change, and the criterion to keep within a promise: safety degrees of at
-    least `margin`.
+    least `margin`, with one `fit` of the vehicle.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
     """
@@ -181,6 +161,7 @@ class RepairProblem:
     promise: Promise
     parameters: list[Parameter]
     unsafe: Unsafe
+    fit: int = 0
 
     @property
     def study(self) -> Study:
@@ -246,6 +227,17 @@ class RepairProblem:
     def degrees_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
         """Safety degrees of settings with one set of parameters, shape (L,)."""
         return self.degrees(change[np.newaxis], settings, stage)[0].reshape(-1)
+
+    def left(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+        """What settings leave to the margin with one set of parameters, shape (L,); infinite where they do not hold, or
+        no driving system keeps them safe.
+        """
+        left = np.full(len(settings), np.inf)
+        rows = np.flatnonzero(self.holds(settings))
+        left[rows] = self.degrees_with(change, settings[rows], stage) - self.margin
+        unsafe = np.flatnonzero(left < 0)
+        left[unsafe[~self.repairable(settings[unsafe])]] = np.inf
+        return left
 
     def holds(self, settings: FloatArray) -> BoolArray:
         """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps a new vehicle safe;

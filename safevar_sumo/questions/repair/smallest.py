@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,27 +34,42 @@ FIRST_SETTINGS = 64
 """Number of the worst settings with which a change is tried at all points first; then with four times as many, and so
 on.
 """
-Failure = tuple[FloatArray, tuple[int, ...]]
-"""A setting, shape (n,), and the point at which a change failed with it, none without a matrix."""
+
+
+class Failure(NamedTuple):
+    """A setting, shape (n,), with which a change failed, the number of the problem, of one fit, and the point; none
+    without a matrix.
+    """
+
+    setting: FloatArray
+    problem: int
+    points: tuple[int, ...]
 
 
 class Search:
-    """Searches the smallest changes that survive `settings`, shape (L, n), worst first.
+    """Searches the smallest changes that survive the settings of problems, one for each fit of the vehicle, shape
+    (L, n), worst first.
 
     Counterexamples only make the smallest change of a number of parameters larger. So `_least`, a size at which there
     was none, is a lower bound for ever.
     """
 
-    def __init__(self, problem: RepairProblem, settings: FloatArray) -> None:
-        self.problem, self.settings = problem, settings
-        self._thinning = 1 if problem.arrays else THINNING
+    def __init__(self, problems: Sequence[RepairProblem], settings: FloatArray) -> None:
+        self.problems = problems
+        self.problem, self.settings_of = problems[0], {0: settings}
+        self._thinning = 1 if self.problem.arrays else THINNING
         self._failures = list[Failure]()
         self._best, self._least = dict[int, FloatArray](), dict[int, float]()
 
-    def add(self, settings: FloatArray) -> None:
-        """Add counterexamples, which are tried first."""
-        rows = np.concatenate([settings, self.settings])
-        self.settings = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+    @property
+    def settings(self) -> FloatArray:
+        """The settings that count with the study's own fit."""
+        return self.settings_of[0]
+
+    def add(self, problem: int, settings: FloatArray) -> None:
+        """Add counterexamples of a problem, which are tried first."""
+        rows = np.concatenate([settings, self.settings_of.get(problem, settings[:0])])
+        self.settings_of[problem] = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
 
     def smallest_changes(self) -> list[FloatArray]:
         """The parameters of today if they survive all counterexamples; otherwise the smallest change of one parameter
@@ -107,14 +123,16 @@ class Search:
 
     def _failure_of(self, change: FloatArray) -> Failure | None:
         """The worst failure among the first settings with which a change fails; None if it survives all."""
-        start, size = 0, FIRST_SETTINGS
-        while start < len(self.settings):
-            settings = self.settings[start : start + size]
-            (degrees,), points = self.problem.degrees(change[np.newaxis], settings, "changes with all vehicles")
-            worst = int(np.argmin(degrees))
-            if degrees[worst] < self.problem.margin:
-                return settings[worst], () if points is None else (int(points[worst]),)
-            start, size = start + size, 4 * size
+        for number, settings in self.settings_of.items():
+            start, size = 0, FIRST_SETTINGS
+            while start < len(settings):
+                rows = settings[start : start + size]
+                problem = self.problems[number]
+                (degrees,), points = problem.degrees(change[np.newaxis], rows, "changes with all vehicles")
+                worst = int(np.argmin(degrees))
+                if degrees[worst] < problem.margin:
+                    return Failure(rows[worst], number, () if points is None else (int(points[worst]),))
+                start, size = start + size, 4 * size
         return None
 
     def _first_survivor(self, changes: FloatArray) -> int | None:
@@ -133,10 +151,12 @@ class Search:
     def _survivors(self, changes: FloatArray, failures: Sequence[Failure]) -> npt.NDArray[np.intp]:
         """The rows of the changes that survive the settings of failures at their points; few at a time."""
         alive = np.arange(len(changes))
-        for points in dict.fromkeys(points for _, points in failures):
-            settings = np.array([setting for setting, failed_at in failures if failed_at == points])
+        for number, points in dict.fromkeys((failure.problem, failure.points) for failure in failures):
+            same = [each.setting for each in failures if (each.problem, each.points) == (number, points)]
+            settings, problem = np.array(same), self.problems[number]
             while len(settings) and len(alive):
-                number = max(1, BATCH // len(alive))
-                degrees, _ = self.problem.degrees(changes[alive], settings[:number], "changes with one vehicle", points)
-                alive, settings = alive[(degrees >= self.problem.margin).all(axis=1)], settings[number:]
+                count = max(1, BATCH // len(alive))
+                degrees, _ = problem.degrees(changes[alive], settings[:count], "changes with one vehicle", points)
+                alive = alive[(degrees >= problem.margin).all(axis=1)]
+                settings = settings[count:]
         return alive

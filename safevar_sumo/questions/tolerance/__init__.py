@@ -5,32 +5,35 @@ The filter of small changes is not applied, as the question is about the vehicle
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import check_name
-from safevar_sumo.metrics import RATING_POINTS, Unsafe, margin_of
+from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
-from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator
-from safevar_sumo.questions.model_spread import across
-from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
-from safevar_sumo.questions.tolerance.boxes import MET_BY_CORNERS, random_settings
-from safevar_sumo.questions.tolerance.joint import JointLimits, find_joint_limits
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Models, limit_criterion, models_of, with_points_between
+from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tolerance.alone import limits_alone
+from safevar_sumo.questions.tolerance.refusal import nearest_limits
 from safevar_sumo.questions.tolerance.rows import limit_rows
 from safevar_sumo.questions.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, scan
-from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
+from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
+from safevar_sumo.questions.tolerance.words import verdict_sentences
+from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study, limits_of
-from safevar_sumo.sumo.matrix import contact_degree
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles.region import REJECTIONS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,29 +48,31 @@ LIMITS: Columns = {
     **{
         f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g")
         for name, meaning in (
-            ("alone", "that is safe with all others as in the original"),
-            ("together", "that is safe with all others within theirs"),
+            ("alone", "that is safe with all others as in the original, with every fit"),
+            ("together", "that is safe with all others within theirs, with every fit"),
             ("specified", "that the user's limit allows"),
         )
         for end in ("low", "high")
     },
-    "kept": "whether the car is safe within the specified limits, alone and together",
+    "kept": "whether the car is safe within the specified limits with every fit; empty without one",
     "fails_first": Column("", "what fails first beyond the limit", is_shown=False),
+    "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
     "sentence": "for a maintenance manual; all of these may be obeyed together",
 }
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
-    "low": Column("", "first simulated value that is so, all others as in the original", ".6g"),
+    "low": Column(
+        "", "first simulated value that is so, all others as in the original, with the study's own fit", ".6g"
+    ),
     "high": Column("", "last one", ".6g"),
     "degree_low": Column("m", "safety degree at the first value; in -m/s on a collision", ".2f"),
     "degree_high": Column("m", "safety degree at the last value; in -m/s on a collision", ".2f"),
 }
 FITS: Columns = {
-    **CHARACTERISTIC,
-    "end": "low or high end of what is safe alone",
-    **with_interval("alone", Column("", "this end, not rounded; the interval holds it with all fits", ".4g")),
-    "fits": Column("-", "number of fits with which the original is safe, so that there is an end"),
+    "fit": Column("-", "number of the fit among the sets of [spread]; 0 is the study's own", "d"),
+    "specified": "whether the specified limits hold with it; left out: the original is unsafe or keeps too little",
+    "corners": Column("m", "the least that the corners of the limits together keep; in -m/s on a collision", ".2f"),
 }
 POINTS: Columns = {
     **CHARACTERISTIC,
@@ -75,10 +80,11 @@ POINTS: Columns = {
     "first_point_lost": Column("", "value nearest to the original that loses a whole point", ".5g"),
     "least_points": Column("-", "fewest points anywhere in the domain", ".2f"),
 }
-
-
-NUMBERS_OF_BOX = {"samples": "samples", "failures": "unsafe", "at_most": "at_most", "not_simulated": "failed"}
-"""The fields of `JointLimits` by their names among the numbers."""
+NEAREST: Columns = {
+    **CHARACTERISTIC,
+    "limit": Column("", "the specified value", ".10g"),
+    "nearest": Column("", "the nearest value with which limits together exist, the others as specified", ".10g"),
+}
 
 
 @question
@@ -90,12 +96,14 @@ def tolerance(
     characteristics: Annotated[tuple[str, ...], "A,B"] = (),
     margin: Margin = None,
     unsafe: Criterion = None,
-    fits: Annotated[int, Range(0, 1000)] = 12,
+    fits: Annotated[int | None, Range(0, 1000)] = None,
+    attack: Annotated[int, Range(0, 100_000_000)] = 5000,
 ) -> Answer:
     """Find how far each characteristic may go: alone, and all together.
 
-    The limits together hold none of the unsafe solutions of results. In a study that searches its scenario they hold in
-    all encounters in which the original vehicle is safe, and end at contact unless a margin is stated.
+    The limits hold in every fit of the vehicle, within a scope that is stated. The limits together hold none of the
+    unsafe solutions of results. In a study that searches its scenario they hold in all encounters in which the original
+    vehicle is safe.
 
     Parameters
     ----------
@@ -105,70 +113,118 @@ def tolerance(
     characteristics
         Only these characteristics, separated by commas; all others keep their values. By default all.
     margin
-        Distance to keep from a collision [m], between bumpers where the safety degree is from centre to centre; by
-        default the model's error that the study states, else 0.3 m.
+        Distance to keep from a collision with the study's own fit [m], between bumpers where the safety degree is from
+        centre to centre; by default the model's error that the study states, else 0.3 m, and 0.1 m in a study that
+        searches its scenario, whose originals keep more.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) with which each
-        characteristic is scanned again; 0 leaves this out.
+        Number of vehicle models that fit the published data about as well (sets of [spread]) in which the limits hold,
+        by default all; 0 for the study's own alone.
+    attack
+        Number of simulations that are aimed at the limits together, over all fits; 0 leaves the attack out.
     """
-    study, system = evaluator.study, assemble(evaluator.study)
+    study = evaluator.study
     members = evaluator.characteristics
     columns = _columns_of(members.vehicle.names, characteristics)
-    everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
-    all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
-    criterion = evaluator.choose_criterion(unsafe, subject, original)
-    # A collision that is asked for stands alone; and the original's margin is what wear may use up in an encounter.
-    has_margin = margin is not None or (unsafe is None and not everywhere)
-    if criterion == Unsafe() and has_margin:
-        criterion = replace(criterion, keep=margin_of(study, margin))
-    criterion = replace(criterion, contact=contact_degree(system))
-    # A box of a rated study would take thousands of whole test matrices.
-    is_sought = not is_rated(study)
-    bounds = members.lower, members.upper
-    if is_sought:  # drawing a setting raises the error if hardly any is feasible, before the long scans
-        random_settings(evaluator, columns, *bounds, 1, np.random.default_rng(study.search.seed))
-    scans, *others = across(
-        evaluator, fits if is_sought else 0, lambda each: scan(each, columns, criterion, coarse=each is not evaluator)
-    )
-    box = None
-    if is_sought and not criterion.of(original)[0]:
+    criterion = limit_criterion(evaluator, subject, unsafe, margin, original)
+    is_sought = not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
+    if is_sought:
+        _check_drawable(evaluator)
+    scans = scan(evaluator, columns, criterion)
+    is_safe = not criterion.of(original)[0]
+    models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
+    alone = limits_alone(scans, columns, _denser(models, attack) if is_sought else models.members, attack)
+    together = None
+    if is_sought and is_safe:
+        all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
+        everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
         known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, scans)]
-        limits_of_box = {**specified, **everywhere}
-        box = find_joint_limits(evaluator, all_columns, criterion, limits_of_box, scans, np.concatenate(known))
-    rows, broken = limit_rows(evaluator, scans, box, specified, criterion)
-    numbers = {
-        "unsafe": str(criterion),
-        "margin": criterion.keep,
-        "kept": not broken,
-        **{name: getattr(box, field, None) for name, field in NUMBERS_OF_BOX.items()},
-    }
+        all_limits = {**specified, **everywhere}
+        together = find_limits_together(models, all_columns, all_limits, scans, np.concatenate(known), attack)
+    found = limit_rows(alone, together, specified, models.members)
     tables = {
-        "limits": tabulate("Limits, rounded to the safe side", LIMITS, rows),
+        "limits": tabulate("Limits, rounded to the safe side", LIMITS, found.rows),
         "intervals": tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans)),
     }
-    if others:
-        tables["fits"] = tabulate("Ends over the fits of published data", FITS, _ends_over_fits([scans, *others]))
+    if together is not None and len(models.members) + len(models.left_out) > 1:
+        tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, _fit_rows(models, together))
     if is_rated(study):
         tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
+    nearest = nearest_limits(models, specified) if found.broken and together is not None else []
+    if nearest:
+        tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
+    wider = wider_rows(evaluator, specified, together, unsafe, margin, fits, attack) if is_safe else []
+    if wider:
+        tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
+    sentences = verdict_sentences(models, alone, together, specified, found.broken, attack, nearest, wider)
     return Answer(
         question="tolerance",
         study=study,
-        verdict=" ".join(
-            [
-                *_verdict(scans, box, criterion, broken, bool(specified), bool(everywhere)),
-                *counted_in_words(study),
-                *constraints_in_words(study),
-            ]
-        ),
-        numbers=numbers,
+        verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
+        numbers=_numbers(study, criterion, models, together, found.broken, attack),
         tables=tables,
-        failures=tuple(f"limit of {text}" for text in broken),
+        failures=tuple(f"limit of {text}" for text in found.broken),
         draw=partial(_draw, scans=scans),
     )
+
+
+def _numbers(
+    study: Study, criterion: Unsafe, models: Models, together: LimitsTogether | None, broken: Sequence[str], attack: int
+) -> dict[str, Any]:
+    """The numbers of the answer; without limits together those about them are undefined."""
+    numbers: dict[str, Any] = {
+        "unsafe": str(criterion),
+        "margin": criterion.keep,
+        "kept": not broken,
+        "scope": scope_of(study, between=attack > 0),
+    }
+    of_box = (
+        "box",
+        "samples",
+        "failures",
+        "at_most",
+        "not_simulated",
+        "fits",
+        "fits_tried",
+        "attacked",
+        "least_attacked",
+    )
+    if together is None:
+        return {**numbers, **dict.fromkeys(of_box), "boxes": 0}
+    proof, found = together.proof, together.attack
+    return {
+        **numbers,
+        "box": together.box is not None,
+        "samples": None if proof is None else proof.samples,
+        "failures": None if proof is None else proof.failures,
+        "at_most": None if proof is None else proof.at_most,
+        "not_simulated": None if proof is None else proof.not_simulated,
+        "fits": len(together.members),
+        "fits_tried": len(models.members),
+        "attacked": None if found is None else found.simulated,
+        "least_attacked": None if found is None else together.least[0],
+        "boxes": int(together.box is not None),
+    }
+
+
+def _check_drawable(evaluator: Evaluator) -> None:
+    """Refuse a study of which hardly any setting is feasible, before the long scans."""
+    members, region = evaluator.characteristics, evaluator.region
+    if not len(Box(region, members.lower, members.upper).draw(1, np.random.default_rng(evaluator.study.search.seed))):
+        problem = f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no box to test: "
+        legal = "characteristics that the constraints do not tie to each other"
+        raise InputError(evaluator.study.source, f"{problem}{region}", legal)
+
+
+def _denser(models: Models, attack: int) -> list[Any]:
+    """The models with further points between those of the study's matrix, if there is an attack."""
+    if not attack:
+        return [*models.members]
+    own, seed = models.own, models.own.evaluator.study.search.seed
+    return [with_points_between(model, own.unsafe, np.random.default_rng((seed, 5, 0)))[0] for model in models.members]
 
 
 def _columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:
@@ -206,44 +262,6 @@ def _unsafe_solutions(subject: Study | Case, columns: Sequence[int], unsafe: Uns
     return np.unique(settings[(settings == original)[:, other_columns].all(axis=1)], axis=0)
 
 
-def _verdict(
-    scans: Sequence[OneAtATimeScan],
-    box: JointLimits | None,
-    unsafe: Unsafe,
-    broken: list[str],
-    has_limits: bool,
-    is_searched: bool,
-) -> Iterator[str]:
-    """The decision, how sure it is, and what is unsafe alone."""
-    if any(one.safe is None for one in scans):
-        yield f"The original vehicle itself is unsafe ({unsafe.description})."
-        return
-    if broken:
-        yield f"Do not release: {'; '.join(broken)}."
-    if box is not None and not box.kept and not has_limits:
-        yield f"No safe box around the original was found ({unsafe.description})."
-    elif box is not None:
-        yield _box_in_words(box, unsafe, has_limits, f" in {MET_BY_CORNERS:,} encounters" if is_searched else "")
-    if names := [one.characteristic.name for one in scans if one.of_state("unsafe")]:
-        yield f"Unsafe alone, all others as in the original: {join_phrases(names)}."
-    else:
-        yield "No single characteristic makes it unsafe."
-
-
-def _box_in_words(box: JointLimits, unsafe: Unsafe, has_limits: bool, met: str) -> str:
-    """The result of the test of all limits together; `met` says in how many encounters the corners drive."""
-    failed = f", and {box.failed} could not be simulated" if box.failed else ""
-    bound = f"at most {100 * box.at_most:.2f} % are, with {100 * CONFIDENCE:.0f} % confidence"
-    if not box.kept:
-        drawn = f"{box.unsafe} of {box.samples:,} vehicles drawn" if box.unsafe else "vehicles that a search found"
-        return f"Within the limits, all others as in the original, {drawn} are unsafe{failed}; {bound}."
-    between = " between bumpers" if unsafe.contact else ""
-    kept = f" with at least {unsafe.keep:.3g} m left{between}" if unsafe.keep else f" (unsafe: {unsafe.description})"
-    decision = "Keeps all limits" if has_limits else "All may go to their limits together"
-    tested = f"no corner{met} and none of {box.samples:,} vehicles drawn within is unsafe"
-    return f"{decision}{kept}: {tested}{failed}; {bound}."
-
-
 def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
     """The rows of the table of intervals."""
     frames = []
@@ -255,18 +273,11 @@ def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)[[*INTERVALS]]
 
 
-def _ends_over_fits(of_fits: Sequence[Sequence[OneAtATimeScan]]) -> list[tuple[Any, ...]]:
-    """A row of `FITS` for each end of what is safe alone, except ends of the domain with all fits."""
-    rows = []
-    for own, *others in zip(*of_fits, strict=True):
-        item, intervals = own.characteristic, [one.safe for one in (own, *others) if one.safe is not None]
-        for column, last in enumerate((item.lower, item.upper)):
-            values = [ends[column] for ends in intervals]
-            if {*values} != {last}:
-                value = np.nan if own.safe is None else own.safe[column]
-                low, high = min(values, default=np.nan), max(values, default=np.nan)
-                rows.append((item.name, item.unit, ("low", "high")[column], value, low, high, len(values)))
-    return rows
+def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]:
+    """A row of `FITS` for each fit."""
+    states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
+    states |= dict.fromkeys(models.left_out, "left out")
+    return [(fit, state, together.corners.get(fit, np.nan)) for fit, state in sorted(states.items())]
 
 
 def _lost_points(scans: Sequence[OneAtATimeScan]) -> list[tuple[Any, ...]]:

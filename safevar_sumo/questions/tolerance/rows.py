@@ -2,110 +2,165 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.evaluator import Evaluator, Interval
-from safevar_sumo.questions.tolerance.joint import JointLimits
-from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
+from safevar_sumo.questions.evaluator import Interval
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.tolerance.alone import AloneLimit
+from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import KMH_PER_MS, FloatArray
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import Characteristic
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
-NO_BOX = "no safe box"
 Ends = tuple[float | None, float | None]
 NOWHERE: Ends = None, None
 
 
-def limit_rows(
-    evaluator: Evaluator,
-    scans: Sequence[OneAtATimeScan],
-    box: JointLimits | None,
-    limits: Mapping[str, Limit],
-    unsafe: Unsafe,
-) -> tuple[list[tuple[Any, ...]], list[str]]:
-    """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept.
+class Failure(NamedTuple):
+    """An unsafe setting, and how it fails, in words."""
 
-    `box` is None in a rated study, and around an unsafe original.
+    setting: FloatArray
+    words: str
+
+
+class LimitRows(NamedTuple):
+    """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept."""
+
+    rows: list[tuple[Any, ...]]
+    broken: list[str]
+
+
+def limit_rows(
+    alone: Sequence[AloneLimit], together: LimitsTogether | None, limits: Mapping[str, Limit], models: Sequence[Model]
+) -> LimitRows:
+    """The rows of the table of limits.
+
+    `together` is None in a rated study, and around an unsafe original.
     """
-    nearest = {one.characteristic.name: one.nearest_unsafe(one.characteristic.original) for one in scans}
-    beyond_alone = _failures_alone(evaluator, nearest, unsafe)
-    beyond = {} if box is None else describe_failures(evaluator, box.beyond, unsafe)
+    beyond_alone = _failures_alone(alone)
+    beyond = {} if together is None else _failures_beyond(together, models)
     rows, broken = [], []
-    for one in scans:
-        item, is_sought = one.characteristic, not is_rated(evaluator.study)
+    for each in alone:
+        item = each.characteristic
         name, limit = item.name, limits.get(item.name)
         specified = NOWHERE if limit is None else (limit.at_least, limit.at_most)
-        together = box.box[name] if box is not None and box.kept else None
-        by, end = _outside(one, specified)
-        is_kept = limit is None or (one.safe is not None and not by and (together is not None or not is_sought))
-        if not is_kept:
-            why = "kept alone, not together with all limits"
-            if by:
-                end = end if one.nearest_unsafe(end) == end else nearest[name] or end
-                fails = _failures_alone(evaluator, {name: end}, unsafe).get(name, "the car fails in other encounters")
-                why = f"{fails} (outside by {by:.3g}{item.suffix})"
-            broken.append(f"{name} {end:.5g}{item.suffix}: {why}")
+        box = None if together is None else together.box
+        column = models[0].evaluator.characteristics.names.index(name)
+        ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
+        failure = beyond.get(name) or beyond_alone.get(name)
+        is_kept = None if limit is None else _is_kept(each, specified, together)
+        if is_kept is False:
+            broken.append(_broken_in_words(each, specified, together, beyond_alone.get(name), models))
+        members = models[0].evaluator.characteristics
         rows.append(
             (
                 *(name, item.unit, item.original),
-                *(*(_rounded(one) or NOWHERE), *(together or NOWHERE), *specified),
-                *(is_kept, beyond.get(name) or beyond_alone.get(name)),
-                _sentence(item, together, specified, beyond.get(name)) if is_sought else None,
+                *(*(each.safe or NOWHERE), *(ends or NOWHERE), *specified),
+                is_kept,
+                None if failure is None else failure.words,
+                None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True)),
+                None if together is None else _sentence(item, box, members, specified, beyond.get(name)),
             )
         )
-    return rows, broken
+    return LimitRows(rows, broken)
 
 
-def _rounded(one: OneAtATimeScan) -> Interval | None:
-    """What is safe alone, rounded inwards; ends of the domain stay."""
-    if one.safe is None:
-        return None
-    item, (low, high) = one.characteristic, one.safe
-    return (
-        low if low <= item.lower else item.rounded(low, upwards=True),
-        high if high >= item.upper else item.rounded(high, upwards=False),
-    )
+def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None) -> bool:
+    """Whether a limit is safe alone, and with all specified limits in every fit."""
+    return alone.safe is not None and not _outside(alone, specified)[0] and not (together and together.broken)
 
 
-def _outside(one: OneAtATimeScan, specified: Ends) -> tuple[float, float]:
+def _outside(alone: AloneLimit, specified: Ends) -> tuple[float, float]:
     """How far the user's limit is outside what is safe alone [unit], 0 if it is inside, and the end that is."""
-    original = one.characteristic.original
-    ends = zip(specified, one.safe or (original, original), (-1, 1), strict=True)
+    original = alone.characteristic.original
+    ends = zip(specified, alone.safe or (original, original), (-1, 1), strict=True)
     by = [(max(sign * (end - safe), 0.0), end) for end, safe, sign in ends if end is not None]
     return max(by, default=(0.0, original))
 
 
-def _failures_alone(evaluator: Evaluator, values: Mapping[str, float | None], unsafe: Unsafe) -> dict[str, str]:
-    """How a value of one characteristic alone fails, in words, by its name; nothing without a value."""
-    members = evaluator.characteristics
-    settings = {name: members.setting({name: value}, name) for name, value in values.items() if value is not None}
-    return describe_failures(evaluator, settings, unsafe)
+def _broken_in_words(
+    alone: AloneLimit,
+    specified: Ends,
+    together: LimitsTogether | None,
+    failure: Failure | None,
+    models: Sequence[Model],
+) -> str:
+    """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by 0.08)`."""
+    item = alone.characteristic
+    by, end = _outside(alone, specified)
+    name = f"{item.name} {next(value for value in specified if value is not None):.5g}{item.suffix}"
+    if by:
+        members = models[0].evaluator.characteristics
+        setting = members.setting({item.name: end}, item.name)
+        for model in models:
+            if model.are_unsafe(setting[np.newaxis], "what fails first")[0]:
+                failure = describe(model, {item.name: setting})[item.name]
+                break
+        words = "the car is unsafe" if failure is None else failure.words
+        value = end if failure is None else failure.setting[members.names.index(item.name)]
+        return f"{item.name} {value:.5g}{item.suffix}: {words} (outside by {by:.3g}{item.suffix})"
+    if together is not None and together.broken:
+        fits = {model.fit: model for model in models}
+        fit, setting = next(iter(together.broken.items()))
+        return f"{name}: with all specified limits, {describe(fits[fit], {'': setting})[''].words}"
+    return f"{name}: the original itself is unsafe"
 
 
-def describe_failures(evaluator: Evaluator, settings: Mapping[str, FloatArray], unsafe: Unsafe) -> dict[str, str]:
-    """How unsafe settings fail at their worst points, in words, by the same names."""
+def _failures_alone(alone: Iterable[AloneLimit]) -> dict[str, Failure]:
+    """How each characteristic alone fails first, by its name."""
+    failures = dict[str, Failure]()
+    for each in alone:
+        original = each.characteristic.original
+        known = [pair for pair in each.beyond if pair is not None]
+        if known:
+            column = next(
+                number
+                for number, member in enumerate(known[0][1].evaluator.characteristics)
+                if member.name == each.characteristic.name
+            )
+            setting, model = min(known, key=lambda pair: abs(pair[0][column] - original))
+            failures |= describe(model, {each.characteristic.name: setting})
+    return failures
+
+
+def _failures_beyond(together: LimitsTogether, models: Sequence[Model]) -> dict[str, Failure]:
+    """How the car fails just beyond each limit of the box, by its name."""
+    failures: dict[str, Failure] = {}
+    names = models[0].evaluator.characteristics.names
+    waiting = {names[column]: setting for (_, column), setting in together.beyond.items()}
+    for model in together.searched:
+        if not waiting:
+            break
+        is_unsafe = model.are_unsafe(np.array([*waiting.values()]), "what fails first")
+        of_model = {name: setting for (name, setting), fails in zip(waiting.items(), is_unsafe, strict=True) if fails}
+        failures |= describe(model, of_model)
+        waiting = {name: setting for name, setting in waiting.items() if name not in of_model}
+    return failures
+
+
+def describe(model: Model, settings: Mapping[str, FloatArray]) -> dict[str, Failure]:
+    """How unsafe settings of a model fail at their worst points, by the same names."""
     if not settings:
         return {}
-    points, members = assemble(evaluator.study).points, evaluator.characteristics
-    runs = evaluator.evaluate(np.array(list(settings.values())), "what fails first")
+    points, members = assemble(model.evaluator.study).points, model.evaluator.characteristics
+    points = tuple(points[number] for number in model.points) or points
+    runs = model.evaluate(np.array(list(settings.values())), "what fails first")
     worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
-    words, names = {}, members.scenario.names
-    columns = (settings, worst.tolist(), runs.settings[:, ~members.of_vehicle].tolist(), runs.collided, runs.f_safe)
-    for is_unsafe, (name, point, values, collided, degree) in zip(
-        unsafe.of(runs), zip(*columns, strict=True), strict=True
-    ):
-        if is_unsafe or not names:
-            scenario = encounter(points[point], dict(zip(names, values, strict=True))).scenario
-            words[name] = _failure_in_words(scenario, unsafe, bool(collided), degree)
-    return words
+    fit = f" (fit {model.fit} of the vehicle)" if model.fit else ""
+    failures = {}
+    rows = zip(settings.items(), worst.tolist(), runs.collided, runs.f_safe, strict=True)
+    for (name, setting), point, collided, degree in rows:
+        values = dict(zip(members.scenario.names, setting[~members.of_vehicle].tolist(), strict=True))
+        scenario = encounter(points[point], values).scenario
+        failures[name] = Failure(setting, _failure_in_words(scenario, model.unsafe, bool(collided), degree) + fit)
+    return failures
 
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
@@ -121,14 +176,20 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
     return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{centre} from {scenario.obstacle()}{test}"
 
 
-def _sentence(item: Characteristic, ends: Interval | None, specified: Ends, beyond: str | None) -> str:
+def _sentence(
+    item: Characteristic, box: Any, members: CharacteristicSet, specified: Ends, failure: Failure | None
+) -> str:
     """A sentence for a maintenance manual: all of these may be obeyed together. The original, and what the user
     specified, have their own digits.
     """
     name = item.short_name[:1].upper() + item.short_name[1:]
-    if ends is None:
-        return f"{name}: {NO_BOX}."
+    if box is None:
+        return f"{name}: no limits together were found."
+    column = members.names.index(item.name)
+    ends: Interval = float(box.lower[column]), float(box.upper[column])
     own, domain = (item.original, *specified), (item.lower, item.upper)
+    if ends[0] == ends[1]:
+        return f"{name}: keep {ends[0]:g}{item.suffix}, as in the original: no room was found for it."
     keep = " and ".join(
         f"{word} {f'{end:g}' if end in own else item.text(end)}{item.suffix}"
         for word, end, last in zip(("at least", "at most"), ends, domain, strict=True)
@@ -136,5 +197,20 @@ def _sentence(item: Characteristic, ends: Interval | None, specified: Ends, beyo
     )
     if not keep:
         return f"{name}: anything from {item.lower:g} to {item.upper:g}{item.suffix}."
-    failure = f"; beyond, with the other characteristics at their limits, {beyond}" if beyond else ""
-    return f"{name}: keep {keep}{failure}."
+    beyond = "" if failure is None else f"; {_vehicle_in_words(item, box, members, failure)}, {failure.words}"
+    return f"{name}: keep {keep}{beyond}."
+
+
+def _vehicle_in_words(item: Characteristic, box: Any, members: CharacteristicSet, failure: Failure) -> str:
+    """The vehicle that fails just beyond a limit: `at 0.81, with the other characteristics at their limits`."""
+    others = [number for number, member in enumerate(members) if not member.is_scenario and member.name != item.name]
+    values = failure.setting[others]
+    is_corner = bool((np.isclose(values, box.lower[others]) | np.isclose(values, box.upper[others])).all())
+    value = failure.setting[members.names.index(item.name)]
+    named = [
+        f"{members.members[number].name} {failure.setting[number]:.6g}{members.members[number].suffix}"
+        for number in others
+        if failure.setting[number] != members.original[number]
+    ]
+    rest = "the other characteristics at their limits" if is_corner else ", ".join(named)
+    return f"at {value:.6g}{item.suffix}{f', with {rest}' if rest else ''}"

@@ -1,0 +1,140 @@
+"""The attack on a box: a search for the setting in it that is worst in any of several models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.questions.box import Box
+from safevar_sumo.records import FloatArray
+
+GENERATION, PARENTS = 512, 32
+"""Settings of a generation; the worst ones so far, which are its parents."""
+STEP, PULL = 0.1, 0.5
+"""Step of a mutation, as a share of the way to a random value; share of the way to a worse parent."""
+DIFFERENCE = 0.7
+"""Factor on the difference of two parents (F of differential evolution; Storn and Price 1997)."""
+MORE_GENERATIONS = 2
+"""Generations after the first with an unsafe setting: several failures at once spare attacks on boxes beside them."""
+Judge = Callable[[FloatArray], FloatArray]
+"""What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it does not count."""
+Rows = npt.NDArray[np.intp]
+
+
+class Attack(NamedTuple):
+    """The worst settings that an attack met, worst first.
+
+    Attributes
+    ----------
+    settings, judges, left
+        Settings, shape (K, n), the numbers of the judges that they met, and what they leave, shape (K,).
+    simulated
+        Number of settings that were simulated, each in one encounter and one model.
+    """
+
+    settings: FloatArray
+    judges: Rows
+    left: FloatArray
+    simulated: int
+
+
+def attack(
+    box: Box, judges: Sequence[Judge], known: Sequence[FloatArray], budget: int, rng: np.random.Generator
+) -> Attack:
+    """Search the settings of a box that leave least, with `budget` simulations; it ends `MORE_GENERATIONS` after one is
+    unsafe.
+
+    `known` are settings for each judge, or none, with which the attack begins, beside random ones.
+
+    Notes
+    -----
+    Half of a generation are children of two parents, each value from one of the two; on average one value mutates: to a
+    random value, a step towards one, or to an end of the box. The other half moves a parent towards a worse one and by
+    a difference of two others, as differential evolution does. After the first generation, half of each meets the
+    judge to whom least is left, and half another one, in turn, the next worst first: few at once make large batches.
+    """
+    found = Attack(np.zeros((0, len(box.lower))), np.zeros(0, dtype=np.intp), np.zeros(0), 0)
+    seen, generations_left = set[tuple[int, bytes]](), 1 + MORE_GENERATIONS
+    settings = np.concatenate([found.settings, *known])
+    numbers = np.repeat(np.arange(len(known)), [len(rows) for rows in known]).astype(np.intp)
+    least = np.full(len(judges), np.inf)
+    generation = 0
+    while found.simulated < budget:
+        size = min(GENERATION, budget - found.simulated)
+        choice = np.arange(len(judges)) if generation == 0 else _pair(least, generation)
+        settings, numbers = _new_ones(box, settings, numbers, choice, size, seen, rng)
+        if not len(settings):
+            break
+        left = np.full(len(settings), np.inf)
+        for number in np.unique(numbers):
+            left[numbers == number] = judges[number](settings[numbers == number])
+        np.minimum.at(least, numbers, left)
+        found = _worst(found, settings, numbers, left)
+        generations_left -= int((found.left < 0).any())
+        if not generations_left:
+            break
+        settings, generation = _children(box, found, rng), generation + 1
+        numbers = _pair(least, generation)[np.arange(len(settings)) // 2 % 2]
+    return found
+
+
+def _pair(least: FloatArray, generation: int) -> Rows:
+    """The judges of a generation: that with the least left, and another one in turn."""
+    order = np.argsort(least, kind="stable")
+    return order[[0, 1 + (generation - 1) % (len(order) - 1) if len(order) > 1 else 0]]
+
+
+def _new_ones(
+    box: Box,
+    settings: FloatArray,
+    numbers: Rows,
+    choice: Rows,
+    size: int,
+    seen: set[tuple[int, bytes]],
+    rng: np.random.Generator,
+) -> tuple[FloatArray, Rows]:
+    """Up to `size` settings of the box that no judge has met; random ones where there are too few."""
+    is_held = box.holds(settings)
+    random = box.draw(size, rng)
+    settings = np.concatenate([settings[is_held], random])
+    numbers = np.concatenate([numbers[is_held], choice[rng.integers(len(choice), size=len(random))]])
+    rows = list[int]()
+    for row, key in enumerate(zip(numbers.tolist(), map(np.ndarray.tobytes, settings), strict=True)):
+        if key not in seen and len(rows) < size:
+            seen.add(key)
+            rows.append(row)
+    return settings[rows], numbers[rows]
+
+
+def _worst(found: Attack, settings: FloatArray, numbers: Rows, left: FloatArray) -> Attack:
+    """The attack after a generation, with the worst settings that count, and all unsafe ones."""
+    is_counted = np.isfinite(left)
+    all_left = np.concatenate([found.left, left[is_counted]])
+    worst = np.argsort(all_left, kind="stable")[: max(PARENTS, np.count_nonzero(all_left < 0))]
+    return Attack(
+        np.concatenate([found.settings, settings[is_counted]])[worst],
+        np.concatenate([found.judges, numbers[is_counted]])[worst],
+        all_left[worst],
+        found.simulated + len(left),
+    )
+
+
+def _children(box: Box, found: Attack, rng: np.random.Generator) -> FloatArray:
+    """A generation of children; none before a setting counts."""
+    parents = found.settings[:PARENTS]
+    if not len(parents):
+        return parents
+    shape = (GENERATION, len(box.lower))
+    first, second, third, fourth = rng.integers(len(parents), size=(4, GENERATION))
+    mixed = np.where(rng.random(shape) < 0.5, parents[first], parents[second])
+    random = box.at(rng.random(shape))
+    ends = np.where(rng.random(shape) < 0.5, box.lower, box.upper)
+    draw = rng.random(shape) * max(int(np.count_nonzero(box.lower < box.upper)), 1)
+    mutated = np.select([draw < 0.4, draw < 0.8, draw < 1.2], [random, mixed + STEP * (random - mixed), ends], mixed)
+    worse = parents[np.minimum(first, second)]
+    moved = parents[first] + PULL * (worse - parents[first]) + DIFFERENCE * (parents[third] - parents[fourth])
+    is_moved = (np.arange(GENERATION) % 2 == 1)[:, np.newaxis]
+    return np.asarray(np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper))

@@ -1,0 +1,114 @@
+"""Boxes of settings: a promise, limits; settings in them, and the proof that hardly any of them is unsafe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.evaluator import CONFIDENCE, sobol_points
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.vehicles import FeasibleRegion
+
+MAX_CORNERS = 4096
+"""Largest number of corners of a box that are simulated."""
+MET_BY_CORNERS = 32_768
+"""Number of encounters that the corners meet together, in a study that searches its scenario."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """Settings from `lower` to `upper`, shape (n,), that satisfy the constraints; where both ends are equal, a
+    characteristic does not vary.
+    """
+
+    region: FeasibleRegion
+    lower: FloatArray
+    upper: FloatArray
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """The settings at points of the unit cube, shape (M, n)."""
+        return self.lower + points * (self.upper - self.lower)
+
+    def holds(self, settings: FloatArray) -> BoolArray:
+        """Which settings are in the box, shape (M,)."""
+        is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
+        return np.asarray(is_within & self.region.feasible(settings))
+
+    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+        """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""
+        return self.region.draw_feasible(lambda count: self.at(rng.random((count, len(self.lower)))), number)
+
+    def spread_and_corners(self, number: int, seed: int) -> FloatArray:
+        """Settings at Sobol points, and at as many corners, where all changes of the vehicle add up."""
+        points = sobol_points(number, len(self.lower), seed)
+        corners = np.where(self.region.characteristics.of_vehicle, np.round(points), points)
+        return self.at(np.concatenate([points, corners]))
+
+    def corners(self, seed: int, attempt: int) -> FloatArray:
+        """Settings at all corners; at `MAX_CORNERS` random ones if it has more.
+
+        In a study that searches its scenario, each corner of the vehicle's characteristics meets equally many
+        encounters, drawn anew in each attempt.
+        """
+        of_vehicle, is_open = self.region.characteristics.of_vehicle, self.lower < self.upper
+        worn = np.flatnonzero(of_vehicle & is_open)
+        rng, size = np.random.default_rng(seed), len(worn)
+        numbers = np.arange(2**size) if 2**size <= MAX_CORNERS else rng.integers(2**size, size=MAX_CORNERS)
+        points = np.zeros((len(numbers), len(self.lower)))
+        points[:, worn] = numbers[:, np.newaxis] >> np.arange(size) & 1
+        if not (~of_vehicle & is_open).any():
+            return self.at(points)
+        points = np.tile(points, (MET_BY_CORNERS // len(points), 1))
+        places = np.random.default_rng((seed, 3, attempt)).random(points.shape)
+        return self.at(np.where(of_vehicle, points, places))
+
+
+class Judgement(NamedTuple):
+    """Which of M settings are unsafe, which could not be simulated, and which count, shape (M,)."""
+
+    unsafe: BoolArray
+    failed: BoolArray
+    counted: BoolArray
+
+
+class Proof(NamedTuple):
+    """`failures` of `samples` settings drawn after the box was chosen, and those that could not be simulated; at most
+    the share `at_most` of all is unsafe or cannot be simulated, with `CONFIDENCE`.
+    """
+
+    samples: int
+    failures: int
+    at_most: float
+    not_simulated: int
+
+
+def prove(
+    draw: Callable[[int], FloatArray], judge: Callable[[FloatArray], Judgement], share: float, attempt: int
+) -> tuple[Proof, FloatArray]:
+    """Test with settings drawn anew that at most `share` of all are unsafe: the proof, and the unsafe settings.
+
+    Notes
+    -----
+    The settings are drawn independently and uniformly, by a random generator that no search uses. Test k, k = 1, 2,
+    ..., may be wrong with probability alpha_k = alpha / 2^k, alpha = 1 - `CONFIDENCE`: its bound is Clopper and
+    Pearson's at confidence 1 - alpha_k. Box k depends on earlier samples alone, so given box k the bound fails with
+    probability at most alpha_k. So the probability that any bound is wrong, and with it the bound of the box that
+    passes, is at most sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `share` if all of
+    them are safe.
+    """
+    import scipy  # takes longer to load than a simulation
+
+    error = (1 - CONFIDENCE) / 2**attempt
+    settings = draw(math.ceil(math.log(error) / math.log1p(-share)))
+    judgement = judge(settings)
+    is_unsafe = judgement.unsafe & judgement.counted
+    samples = int(np.count_nonzero(judgement.counted))
+    failures = int(np.count_nonzero(is_unsafe))
+    not_simulated = int(np.count_nonzero(judgement.failed & judgement.counted))
+    safe = samples - failures - not_simulated
+    at_most = float(scipy.special.betaincinv(samples - safe + 1, safe, 1 - error)) if safe else 1.0
+    return Proof(samples, failures, at_most, not_simulated), settings[is_unsafe]

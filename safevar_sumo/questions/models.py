@@ -1,0 +1,210 @@
+"""Models of the vehicle in which a claim is tested: the fits of its study, at the study's points and between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise, product
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.metrics import Unsafe, margin_of
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.scenarios import searchable_in
+from safevar_sumo.study import MatrixTest, Study
+from safevar_sumo.sumo.matrix import contact_degree, simulate_all_points
+from safevar_sumo.sumo.system import assemble
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
+
+SEARCHED_MARGIN = 0.1
+"""Distance to keep in a study that searches its scenario [m]: where the original keeps just its margin, wear may use up
+the rest, and contact is no limit to release.
+"""
+BETWEEN_DECIMALS = 2
+"""Decimals of a parameter between two values of a matrix."""
+LEAST = 1e-9
+"""The least by which an unsafe setting is beyond the limit [m]."""
+
+
+class Model(NamedTuple):
+    """A fit of the vehicle, and what is unsafe with it: what a claim about a study is tested in.
+
+    Attributes
+    ----------
+    fit
+        Its number among the sets of [spread]; the study's own is 0.
+    points
+        Numbers of the points of the study's matrix that count; all if empty.
+    """
+
+    fit: int
+    evaluator: Evaluator
+    unsafe: Unsafe
+    points: tuple[int, ...] = ()
+
+    def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
+        """The evaluations of M settings, shape (M, n), at the points that count."""
+        if not self.points:
+            return self.evaluator.evaluate(settings, stage)
+        return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)
+
+    def left(self, settings: FloatArray, stage: str) -> FloatArray:
+        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it does not
+        count.
+        """
+        return np.where(self.evaluator.region.feasible(settings), self.left_by(self.evaluate(settings, stage)), np.inf)
+
+    def left_by(self, evaluations: Evaluations) -> FloatArray:
+        """What evaluated settings leave; see `left`."""
+        unsafe = self.unsafe
+        limit = unsafe.contact + unsafe.keep if unsafe.below is None else unsafe.below
+        left = evaluations.f_safe - limit
+        left = np.where(unsafe.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
+        return np.where(evaluations.valid & np.isfinite(left), left, np.inf)
+
+    def degree(self, left: float) -> float:
+        """The distance that a safe setting keeps, between bumpers [m], or its safety degree where that is limited."""
+        return left + (self.unsafe.keep if self.unsafe.below is None else self.unsafe.below)
+
+    def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
+        """Which of M settings are unsafe, shape (M,)."""
+        return np.asarray(self.left(settings, stage) < 0)
+
+    def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
+        """The model at the points of the study's matrix at which settings are worst; without a matrix, and in a study
+        that searches its scenario, as it is.
+        """
+        if len(self.evaluator.characteristics.scenario):
+            return self
+        worst = self.evaluate(settings, stage).worst_points
+        if worst is None:
+            return self
+        numbers = np.unique(worst).tolist()
+        return self._replace(points=tuple(self.points[number] for number in numbers) if self.points else (*numbers,))
+
+
+class Models(NamedTuple):
+    """The fits in which a claim is tested, the study's own first, and the numbers of those left out: fits in which the
+    original itself is unsafe, or keeps less than the margin.
+    """
+
+    members: tuple[Model, ...]
+    left_out: tuple[int, ...]
+
+    @classmethod
+    def own_alone(cls, evaluator: Evaluator, unsafe: Unsafe) -> Self:
+        """The study's own fit."""
+        return cls((Model(0, evaluator, unsafe),), ())
+
+    @property
+    def own(self) -> Model:
+        return self.members[0]
+
+    @property
+    def fits(self) -> tuple[int, ...]:
+        return tuple(member.fit for member in self.members)
+
+
+def limit_criterion(
+    evaluator: Evaluator, subject: Study | Case, unsafe: Any, margin: float | None, original: Evaluations
+) -> Unsafe:
+    """What is unsafe for limits: the stated criterion as it is, else a collision or less than the margin [m], which
+    is by default that of the study; `SEARCHED_MARGIN` in one that searches its scenario, whose originals keep more.
+    """
+    study = evaluator.study
+    criterion = replace(evaluator.choose_criterion(unsafe, subject, original), contact=contact_degree(assemble(study)))
+    # A collision that is asked for stands alone.
+    if criterion.below is not None or criterion.points is not None or (margin is None and unsafe is not None):
+        return criterion
+    usual = SEARCHED_MARGIN if margin is None and study.scenario.search else margin_of(study, margin)
+    return replace(criterion, keep=usual)
+
+
+def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None) -> Models:
+    """The first `fits` fits of a study, by default all: what is unsafe holds in the study's own, and a distance to keep
+    there alone. No other fit may collide.
+    """
+    study = evaluator.study
+    studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
+    in_fits = replace(unsafe, keep=0.0)
+    members, left_out = [Model(0, evaluator, unsafe)], list[int]()
+    for number, fitted in enumerate(studies, 1):
+        model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
+        original = model.evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "original with each fit")
+        if unsafe.of(original)[0] or not original.valid[0]:
+            left_out.append(number)
+        else:
+            members.append(model)
+    return Models(tuple(members), tuple(left_out))
+
+
+def with_points_between(model: Model, unsafe: Unsafe, rng: np.random.Generator) -> tuple[Model, int]:
+    """A model whose study also has points between those of its matrix, drawn at random, and the number of those left
+    out: points at which the original itself is unsafe, by a criterion that may be stricter than the model's.
+    """
+    study = model.evaluator.study
+    tests = tests_between(study, rng)
+    if not tests:
+        return model, 0
+    original = model.evaluator.characteristics.original[np.newaxis]
+    results = simulate_all_points(assemble(_with_tests(study, tests)), original)
+    kept = [
+        test
+        for test, result in zip(tests, results, strict=True)
+        if result.evaluations.valid[0] and not unsafe.of(result.evaluations)[0]
+    ]
+    if not kept:
+        return model, len(tests)
+    assert study.matrix is not None
+    denser = _with_tests(study, [*study.matrix.tests, *kept])
+    return model._replace(evaluator=model.evaluator.for_study(denser, verified=0)), len(tests) - len(kept)
+
+
+def _with_tests(study: Study, tests: Sequence[MatrixTest]) -> Study:
+    assert study.matrix is not None
+    return replace_in(study, matrix=replace_in(study.matrix, tests=[*tests]))
+
+
+def tests_between(study: Study, rng: np.random.Generator) -> list[MatrixTest]:
+    """A test at one random point in each cell of each test's grid: between neighbouring values of every axis that a
+    study may search, at all values of other axes; none without such an axis.
+    """
+    if study.matrix is None or study.matrix.protocol or study.scenario.search:
+        return []
+    tests = list[MatrixTest]()
+    for test, points in points_of_tests(study, assemble(study).points):
+        searchable = searchable_in(type(points[0].scenario))
+        cells = {name: _cells(values) if name in searchable else [] for name, values in test.over.items()}
+        if not any(cells.values()):
+            continue
+        for cell in product(*(cells[name] or [(value,) for value in values] for name, values in test.over.items())):
+            drawn = [_draw(ends, rng) for ends in cell]
+            over = {name: [value] for name, value in zip(test.over, drawn, strict=True)}
+            tests.append(replace_in(test, over=over))
+    return tests
+
+
+def _cells(values: Sequence[Any]) -> list[tuple[float, ...]]:
+    """The pairs of neighbours among the numbers of an axis; none if they are not numbers."""
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return []
+    return list(pairwise(sorted(values)))
+
+
+def _draw(ends: tuple[Any, ...], rng: np.random.Generator) -> Any:
+    """A value between two ends, or the only one."""
+    return ends[0] if len(ends) == 1 else round(float(rng.uniform(*ends)), BETWEEN_DECIMALS)
+
+
+def fit_names(fits: Sequence[int]) -> str:
+    """Fits in words: `fits 2, 5 and 8`."""
+    return f"fit{'' if len(fits) == 1 else 's'} {join_phrases(map(str, fits))}"

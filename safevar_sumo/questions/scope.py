@@ -1,0 +1,93 @@
+"""The scope of a claim in words: the tests with their speeds and impact locations, the road, and the light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+from typing import Any
+
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import KMH_PER_MS
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
+from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
+from safevar_sumo.sumo.system import assemble
+
+
+def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixTest, list[Point]]]:
+    """The tests of a study's matrix, each with its points."""
+    assert study.matrix is not None
+    rest, tests = iter(points), []
+    for test in study.matrix.tests:
+        count = max(len(test.weathers), 1)
+        for values in test.over.values():
+            count *= len(values)
+        tests.append((test, [*islice(rest, count)]))
+    return tests
+
+
+def scope_of(study: Study, *, between: bool = True) -> str:
+    """What a claim about a study covers, as a phrase for a manual: `crossing (CPFA) at 10 to 40 km/h; road wet`.
+
+    Without `between`, nothing was simulated between the values of a matrix, which are then listed.
+    """
+    points = assemble(study).points
+    if study.matrix is None or study.matrix.protocol:
+        name = "" if study.matrix is None else str(study.matrix.protocol)
+        drives = [(_model_in_words(study.scenario.model), name, _parameters_in_words(study, None, points, between))]
+    else:
+        drives = [
+            (
+                _model_in_words(test.model or study.scenario.model),
+                test.name,
+                _parameters_in_words(study, test, own, between),
+            )
+            for test, own in points_of_tests(study, points)
+        ]
+    phrases = []
+    for model, parameters in dict.fromkeys((model, parameters) for model, _, parameters in drives):
+        names = [name for other, name, same in drives if (other, same) == (model, parameters) and name]
+        tests = f" ({join_phrases(names)})" if names else ""
+        phrases.append(f"{model}{tests}{f' {parameters}' if parameters else ''}")
+    weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
+    return f"{'; '.join(phrases)}; {' or '.join(weathers)}"
+
+
+def _model_in_words(model: str) -> str:
+    return model.rpartition(":")[2].replace("_", " ")
+
+
+def _parameters_in_words(study: Study, test: MatrixTest | None, points: Sequence[Point], between: bool) -> str:
+    """The speeds and other parameters of a test that vary: over its axes, and in a search over the scenario."""
+    over = {} if test is None else test.over
+    searchable = searchable_in(type(points[0].scenario))
+    phrases = {}
+    for name, values in over.items():
+        unit = unit_text(searchable[name].unit) if name in searchable else ""
+        phrases[name] = f"{_values_in_words(values, between and name in searchable)}{unit}"
+    for name, domain in study.scenario.search.items():
+        phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
+    speeds = sorted({point.scenario.test_speed for point in points if point.scenario.test_speed is not None})
+    if SPEED_DIMENSION not in phrases and speeds:
+        ends = dict.fromkeys(f"{KMH_PER_MS * speed:.4g}" for speed in (speeds[0], speeds[-1]))
+        phrases = {SPEED_DIMENSION: f"{' to '.join(ends)} km/h", **phrases}
+    return ", ".join(
+        f"at {text}" if name == SPEED_DIMENSION else f"{name.replace('_', ' ')} {text}"
+        for name, text in phrases.items()
+    )
+
+
+def _values_in_words(values: Sequence[Any], is_range: bool) -> str:
+    if is_range and len(values) > 1:
+        return f"{min(values):g} to {max(values):g}"
+    return join_phrases(f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+
+
+def _weather_in_words(weather: Weather) -> str:
+    """The road, the water on it, and the sight: `road wet (friction 0.71, water 1 mm), by day`."""
+    effects = [f"friction {weather.road_friction:g}"] if weather.road_friction != 1 else []
+    effects += [f"water {weather.water:g} mm"] if weather.water else []
+    effects += [f"visibility {weather.visibility:g}"] if weather.visibility != 1 else []
+    effects += [f"recognition {weather.recognition_delay:g} s later"] if weather.recognition_delay else []
+    name = weather.name.replace("_", " ")
+    details = f" ({', '.join(effects)})" if effects else ""
+    return f"road {name}{details}, by {weather.light}"

@@ -1,0 +1,352 @@
+"""The search for the largest box in which characteristics may vary together, with limits that the user specifies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+
+import numpy as np
+
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.models import Model
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Limit
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
+
+PARTS, ROUNDS = 8, 3
+"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS` parts."""
+WIDENING = 0.02
+"""Share of its domain by which a side of the box is widened in search of something unsafe."""
+SEARCH_POINTS = 256
+"""Number of Sobol points, and of corners, at which a box is searched for something unsafe."""
+SLAB_POINTS = 64
+"""Number of Sobol points, and of corners, at which the room beside a box is searched."""
+MAX_ATTEMPTS = 40
+"""Maximum number of boxes that are searched for something unsafe, and of tests."""
+DEVIATIONS = tuple(0.35 * 0.7**k for k in range(9))
+"""Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
+PROPOSALS = 4096
+"""Number of boxes that a round of the random search proposes."""
+BATCH, LEAST_BATCH = 512, 64
+"""Simulations, at all points of a study's matrix, that cost hardly more than one; fewest settings of a batch."""
+LEAST_GAIN = 0.01
+"""Least gain in the logarithm of the volume for which a proposed box is simulated."""
+UNDONE_AT_ONCE = 4
+"""Number of changes of a setting of which all combinations are undone in one batch, in search of its causes."""
+RETREAT = 0.05
+"""By this share of what is left, a box keeps off known failures more after each attack that teaches no new corner:
+where the response is not monotone, the next one would lie beside them.
+"""
+ROUNDING = 1e-9
+"""Rounding errors of a setting, as a share of the domain."""
+STAGE = "limits together"
+Step = Sequence[int]
+"""A side of a box, below or above, and the column of its characteristic."""
+
+
+class BoxGeometry:
+    """Boxes that are given by their sides: the extents below and above the original, shape (2, n), in the units of the
+    characteristics.
+
+    Attributes
+    ----------
+    width
+        Widths of the domains; 0 for a characteristic that does not vary.
+    domain
+        The extents of the domains.
+    limits
+        The values of the sides that are at limits, NaN for the free ones.
+    is_free
+        Which sides may move; the others are at their limits.
+    longest
+        The longest that each side may be: a free one to the end of its domain, a fixed one to its limit.
+    fixed
+        The box whose free sides are 0.
+    """
+
+    def __init__(self, region: FeasibleRegion, columns: Sequence[int], limits: Mapping[str, Limit]) -> None:
+        members = region.characteristics
+        self.region, self.columns = region, columns
+        self.original, is_varied = members.original, np.isin(range(len(members)), columns)
+        self.domain = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
+        self.width = self.domain.sum(axis=0)
+        self.limits = np.full_like(self.domain, np.nan)
+        for name, limit in limits.items():
+            self.limits[:, members.names.index(name)] = limit.at_least, limit.at_most  # None is NaN
+        self.is_free = (self.domain > 0) & np.isnan(self.limits)
+        self.longest = np.where(np.isnan(self.limits), self.domain, np.abs(self.limits - self.original))
+        self.fixed = np.where(self.is_free, 0.0, self.longest)
+
+    @property
+    def characteristics(self) -> CharacteristicSet:
+        return self.region.characteristics
+
+    def box(self, sides: FloatArray) -> Box:
+        return Box(self.region, self.original - sides[0], self.original + sides[1])
+
+    def sides_of(self, box: Box) -> FloatArray:
+        """The sides of a box."""
+        return np.stack([self.original - box.lower, box.upper - self.original])
+
+    def printed(self, sides: FloatArray) -> Box:
+        """A box as it is printed: limits and ends of domains exactly, all others rounded inwards."""
+        box, members = self.box(sides), self.characteristics
+        ends = np.array(
+            [
+                [item.rounded(end, upwards=upwards) for item, end in zip(members, ends, strict=True)]
+                for ends, upwards in ((box.lower, True), (box.upper, False))
+            ]
+        )
+        ends = np.where(sides >= self.domain, np.stack([members.lower, members.upper]), ends)
+        ends = np.where(self.domain > 0, ends, self.original)
+        lower, upper = np.where(np.isnan(self.limits), ends, self.limits)
+        return Box(self.region, lower, upper)
+
+    def extents(self, settings: FloatArray) -> FloatArray:
+        """The sides that a box needs to hold each of K settings, shape (K, 2, n); below 0 where it needs none."""
+        change = settings - self.original
+        return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
+
+    def wider(self, sides: FloatArray, steps: Sequence[Step], share: float) -> FloatArray:
+        """A box with some sides moved outwards by a share of the domain, at most to its end."""
+        wider = sides.copy()
+        for side, column in steps:
+            wider[side, column] = min(sides[side, column] + share * self.width[column], self.domain[side, column])
+        return wider
+
+    def log_volume(self, boxes: FloatArray) -> FloatArray:
+        """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
+        shares = np.divide(boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0)
+        return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))  # finite for a width of 0, too
+
+
+class BoxSearch(BoxGeometry):
+    """The search for a box that is safe in some models.
+
+    Attributes
+    ----------
+    models
+        Fits of the vehicle, at points of the study, in which a box has to be safe; more may `join`.
+    unsafe_settings
+        Settings that no box may hold.
+    corners
+        Corners that were unsafe in some box: for each characteristic -1, the lower end of the box, 0, the original, or
+        1, the upper end; for each parameter of the scenario its place between original and end.
+    gap
+        The share of the way to a known failure by which a box keeps off it.
+    batch
+        Number of settings that are simulated at once.
+    """
+
+    def __init__(
+        self, model: Model, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
+    ) -> None:
+        super().__init__(model.evaluator.region, columns, limits)
+        self.models, self.unsafe_settings = [model], unsafe_settings
+        self.corners = list[FloatArray]()
+        self.gap, self.search_count = 0.0, 0
+        self.seed = model.evaluator.study.search.seed
+        self.batch = max(BATCH // len(model.points or assemble(model.evaluator.study).points), LEAST_BATCH)
+
+    def join(self, model: Model) -> None:
+        """Take a model into the search, or more points of one that is in it."""
+        for number, member in enumerate(self.models):
+            if member.evaluator is model.evaluator:
+                points = (*member.points, *model.points) if member.points and model.points else ()
+                self.models[number] = member._replace(points=tuple(sorted({*points})))
+                return
+        self.models.append(model)
+
+    def needs(self, settings: FloatArray) -> FloatArray:
+        """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2, n)."""
+        extents = self.extents(settings)
+        return np.where(self.is_free & (extents > 0), (1 - self.gap) * extents, extents)
+
+    def unsafe_inside(self, sides: FloatArray, needs: FloatArray | None = None) -> FloatArray:
+        """The known unsafe settings that a box holds, or, by what they need of a box, that it must not."""
+        needs = self.extents(self.unsafe_settings) if needs is None else needs
+        return np.asarray(self.unsafe_settings[(needs <= sides).all(axis=(1, 2))])
+
+    def are_unsafe(self, settings: FloatArray) -> BoolArray:
+        """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one of them."""
+        rows = settings.reshape(-1, 1, len(self.original))
+        return self.have_unsafe(rows).reshape(settings.shape[:-1])
+
+    def have_unsafe(self, groups: FloatArray) -> BoolArray:
+        """Which of G groups of settings, shape (G, K, n), hold an unsafe one; unsafe ones are remembered.
+
+        A group is simulated in one model after another until one is unsafe; the model that last found some is the
+        first.
+        """
+        has_unsafe = np.zeros(len(groups), dtype=bool)
+        for model in [*self.models]:
+            waiting = np.flatnonzero(~has_unsafe)
+            rows = groups[waiting].reshape(-1, len(self.original))
+            if not len(rows):
+                break
+            is_unsafe = model.are_unsafe(rows, STAGE)
+            if is_unsafe.any():
+                self.models.remove(model)
+                self.models.insert(0, model)
+            self.unsafe_settings = np.concatenate([self.unsafe_settings, rows[is_unsafe]])
+            has_unsafe[waiting] = is_unsafe.reshape(len(waiting), -1).any(axis=1)
+        return has_unsafe
+
+    def corner_settings(self, boxes: FloatArray) -> FloatArray:
+        """Settings at the C known corners of B boxes, shape (B, C, n)."""
+        corners, below, above = np.array(self.corners), boxes[:, :1], boxes[:, 1:]
+        return self.original + corners * np.where(corners > 0, above, below)  # a corner of 0 is the original
+
+    def points(self, sides: FloatArray, number: int) -> FloatArray:
+        """New Sobol points and corners of a box."""
+        self.search_count += 1
+        return self.box(sides).spread_and_corners(number, self.seed + self.search_count)
+
+    def failures_in(self, sides: FloatArray) -> FloatArray:
+        """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
+        known = self.unsafe_inside(sides)
+        if len(known):
+            return known
+        points = self.points(sides, SEARCH_POINTS)
+        found = points[self.are_unsafe(points)]
+        return found
+
+    def learn(self, settings: FloatArray) -> bool:
+        """Add corners that are unsafe, from some of these unsafe settings; whether there is a new one.
+
+        One by one, as many changes of a setting as possible are undone while it stays unsafe; the directions of the
+        remaining changes are the corner. All combinations of the next few are simulated at once. Without a new corner,
+        boxes keep off all failures more.
+        """
+        number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
+        causes = self._causes(settings[:: len(settings) // number][:number])
+        changes, is_vehicle = causes - self.original, self.characteristics.of_vehicle
+        sides = np.where(changes > 0, self.domain[1], self.domain[0])
+        shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
+        corners = np.where(is_vehicle, np.sign(changes), shares)  # of the vehicle, in the encounter of the cause
+        known = {corner.tobytes(): corner for corner in [*self.corners, *corners]}
+        is_new = len(known) > len(self.corners)
+        self.corners = list(known.values())
+        if not is_new:
+            self.gap += RETREAT * (1 - self.gap)
+        # A box that holds a setting with more than a cause's changes holds the cause.
+        needs = np.maximum(self.extents(self.unsafe_settings), 0.0)
+        for cause in np.maximum(self.extents(causes), 0.0):
+            is_kept = ~(needs >= cause).all(axis=(1, 2))
+            needs = needs[is_kept]
+            self.unsafe_settings = self.unsafe_settings[is_kept]
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
+        return is_new
+
+    def _causes(self, settings: FloatArray) -> FloatArray:
+        """Unsafe settings with as few changes as possible, from K unsafe ones, shape (K, n)."""
+        causes, columns = settings.copy(), np.flatnonzero(self.is_free.any(axis=0))
+        for start in range(0, len(columns), UNDONE_AT_ONCE):
+            group = columns[start : start + UNDONE_AT_ONCE]
+            bits = 1 << np.arange(len(group))
+            is_undone = np.zeros((2 ** len(group), len(self.original)), dtype=bool)
+            is_undone[:, group] = np.arange(2 ** len(group))[:, np.newaxis] & bits
+            variants = np.where(is_undone, self.original, causes[:, np.newaxis])
+            for cause, of_cause, is_unsafe in zip(causes, variants, self.are_unsafe(variants), strict=True):
+                chosen = 0
+                for bit in bits:
+                    chosen += bit * is_unsafe[chosen + bit]
+                cause[:] = of_cause[chosen]
+        return causes
+
+    def are_safe(self, boxes: FloatArray) -> BoolArray:
+        """Which of B boxes, shape (B, 2, n), are safe at the known corners."""
+        return ~self.have_unsafe(self.corner_settings(boxes))
+
+    def shrunk(self, sides: FloatArray, start: FloatArray) -> FloatArray:
+        """A box whose free sides are the largest share of `sides` with which it is safe."""
+        low, high = 0.0, 1.0
+        for _ in range(ROUNDS):
+            shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
+            boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * sides, start)
+            needs = self.needs(self.unsafe_settings)
+            is_safe = self.are_safe(boxes) & [not (needs <= box).all(axis=(1, 2)).any() for box in boxes]
+            safe_count = int(np.argmin([*is_safe, False]))  # the smallest ones, before the first unsafe
+            low, high = shares[safe_count], shares[min(safe_count + 1, PARTS)]
+        return np.where(self.is_free, low * sides, start)
+
+    def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
+        """A box within `start` that is safe at the known corners, and keeps off known unsafe settings, as large as a
+        random search makes it.
+
+        `sides` first shrink as a whole until they are safe. Larger boxes nearby are then simulated at their corners.
+        """
+        rng = np.random.default_rng((self.seed, 2))
+        best = self.shrunk(sides, start)
+        for deviation in DEVIATIONS:
+            shape = (PROPOSALS, *start.shape)
+            is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
+            steps = rng.normal(0.0, deviation, shape) * is_moved
+            boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
+            boxes = boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN]
+            chosen = [*islice(self._without_known_failures(boxes), max(self.batch // len(self.corners), 1))]
+            if chosen:
+                boxes = np.array(chosen)
+                is_safe = self.are_safe(boxes)
+                best = max(boxes[is_safe], key=self.log_volume, default=best)
+        return best
+
+    def _without_known_failures(self, boxes: FloatArray) -> Iterator[FloatArray]:
+        """Those of B boxes, shape (B, 2, n), that no known failure forbids."""
+        needs = self.needs(self.unsafe_settings)
+        needs = needs[(needs <= boxes.max(axis=0, initial=0.0)).all(axis=(1, 2))]
+        columns = np.ascontiguousarray(
+            needs.reshape(-1, self.domain.size).T
+        )  # a side in a row: compared without copies
+        for box in boxes:
+            if not np.logical_and.reduce(columns <= box.reshape(-1, 1), axis=0).any():
+                yield box
+
+    def widened(self, sides: FloatArray) -> FloatArray:
+        """Move the free sides of a box outwards in steps, until something unsafe is in the next step of each or the
+        domain ends. Sides move together where their steps together are safe, too.
+        """
+        steps: list[Step] = [*np.argwhere(self.is_free & (sides < self.longest)).tolist()]
+        while steps := self.safe_steps(sides, [[step] for step in steps]):
+            sides = self.wider(sides, self.safe_steps(sides, [steps]) or steps[:1], WIDENING)
+            steps = [step for step in steps if sides[*step] < self.longest[*step]]
+        return sides
+
+    def safe_steps(self, sides: FloatArray, groups: Sequence[Sequence[Step]]) -> list[Step]:
+        """The steps outwards in which nothing unsafe is found; those of a group are made together."""
+
+        def is_open(box: FloatArray, step: Step) -> bool:
+            side, column = step
+            known = self.unsafe_inside(box, self.needs(self.unsafe_settings))
+            return not (self.needs(known)[:, side, column] > sides[side, column]).any()
+
+        boxes = [(self.wider(sides, group, WIDENING), group) for group in groups]
+        steps = [(box, step) for box, group in boxes for step in group if is_open(box, step)]
+        if steps:
+            self.have_unsafe(np.array([self.settings_at_end(box, step) for box, step in steps]))
+        return [step for box, step in steps if is_open(box, step)]
+
+    def settings_at_end(self, sides: FloatArray, step: Step) -> FloatArray:
+        """Settings at the end of one side of a box, all other values in the box."""
+        side, column = step
+        settings = np.concatenate([self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)])
+        box = self.box(sides)
+        settings[:, column] = (box.lower, box.upper)[side][column]
+        return settings
+
+    def best(self, start: FloatArray) -> FloatArray | None:
+        """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be; None if
+        every search finds something.
+        """
+        sides = start
+        for _ in range(MAX_ATTEMPTS):
+            sides = self.largest(sides, start)
+            found = self.failures_in(sides)
+            if not len(found):
+                sides = self.widened(sides)
+                found = self.failures_in(sides)
+            if not len(found):
+                return sides
+            self.learn(found)
+        return None

@@ -1,0 +1,410 @@
+"""Limits that may be used together: a box that holds in all fits, under attack, and of which no limit can move out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.attack import Attack, attack
+from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
+from safevar_sumo.questions.models import Model, Models, with_points_between
+from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
+from safevar_sumo.questions.tolerance.search import BoxSearch, Step
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Limit
+
+MAX_UNSAFE_SHARE = 0.003
+"""Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
+MAX_BOXES, MAX_GROWTHS = 40, 12
+"""Maximum number of boxes that are tested; and of tests of one whose limits have moved out."""
+SLAB_ATTACK = 512
+"""Number of simulations of an attack on the room beyond a limit."""
+LEAST_MOVE = 1 / 50
+"""A limit that cannot move out by this share of its range, or by one printed digit, is at its end."""
+STRIDES = (8, 4, 2, 1)
+"""Numbers of such moves that are tried at once, the largest first."""
+RETREAT = 0.8
+"""Share of such a move by which a limit keeps off a failure that an attack found between corners."""
+KNOWN = 32
+"""Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
+PROMISE_POINTS = 256
+"""Number of Sobol points, and of corners, at which specified limits are tested, all others as in the original."""
+STAGE, ATTACK_STAGE = "test of the limits together", "attack on the limits together"
+
+
+class LimitsTogether(NamedTuple):
+    """The largest box that was found, by relative volume, in which characteristics reach the limits specified for them.
+
+    Attributes
+    ----------
+    promise
+        The specified limits, all other characteristics as in the original.
+    box
+        The limits as printed; None if none were found.
+    broken
+        Numbers of the fits in which the promise itself is unsafe, and the worst setting of each.
+    members
+        The models in which the box holds.
+    proof, attack
+        Of the box; of the promise without one.
+    least
+        The least that the attack found [m]: over all fits, and with the study's own.
+    between, between_left_out
+        Numbers of points between those of the study's matrix that the attack met, and of those that do not count.
+    boxes
+        Number of boxes that were tried.
+    beyond
+        By side and column, an unsafe setting just beyond the box; all its other values are in the box.
+    corners
+        The least that the corners keep with each fit [m].
+    room
+        Which characteristics could have room, shape (n,): those that vary and have no limit on both sides.
+    searched
+        The models that the search of the box had to survive, then all others in which it was tested.
+    """
+
+    promise: Box
+    box: Box | None
+    broken: Mapping[int, FloatArray]
+    members: tuple[Model, ...]
+    proof: Proof | None
+    attack: Attack | None
+    least: tuple[float, float]
+    between: int
+    between_left_out: int
+    boxes: int
+    beyond: Mapping[tuple[int, int], FloatArray]
+    corners: Mapping[int, float]
+    room: BoolArray
+    searched: tuple[Model, ...] = ()
+
+
+class _Failures(NamedTuple):
+    """Unsafe settings, shape (K, n), and the model at the points where they are."""
+
+    model: Model
+    settings: FloatArray
+
+
+class _Test(NamedTuple):
+    """What the test of a box gave: failures, or the proof, the attack and its models."""
+
+    failures: list[_Failures]
+    corners: Mapping[int, float]
+    judges: Sequence[Model] = ()
+    attack: Attack | None = None
+    proof: Proof | None = None
+    left_out: int = 0
+
+
+class _BoxTest:
+    """The test of boxes: all corners with each fit, an attack over all fits, and settings drawn at random."""
+
+    def __init__(self, models: Sequence[Model], budget: int) -> None:
+        self.models, self.budget = models, budget
+        self.seed = models[0].evaluator.study.search.seed
+        self.tests = 0
+
+    def of(self, box: Box, attempt: int) -> _Test:
+        """Test a box; the first stage that finds failures ends it."""
+        corners = box.corners(self.seed, attempt)
+        lefts = [model.left(corners[:MAX_CORNERS], STAGE) for model in self.models]
+        least = {
+            model.fit: model.degree(float(left.min(initial=np.inf)))
+            for model, left in zip(self.models, lefts, strict=True)
+        }
+        found = [_failures(model, corners[:MAX_CORNERS], left) for model, left in zip(self.models, lefts, strict=True)]
+        if any(found):
+            return _Test([each for each in found if each], least)
+        worst = [
+            corners[np.argsort(left, kind="stable")[: KNOWN if number == 0 else KNOWN // 8]]
+            for number, left in enumerate(lefts)
+        ]
+        test = self._attack(box, worst, attempt)._replace(corners=least)
+        own = self.models[0]
+        if not test.failures and len(corners) > MAX_CORNERS:  # corners of a study that searches its scenario
+            others = corners[MAX_CORNERS:]
+            failures = _failures(own, others, own.left(others, STAGE))
+            test = test._replace(failures=[failures] if failures else [])
+        return test if test.failures else self._prove(box, test, attempt)
+
+    def _attack(self, box: Box, worst: Sequence[FloatArray], attempt: int) -> _Test:
+        own, judges, left_out = self.models[0], list[Model](), list[int]()
+        if not self.budget:
+            return _Test([], {}, self.models)
+        for model in self.models:
+            denser, number = with_points_between(model, own.unsafe, np.random.default_rng((self.seed, 5, attempt)))
+            judges.append(denser)
+            left_out.append(number)
+        rng = np.random.default_rng((self.seed, 4, attempt))
+        lefts: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=ATTACK_STAGE) for model in judges]
+        found = attack(box, lefts, worst, self.budget, rng)
+        failures = [
+            _failures(model, found.settings[found.judges == number], found.left[found.judges == number])
+            for number, model in enumerate(judges)
+        ]
+        return _Test([each for each in failures if each], {}, judges, found, left_out=left_out[0])
+
+    def _prove(self, box: Box, test: _Test, attempt: int) -> _Test:
+        self.tests += 1
+        own = self.models[0]
+        model = test.judges[0] if test.judges else own
+
+        def judge(settings: FloatArray) -> Judgement:
+            evaluations = model.evaluate(settings, STAGE)
+            failed = ~evaluations.valid & ~evaluations.infeasible
+            return Judgement(model.left_by(evaluations) < 0, failed, ~evaluations.infeasible)
+
+        rng = np.random.default_rng((self.seed, 1, attempt))
+        proof, unsafe = prove(lambda number: box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self.tests)
+        failures = _failures(model, unsafe, np.full(len(unsafe), -1.0))
+        return test._replace(proof=proof, failures=[failures] if failures else [])
+
+
+def _failures(model: Model, settings: FloatArray, left: FloatArray) -> _Failures | None:
+    """The settings that leave less than nothing, and the model at the points where they do; None if none does."""
+    unsafe = settings[left < 0]
+    return _Failures(model.at_worst_points(unsafe, STAGE), unsafe) if len(unsafe) else None
+
+
+class _Settlement:
+    """Moves limits as far as they can go, one at a time."""
+
+    def __init__(self, search: BoxSearch) -> None:
+        self.search = search
+
+    def of(self, box: Box) -> Box:
+        """A box of which no limit can move out alone without meeting something unsafe."""
+        steps: list[Step] = [*np.argwhere(self.search.is_free).tolist()]
+        while steps:
+            moved = list[Step]()
+            for step in steps:
+                wider = self._moved(box, step)
+                if wider is not None:
+                    box = wider
+                    moved.append(step)
+            steps = moved
+        return box
+
+    def _moved(self, box: Box, step: Step) -> Box | None:
+        """The box with one limit moved out as far as nothing unsafe is met; None if it cannot move."""
+        for stride in STRIDES:
+            wider = self.trial(box, step, stride)
+            if wider is None:
+                return None
+            if not self._is_blocked(box, wider, step):
+                return wider
+        return None
+
+    def trial(self, box: Box, step: Step, stride: int = 1) -> Box | None:
+        """The box with one limit moved out by some moves, rounded; None at the end of the domain."""
+        side, column = step
+        item = self.search.characteristics.members[column]
+        end = (box.lower, box.upper)[side][column]
+        last = (item.lower, item.upper)[side]
+        if end == last:
+            return None
+        move = max(LEAST_MOVE * (item.upper - item.lower), 10.0**-item.digits)
+        place = item.rounded(end + (-1, 1)[side] * stride * move, upwards=side == 0)
+        place = max(place, last) if side == 0 else min(place, last)
+        ends = [box.lower.copy(), box.upper.copy()]
+        ends[side][column] = place
+        return Box(box.region, *ends)
+
+    def _is_blocked(self, box: Box, wider: Box, step: Step) -> bool:
+        search, (side, column) = self.search, step
+        sides = search.sides_of(wider)
+        if len(search.unsafe_inside(sides)):
+            return True
+        end = (wider.lower, wider.upper)[side][column]
+        ends = [wider.lower.copy(), wider.upper.copy()]
+        for values in ends:
+            values[column] = end
+        slab = Box(wider.region, *ends).corners(search.seed, 1)[:MAX_CORNERS]
+        settings = np.concatenate([slab, search.settings_at_end(sides, step)])
+        if search.have_unsafe(settings[np.newaxis])[0]:
+            return True
+        beyond = [wider.lower.copy(), wider.upper.copy()]
+        beyond[1 - side][column] = (box.lower, box.upper)[side][column]
+        judges = [partial(model.left, stage=STAGE) for model in search.models]
+        rng = np.random.default_rng((search.seed, 10, side, column))
+        found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN]], SLAB_ATTACK, rng)
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
+        return bool((found.left < 0).any())
+
+    def cut(self, box: Box) -> Box:
+        """A box without its known failures: for each, that limit moves in which loses the least volume, by somewhat
+        more than it needs to.
+        """
+        search = self.search
+        while len(inside := search.unsafe_inside(search.sides_of(box))):
+            sides = search.sides_of(box)
+            extents, choices = search.extents(inside[:1])[0], list[FloatArray]()
+            for side, column in np.argwhere(search.is_free & (extents > 0)).tolist():
+                shorter = sides.copy()
+                shorter[side, column] = max(extents[side, column] - RETREAT * LEAST_MOVE * search.width[column], 0.0)
+                choices.append(shorter)
+            if not choices:
+                return search.printed(search.fixed)
+            box = search.printed(max(choices, key=search.log_volume))
+        return box
+
+    def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:
+        """For each limit that could move out further, a known failure that it then meets."""
+        beyond = dict[tuple[int, int], FloatArray]()
+        for side, column in np.argwhere(self.search.domain > 0).tolist():
+            wider = self.trial(box, (side, column))
+            if wider is not None:
+                for setting in self.search.unsafe_inside(self.search.sides_of(wider))[:1]:
+                    beyond[side, column] = setting
+        return beyond
+
+
+def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
+    """The worst setting of a promise in each fit in which it is unsafe."""
+    seed = models[0].evaluator.study.search.seed
+    settings = np.concatenate(
+        [promise.corners(seed, 0)[:MAX_CORNERS], promise.spread_and_corners(PROMISE_POINTS, seed)]
+    )
+    settings = np.unique(settings, axis=0)
+    broken = dict[int, FloatArray]()
+    for model in models:
+        left = model.left(settings, "specified limits with each fit")
+        if left.min() < 0:
+            broken[model.fit] = settings[np.argmin(left)]
+    return broken
+
+
+def find_limits_together(
+    models: Models,
+    columns: Sequence[int],
+    limits: Mapping[str, Limit],
+    scans: Sequence[OneAtATimeScan],
+    unsafe_settings: FloatArray,
+    budget: int,
+) -> LimitsTogether:
+    """The largest box by relative volume in which `columns` vary, in which those of `limits` reach their limits, and
+    that holds none of `unsafe_settings`, shape (K, n).
+
+    Notes
+    -----
+    A random search seeks the largest box that is safe at known corners, within what is safe alone. Causes of what is
+    unsafe, as few changes as possible, are further corners, and the box is sought anew until no search finds anything.
+    Then all corners with each fit, an attack with `budget` simulations over all fits, and settings drawn at random test
+    it. What they find becomes part of what later boxes must survive, in that fit. At last each limit, as it is printed,
+    moves out as far as it can go, and the box is tested again; a failure then moves one limit in.
+    """
+    own = models.own._replace(evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0))
+    # Points at which nothing fails cost as much as the others; the test of a box adds those at which it fails.
+    first = own.at_worst_points(unsafe_settings, "worst points") if len(unsafe_settings) else own
+    search = BoxSearch(first, columns, limits, unsafe_settings)
+    promise = search.printed(search.fixed)
+    broken = broken_promises(promise, models.members)
+    members = tuple(model for model in (own, *models.members[1:]) if model.fit not in broken)
+    nothing = LimitsTogether(
+        promise,
+        None,
+        broken,
+        members,
+        None,
+        None,
+        (np.nan, np.nan),
+        0,
+        0,
+        0,
+        {},
+        {},
+        np.asarray(search.is_free.any(axis=0)),
+    )
+    if own.fit in broken:
+        return nothing
+    start = _start(search, columns, scans)
+    test = _BoxTest(members, budget)
+    for number in range(1, MAX_BOXES + 1):
+        sides = search.best(start)
+        if sides is None:
+            return nothing._replace(boxes=number)
+        box = search.printed(sides)
+        found = test.of(box, number)
+        if not found.failures:
+            return _grown(nothing, search, test, box, found, number)
+        _learn(search, found)
+    return nothing._replace(boxes=MAX_BOXES)
+
+
+def _learn(search: BoxSearch, test: _Test) -> None:
+    """Take failures, and the models in which they are, into a search."""
+    for failures in test.failures:
+        search.join(failures.model)
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+        search.learn(failures.settings)
+
+
+def _grown(
+    nothing: LimitsTogether, search: BoxSearch, test: _BoxTest, box: Box, found: _Test, number: int
+) -> LimitsTogether:
+    """The limits together from a box that passed its test, whose limits have moved out as far as they can; where what
+    grew fails its tests, the box itself.
+    """
+    settlement = _Settlement(search)
+    wider = settlement.of(box)
+    for growth in range(1, MAX_GROWTHS + 1):
+        volumes = [search.log_volume(search.sides_of(each)) for each in (box, wider)]
+        if volumes[1] <= volumes[0]:
+            break
+        found_wider = test.of(wider, number + growth)
+        if found_wider.failures:
+            _learn(search, found_wider)
+            wider = settlement.cut(wider)
+        else:
+            box, found = wider, found_wider
+            wider = settlement.of(box)
+    return _result(nothing, search, settlement, box, found, number)
+
+
+def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]) -> FloatArray:
+    """The box of what is safe alone; its corner where every characteristic has gone towards its smaller margin becomes
+    the first that the search knows.
+    """
+    start, corner = search.longest.copy(), np.zeros(len(search.original))
+    for column, scan in zip(columns, scans, strict=False):  # parameters of the scenario, which come last, have no scan
+        original = search.original[column]
+        low, high = scan.safe or (original, original)
+        safe_alone = np.minimum(start[:, column], (original - low, high - original))
+        start[:, column] = np.where(search.is_free[:, column], safe_alone, start[:, column])
+        low_degree, high_degree = np.nan_to_num([scan.degree(end) for end in (low, high)], nan=np.inf)
+        corner[column] = -1.0 if low_degree < high_degree else 1.0
+    search.corners.append(corner)
+    return start
+
+
+def _result(
+    nothing: LimitsTogether, search: BoxSearch, settlement: _Settlement, box: Box, test: _Test, number: int
+) -> LimitsTogether:
+    """The limits together from a box that passed its test; a box that leaves no characteristic any room is none."""
+    of_vehicle = search.characteristics.of_vehicle
+    is_open = search.is_free & of_vehicle
+    has_room = not is_open.any() or bool((search.sides_of(box)[is_open] > 0).any())
+    least = [np.nan, np.nan]
+    if test.attack is not None:
+        judges = [test.judges[judge] for judge in test.attack.judges]
+        degrees = [model.degree(left) for model, left in zip(judges, test.attack.left.tolist(), strict=True)]
+        of_own = [degree for degree, model in zip(degrees, judges, strict=True) if model.fit == 0]
+        least = [min(degrees, default=np.nan), min(of_own, default=np.nan)]
+    points = [len(model.evaluator.study.matrix.tests) for model in test.judges[:1] if model.evaluator.study.matrix]
+    own_tests = nothing.members[0].evaluator.study.matrix
+    return nothing._replace(
+        box=box if has_room else None,
+        proof=test.proof,
+        attack=test.attack,
+        least=(least[0], least[1]),
+        between=sum(points) - (len(own_tests.tests) if own_tests else 0),
+        between_left_out=test.left_out,
+        boxes=number,
+        beyond=settlement.beyond(box),
+        corners=test.corners,
+        searched=(*nothing.members, *search.models, *test.judges),
+    )

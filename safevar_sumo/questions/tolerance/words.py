@@ -1,0 +1,130 @@
+"""The verdict on limits in words: the decision, how sure it is, in how many fits, and in which scope."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from safevar_sumo.questions.box import MET_BY_CORNERS
+from safevar_sumo.questions.evaluator import CONFIDENCE
+from safevar_sumo.questions.models import Models, fit_names
+from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.tolerance.alone import AloneLimit
+from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.study import Limit, unit_text
+
+
+def verdict_sentences(
+    models: Models,
+    alone: Sequence[AloneLimit],
+    together: LimitsTogether | None,
+    limits: Mapping[str, Limit],
+    broken: Sequence[str],
+    budget: int,
+    nearest: Sequence[tuple[Any, ...]],
+    wider: Sequence[tuple[Any, ...]],
+) -> Iterator[str]:
+    """The sentences of the verdict, the decision first."""
+    unsafe, study = models.own.unsafe, models.own.evaluator.study
+    if any(each.safe is None for each in alone):
+        yield f"The original vehicle itself is unsafe ({unsafe.description})."
+        return
+    if broken:
+        yield f"Do not release: {'; '.join(broken)}."
+    if together is not None:
+        yield from _fits_in_words(models, together, bool(limits))
+        yield from _nearest_in_words(nearest)
+        yield from _box_in_words(models, together, bool(limits), budget)
+    yield f"Scope: {scope_of(study, between=budget > 0)}."
+    for name, scope, _, verdict in wider:
+        yield f"In the wider scope of {name} ({scope}) {verdict}"
+    if names := [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]:
+        yield f"Unsafe alone, all others as in the original: {join_phrases(names)}."
+    else:
+        yield "No single characteristic makes it unsafe."
+
+
+def _fits_in_words(models: Models, together: LimitsTogether, has_limits: bool) -> Iterator[str]:
+    """In which fits the specified limits do not hold, and which fits do not count."""
+    if together.broken and len(models.members) > 1:
+        kept = f"{len(together.members)} of {len(models.members)}"
+        fits = fit_names(sorted(together.broken))
+        yield f"The specified limits hold in {kept} fits of the vehicle, not in {fits}."
+    if models.left_out:
+        yield f"Left out: {fit_names(models.left_out)}, in which the original itself is unsafe or keeps too little."
+
+
+def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
+    """What would do in place of the specified limits."""
+    would_do = [(name, unit, value) for name, unit, _, value in nearest if value is not None]
+    if would_do:
+        values = " or ".join(f"{name} {value:.10g}{unit_text(unit)}" for name, unit, value in would_do)
+        others = ", the other specified limits as they are" if len(nearest) > 1 else ""
+        yield f"What would do: {values}{others}."
+    elif nearest:
+        yield "No value of any one of the specified limits would do."
+
+
+def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, budget: int) -> Iterator[str]:
+    """The limits together, and what they were tested with."""
+    unsafe, count = models.own.unsafe, len(together.members)
+    where = "in one model" if len(models.members) == 1 else f"in {count} of {len(models.members)} fits"
+    if together.box is None:
+        if together.boxes:
+            kept = "The specified limits are kept with all others as in the original. " if has_limits else ""
+            boxes = "1 box was" if together.boxes == 1 else f"{together.boxes} boxes were"
+            yield (
+                f"{kept}No limits together were found ({unsafe.description}): {boxes} "
+                "tried, and each held an unsafe vehicle. That is no proof that there are none."
+            )
+        return
+    decision = "All may go to their limits together"
+    if has_limits:
+        decision = "The limits together below hold" if together.broken else "Keeps all limits"
+    between = " between bumpers" if unsafe.contact else ""
+    distance = f"keeps less than {unsafe.keep:.3g} m{between}" if unsafe.keep else f"is unsafe ({unsafe.description})"
+    others = f" with the study's own fit, and none collides with {count - 1} others" if count > 1 else ""
+    yield f"{decision} {where}: within them no vehicle that was tried {distance}{others}."
+    searched = len(models.own.evaluator.characteristics.scenario) > 0
+    met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
+    yield f"Tried: all corners{met}; {_attack_in_words(together, budget)}; {_proof_in_words(together)}."
+    if names := _without_room(models, together):
+        yield f"No room was found for {join_phrases(names)}: they stay as in the original."
+
+
+def _attack_in_words(together: LimitsTogether, budget: int) -> str:
+    """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67 m)`."""
+    if together.attack is None or not budget:
+        return "not attacked"
+    least, own = together.least
+    if not least < float("inf"):
+        return f"{together.attack.simulated:,} aimed at them meet nobody"
+    of_own = f" (with the study's own fit {own:.2f} m)" if own == own and round(own, 2) != round(least, 2) else ""
+    between = ""
+    if together.between:
+        between = f", at {number_of(together.between, 'point')} between those of the study, too"
+        if together.between_left_out:
+            between += f" ({together.between_left_out} left out, where the new car keeps too little)"
+    return f"the worst of {together.attack.simulated:,} aimed at them keeps {least:.2f} m{of_own}{between}"
+
+
+def _proof_in_words(together: LimitsTogether) -> str:
+    proof = together.proof
+    assert proof is not None
+    failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
+    bound = f"at most {100 * proof.at_most:.2f} % of evenly drawn cars are, with {100 * CONFIDENCE:.0f} % confidence"
+    return f"{proof.failures} of {proof.samples:,} drawn at random are unsafe{failed}: {bound}"
+
+
+def _without_room(models: Models, together: LimitsTogether) -> list[str]:
+    """The characteristics that stay as in the original, beside limits that leave others room."""
+    box = together.box
+    assert box is not None
+    return [
+        item.name
+        for item, low, high, last in zip(
+            models.own.evaluator.characteristics, box.lower, box.upper, together.room, strict=True
+        )
+        if low == high and last and not item.is_scenario
+    ]
