@@ -227,7 +227,9 @@ def behind_a_braking_leader(driver: Any, speed: float, headway: float, leader_br
 
 
 @pytest.mark.parametrize("headway", [1.0, 1.4, 2.0])
-@pytest.mark.parametrize("speed", [30.0, 50.0, 80.0, 100.0, 130.0])
+@pytest.mark.parametrize(
+    "speed", [50.0, *(pytest.param(v, marks=pytest.mark.slow) for v in (30.0, 80.0, 100.0, 130.0))]
+)
 def test_the_competent_driver_behind_a_braking_leader_does_what_the_rule_says(speed: float, headway: float) -> None:
     """He holds the speed and the gap with which he began until he perceives the braking; half a step is 0.35 m/s."""
     for leader_braking in (5.2, 5.5, 6.0, 7.0, 8.0, 9.0):

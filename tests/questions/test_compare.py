@@ -118,6 +118,7 @@ def test_none_of_three_worse_versions_is_called_better(
     assert answer.numbers["worse_in"] > 0
 
 
+@pytest.mark.slow
 def test_a_slower_sensor_meets_the_same_changes() -> None:
     wear = load_study("wear", **ONE_TEST)
     slower = load_study("wear", **ONE_TEST, vehicle={"characteristics": {"sensorLatency": {"original": 0.15}}})

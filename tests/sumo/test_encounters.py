@@ -202,6 +202,7 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
     np.testing.assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
 
 
+@pytest.mark.slow
 def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Path) -> None:
     """In half of the encounters here the original collides; all algorithms simulate them and report none."""
     search = {"speed": domain(50, 90, "km/h"), "road_friction": domain(0.5, 1, "-", 1)}
