@@ -129,7 +129,7 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     shown = [output.get("data", {}) for output in outputs]
     assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (5, 3)
     printed = "".join(_texts(notebook))
-    for result in ("limits together with at least", "The probability of an unsafe vehicle is", "of them have "):
+    for result in ("All may go to their limits together", "The probability of an unsafe vehicle is", "of them have "):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]
 

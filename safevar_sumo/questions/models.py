@@ -129,9 +129,9 @@ def limit_criterion(
     return replace(criterion, keep=usual)
 
 
-def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None) -> Models:
+def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_unsafe_originals: bool = False) -> Models:
     """The first `fits` fits of a study, by default all: what is unsafe holds in the study's own, and a distance to keep
-    there alone. No other fit may collide.
+    there alone. No other fit may collide. Those with an unsafe original are left out unless they are wanted.
     """
     study = evaluator.study
     studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
@@ -140,7 +140,7 @@ def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None) -> Models:
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         original = model.evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "original with each fit")
-        if unsafe.of(original)[0] or not original.valid[0]:
+        if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
             left_out.append(number)
         else:
             members.append(model)

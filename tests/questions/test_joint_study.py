@@ -142,7 +142,7 @@ def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody
     counts = system.measuring.scoring.violation(evaluations) == 0
     assert counts.sum() > 4000
     assert (evaluations.collided & counts).sum() <= 1
-    assert "no corner in 32,768 encounters" in answer["verdict"]
+    assert "all corners in 32,768 encounters" in answer["verdict"]
 
 
 @pytest.mark.slow

@@ -180,8 +180,10 @@ def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.M
     of_each = np.array([low_end(with_values(study, {gap: value})) for value in gaps])
     assert len({*of_each}) > 1, "the fits differ"
     asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
-    (row,) = tolerance(study, **asked).tables["fits"].to_dict("records")
-    assert (row["characteristic"], row["end"], row["alone"]) == ("tireFric", "low", of_each[0])
-    assert (row["alone_low"], row["alone_high"]) == (np.nanmin(of_each), np.nanmax(of_each))
-    assert row["fits"] == np.isfinite(of_each).sum()
+    answer = tolerance(study, **asked, attack=200)
+    (row,) = answer.to_dict()["tables"]["limits"]["rows"]
+    assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, "the strictest fit decides, rounded to the safe side"
+    states = answer.tables["fits"].set_index("fit")["specified"]
+    assert {*states[np.isfinite(of_each)]} == {"kept"}
+    assert answer.numbers["fits"] == np.isfinite(of_each).sum()
     assert "fits" not in tolerance(study, fits=0, **asked).tables

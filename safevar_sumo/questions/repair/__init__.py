@@ -111,7 +111,7 @@ def repair(
         _check_file(Path(out), study)
     unsafe_today = Unsafe(keep=margin_of(study, margin), contact=contact_degree(assemble(study)))
     promised, parameters = Promise.of(study, evaluator.region, promise), parameters_of(study, change)
-    models = models_of(evaluator, unsafe_today, fits)
+    models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
             evaluator=model.evaluator, promise=promised, parameters=parameters, unsafe=model.unsafe, fit=model.fit

@@ -122,7 +122,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """
     tests = rq2_runs(case, choices)
     texts = [
-        f"{effect:.2f}{'*' * significant} {MARKS[magnitude]}".strip() if magnitude else "-"
+        f"{effect:.2f}{'*' * significant} {MARKS[magnitude]}".strip() if magnitude in MARKS else "-"
         for effect, significant, magnitude in zip(
             tests["effect_size"], tests["significant"], tests["magnitude"], strict=True
         )
