@@ -244,7 +244,7 @@ def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
 
 @pytest.mark.slow
 def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: Path) -> None:
-    planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 26.0, always"))
+    planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 30.0, always"))
     out = tmp_path / "kept.toml"
     done = run("repair", str(planted), "--promise", "grip>=7.9", "--change", "gap", "--out", str(out), "--json")
     answer = json.loads(done.stdout)
