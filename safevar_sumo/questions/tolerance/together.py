@@ -12,7 +12,8 @@ from safevar_sumo.questions.attack import Attack, attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
 from safevar_sumo.questions.models import Model, Models, with_points_between
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
-from safevar_sumo.questions.tolerance.search import BoxSearch, Step
+from safevar_sumo.questions.tolerance.search import BoxSearch
+from safevar_sumo.questions.tolerance.settlement import Settlement
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 
@@ -20,14 +21,6 @@ MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 MAX_BOXES, MAX_GROWTHS = 40, 12
 """Maximum number of boxes that are tested; and of tests of one whose limits have moved out."""
-SLAB_ATTACK = 512
-"""Number of simulations of an attack on the room beyond a limit."""
-LEAST_MOVE = 1 / 50
-"""A limit that cannot move out by this share of its range, or by one printed digit, is at its end."""
-STRIDES = (8, 4, 2, 1)
-"""Numbers of such moves that are tried at once, the largest first."""
-RETREAT = 0.8
-"""Share of such a move by which a limit keeps off a failure that an attack found between corners."""
 KNOWN = 32
 """Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
 PROMISE_POINTS = 256
@@ -170,99 +163,6 @@ def _failures(model: Model, settings: FloatArray, left: FloatArray) -> _Failures
     return _Failures(model.at_worst_points(unsafe, STAGE), unsafe) if len(unsafe) else None
 
 
-class _Settlement:
-    """Moves limits as far as they can go, one at a time."""
-
-    def __init__(self, search: BoxSearch) -> None:
-        self.search = search
-
-    def of(self, box: Box) -> Box:
-        """A box of which no limit can move out alone without meeting something unsafe."""
-        steps: list[Step] = [*np.argwhere(self.search.is_free).tolist()]
-        while steps:
-            moved = list[Step]()
-            for step in steps:
-                wider = self._moved(box, step)
-                if wider is not None:
-                    box = wider
-                    moved.append(step)
-            steps = moved
-        return box
-
-    def _moved(self, box: Box, step: Step) -> Box | None:
-        """The box with one limit moved out as far as nothing unsafe is met; None if it cannot move."""
-        for stride in STRIDES:
-            wider = self.trial(box, step, stride)
-            if wider is None:
-                return None
-            if not self._is_blocked(box, wider, step):
-                return wider
-        return None
-
-    def trial(self, box: Box, step: Step, stride: int = 1) -> Box | None:
-        """The box with one limit moved out by some moves, rounded; None at the end of the domain."""
-        side, column = step
-        item = self.search.characteristics.members[column]
-        end = (box.lower, box.upper)[side][column]
-        last = (item.lower, item.upper)[side]
-        if end == last:
-            return None
-        move = max(LEAST_MOVE * (item.upper - item.lower), 10.0**-item.digits)
-        place = item.rounded(end + (-1, 1)[side] * stride * move, upwards=side == 0)
-        place = max(place, last) if side == 0 else min(place, last)
-        ends = [box.lower.copy(), box.upper.copy()]
-        ends[side][column] = place
-        return Box(box.region, *ends)
-
-    def _is_blocked(self, box: Box, wider: Box, step: Step) -> bool:
-        search, (side, column) = self.search, step
-        sides = search.sides_of(wider)
-        if len(search.unsafe_inside(sides)):
-            return True
-        end = (wider.lower, wider.upper)[side][column]
-        ends = [wider.lower.copy(), wider.upper.copy()]
-        for values in ends:
-            values[column] = end
-        slab = Box(wider.region, *ends).corners(search.seed, 1)[:MAX_CORNERS]
-        settings = np.concatenate([slab, search.settings_at_end(sides, step)])
-        if search.have_unsafe(settings[np.newaxis])[0]:
-            return True
-        beyond = [wider.lower.copy(), wider.upper.copy()]
-        beyond[1 - side][column] = (box.lower, box.upper)[side][column]
-        judges = [partial(model.left, stage=STAGE) for model in search.models]
-        rng = np.random.default_rng((search.seed, 10, side, column))
-        found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN]], SLAB_ATTACK, rng)
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
-        return bool((found.left < 0).any())
-
-    def cut(self, box: Box) -> Box:
-        """A box without its known failures: for each, that limit moves in which loses the least volume, by somewhat
-        more than it needs to.
-        """
-        search = self.search
-        while len(inside := search.unsafe_inside(search.sides_of(box))):
-            sides = search.sides_of(box)
-            extents, choices = search.extents(inside[:1])[0], list[FloatArray]()
-            for side, column in np.argwhere(search.is_free & (extents > 0)).tolist():
-                shorter = sides.copy()
-                shorter[side, column] = max(extents[side, column] - RETREAT * LEAST_MOVE * search.width[column], 0.0)
-                choices.append(shorter)
-            if not choices:
-                return search.printed(search.fixed)
-            box = search.printed(max(choices, key=search.log_volume))
-        return box
-
-    def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:
-        """For each limit that could move out further, a known failure that it then meets."""
-        beyond = dict[tuple[int, int], FloatArray]()
-        for side, column in np.argwhere(self.search.domain > 0).tolist():
-            wider = self.trial(box, (side, column))
-            if wider is not None:
-                for setting in self.search.unsafe_inside(self.search.sides_of(wider))[:1]:
-                    beyond[side, column] = setting
-        return beyond
-
-
 def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
     """The worst setting of a promise in each fit in which it is unsafe."""
     seed = models[0].evaluator.study.search.seed
@@ -349,7 +249,7 @@ def _grown(
     """The limits together from a box that passed its test, whose limits have moved out as far as they can; where what
     grew fails its tests, the box itself.
     """
-    settlement = _Settlement(search)
+    settlement = Settlement(search)
     wider = settlement.of(box)
     for growth in range(1, MAX_GROWTHS + 1):
         volumes = [search.log_volume(search.sides_of(each)) for each in (box, wider)]
@@ -382,7 +282,7 @@ def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATime
 
 
 def _result(
-    nothing: LimitsTogether, search: BoxSearch, settlement: _Settlement, box: Box, test: _Test, number: int
+    nothing: LimitsTogether, search: BoxSearch, settlement: Settlement, box: Box, test: _Test, number: int
 ) -> LimitsTogether:
     """The limits together from a box that passed its test; a box that leaves no characteristic any room is none."""
     of_vehicle = search.characteristics.of_vehicle

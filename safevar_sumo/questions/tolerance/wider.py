@@ -104,4 +104,5 @@ def _verdict(models: Models, settings: FloatArray, judges: Rows, left: FloatArra
     if left[0] >= 0:
         return f"they hold: the worst of {simulated:,} aimed at them keeps {model.degree(left[0]):.2f} m{where}."
     words = describe(model, {"": settings[0]})[""].words
-    return f"they do not hold: {words}{where}, where the new car is safe."
+    new_car = ", where the new car is safe" if where else ""  # other encounters of a searched scenario do not count
+    return f"they do not hold: {words}{where}{new_car}."

@@ -1,0 +1,116 @@
+"""How far each limit of a box can move out alone, and how it moves in where an attack found a failure."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from safevar_sumo.questions.attack import attack
+from safevar_sumo.questions.box import MAX_CORNERS, Box
+from safevar_sumo.questions.tolerance.search import STAGE, BoxSearch, Step
+from safevar_sumo.records import FloatArray
+
+LEAST_MOVE = 1 / 50
+"""A limit that cannot move out by this share of its range, or by one printed digit, is at its end."""
+STRIDES = (8, 4, 2, 1)
+"""Numbers of such moves that are tried at once, the largest first."""
+CLEARANCE = 0.8
+"""Share of such a move by which a limit keeps off a failure that an attack found between corners."""
+SLAB_ATTACK = 512
+"""Number of simulations of an attack on the room beyond a limit."""
+KNOWN_CORNERS = 32
+"""Number of corners with which that attack begins."""
+
+
+class Settlement:
+    """Moves limits as far as they can go, one at a time."""
+
+    def __init__(self, search: BoxSearch) -> None:
+        self.search = search
+
+    def of(self, box: Box) -> Box:
+        """A box of which no limit can move out alone without meeting something unsafe."""
+        steps: list[Step] = [*np.argwhere(self.search.is_free).tolist()]
+        while steps:
+            moved = list[Step]()
+            for step in steps:
+                wider = self._moved(box, step)
+                if wider is not None:
+                    box = wider
+                    moved.append(step)
+            steps = moved
+        return box
+
+    def _moved(self, box: Box, step: Step) -> Box | None:
+        """The box with one limit moved out as far as nothing unsafe is met; None if it cannot move."""
+        for stride in STRIDES:
+            wider = self.trial(box, step, stride)
+            if wider is None:
+                return None
+            if not self._is_blocked(box, wider, step):
+                return wider
+        return None
+
+    def trial(self, box: Box, step: Step, stride: int = 1) -> Box | None:
+        """The box with one limit moved out by some moves, rounded; None at the end of the domain."""
+        side, column = step
+        item = self.search.characteristics.members[column]
+        end = (box.lower, box.upper)[side][column]
+        last = (item.lower, item.upper)[side]
+        if end == last:
+            return None
+        move = max(LEAST_MOVE * (item.upper - item.lower), 10.0**-item.digits)
+        place = item.rounded(end + (-1, 1)[side] * stride * move, upwards=side == 0)
+        place = max(place, last) if side == 0 else min(place, last)
+        ends = [box.lower.copy(), box.upper.copy()]
+        ends[side][column] = place
+        return Box(box.region, *ends)
+
+    def _is_blocked(self, box: Box, wider: Box, step: Step) -> bool:
+        search, (side, column) = self.search, step
+        sides = search.sides_of(wider)
+        if len(search.unsafe_inside(sides)):
+            return True
+        end = (wider.lower, wider.upper)[side][column]
+        ends = [wider.lower.copy(), wider.upper.copy()]
+        for values in ends:
+            values[column] = end
+        slab = Box(wider.region, *ends).corners(search.seed, 1)[:MAX_CORNERS]
+        settings = np.concatenate([slab, search.settings_at_end(sides, step)])
+        if search.have_unsafe(settings[np.newaxis])[0]:
+            return True
+        beyond = [wider.lower.copy(), wider.upper.copy()]
+        beyond[1 - side][column] = (box.lower, box.upper)[side][column]
+        judges = [partial(model.left, stage=STAGE) for model in search.models]
+        rng = np.random.default_rng((search.seed, 10, side, column))
+        found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN_CORNERS]], SLAB_ATTACK, rng)
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
+        return bool((found.left < 0).any())
+
+    def cut(self, box: Box) -> Box:
+        """A box without its known failures: for each, that limit moves in which loses the least volume, by somewhat
+        more than it needs to.
+        """
+        search = self.search
+        while len(inside := search.unsafe_inside(search.sides_of(box))):
+            sides = search.sides_of(box)
+            extents, choices = search.extents(inside[:1])[0], list[FloatArray]()
+            for side, column in np.argwhere(search.is_free & (extents > 0)).tolist():
+                shorter = sides.copy()
+                shorter[side, column] = max(extents[side, column] - CLEARANCE * LEAST_MOVE * search.width[column], 0.0)
+                choices.append(shorter)
+            if not choices:
+                return search.printed(search.fixed)
+            box = search.printed(max(choices, key=search.log_volume))
+        return box
+
+    def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:
+        """For each limit that could move out further, a known failure that it then meets."""
+        beyond = dict[tuple[int, int], FloatArray]()
+        for side, column in np.argwhere(self.search.domain > 0).tolist():
+            wider = self.trial(box, (side, column))
+            if wider is not None:
+                for setting in self.search.unsafe_inside(self.search.sides_of(wider))[:1]:
+                    beyond[side, column] = setting
+        return beyond
