@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import (
+    CORRIDOR,
     Ads,
     NonNegativeParameter,
     PositiveParameter,
@@ -100,7 +101,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     margin: NonNegativeParameter = 0.5
     partial_share: Annotated[float, Meta(ge=0, le=1)] = 0.4
     partial_time: NonNegativeParameter = 0.15
-    corridor: PositiveParameter = 1.4
+    corridor: PositiveParameter = CORRIDOR
     reach: PositiveParameter = 100.0
     warning_time: NonNegativeParameter = 2.0
 
@@ -211,7 +212,7 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     target_acceleration: PositiveParameter = 2.5
     target_jerk: PositiveParameter = 1.5
     command_delay: NonNegativeParameter = 0.2
-    corridor: PositiveParameter = 1.4
+    corridor: PositiveParameter = CORRIDOR
 
     def start(self, n: int, nominal: Nominal, step: float) -> _AutowareMemory:
         return _AutowareMemory(nominal, step, cruise=None, decision_time=np.full(n, -1.0))

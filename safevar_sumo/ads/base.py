@@ -224,6 +224,10 @@ def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pe
     return Command(np.where(excess < 0, 0.0, np.minimum(np.maximum(throttle, 0.0), 1.0)), brake)
 
 
+CORRIDOR = 1.15
+"""Half the width of the corridor that a driver watches [m]: an adult in it has his middle up to 1.4 m from the lane's
+middle, a car, which is 1.7 m wide, up to 2.0 m.
+"""
 LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a positive closing speed [m/s]; keeps times finite."""
 LARGEST_GAP = 1e6
@@ -237,18 +241,19 @@ def time_to_reach(seen: Observation) -> FloatArray:
 
 
 def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
-    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle
-    reaches it.
+    """Whether a side of a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the
+    vehicle reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """
     is_detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
     lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
     lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
-    return is_detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor))
+    watched = corridor + seen.obstacle_width / 2
+    return is_detected & ((np.abs(lateral) <= watched) | (np.abs(lateral_at_arrival) <= watched))
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
-    """Whether an obstacle is within `corridor` of the lane's middle [m], or moves towards the middle."""
+    """Whether a side of an obstacle is within `corridor` of the lane's middle [m], or moves towards the middle."""
     moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
-    return (np.abs(seen.lateral) <= corridor) | moves_inwards
+    return (np.abs(seen.lateral) <= corridor + seen.obstacle_width / 2) | moves_inwards

@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import (
+    CORRIDOR,
     LARGEST_GAP,
     Ads,
     NonNegativeParameter,
@@ -38,7 +39,7 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     cruise_speed: PositiveParameter = 13.89
     headway: PositiveParameter = 1.0
     standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
-    corridor: PositiveParameter = 1.4
+    corridor: PositiveParameter = CORRIDOR
 
     def start(self, n: int, nominal: Nominal, step: float) -> tuple[Nominal, Trim | None]:
         return nominal, None

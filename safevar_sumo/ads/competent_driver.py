@@ -130,7 +130,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         lateral = np.where(is_sighted, seen.lateral, 0.0)
         is_first_sight = is_sighted & ~np.isfinite(memory.first_lateral)
         first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
-        appeared_in_way = memory.appeared_in_way | (is_first_sight & (np.abs(lateral) <= self.corridor))
+        is_in_corridor = np.abs(lateral) <= self.corridor + seen.obstacle_width / 2
+        appeared_in_way = memory.appeared_in_way | (is_first_sight & is_in_corridor)
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         strays_now = is_sighted & (deviation >= self.stray)
         new_stray_time = np.where(strays_now, 0.0, -1.0)

@@ -21,7 +21,7 @@ from safevar_sumo.study.schema import ModelTable
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"),
-    **dict.fromkeys(("gap", "lateral"), "m"),
+    **dict.fromkeys(("gap", "lateral", "obstacle_width"), "m"),
     **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
     **{"time": "s", "acceleration": "m/s2"},
 }

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import (
+    CORRIDOR,
     Ads,
     Memory,
     NonNegativeParameter,
@@ -94,7 +95,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     cruise_speed: PositiveParameter | None = None
-    corridor: PositiveParameter = 1.4
+    corridor: PositiveParameter = CORRIDOR
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         nobody, never = np.zeros(n), np.zeros(n, dtype=bool)

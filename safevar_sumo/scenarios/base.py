@@ -177,6 +177,7 @@ class Scene(NamedTuple):
     obstacle_speed: FloatArray = ZERO
     visible: BoolArray = ALL_TRUE
     obstacle_length: FloatArray = ZERO
+    obstacle_width: FloatArray = ZERO
 
 
 MAX_DURATION = 3600.0

@@ -187,7 +187,9 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
         front = memory.frame.along(vehicle_positions)
         moves_away = lateral * lateral_speed > 0
         over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)
-        return Scene(memory.conflict_point - front, lateral, lateral_speed, over), memory._replace(last_lateral=lateral)
+        width = np.array(world.person_width(PEDESTRIAN))
+        scene = Scene(memory.conflict_point - front, lateral, lateral_speed, over, obstacle_width=width)
+        return scene, memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's

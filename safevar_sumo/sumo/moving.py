@@ -38,8 +38,7 @@ class Moving(NamedTuple):
     vx, vy, least_vx, most_vx
         Speeds along the lane and to its left; the least and largest speed along it from now on [m/s].
     lateral, lateral_speed
-        Position across the lane, from the side that the body comes from, and its rate of change [m, m/s]: that of the
-        middle of its rear or front, or of the middle of who moves across.
+        Position of its middle across the lane, from the side that the body comes from, and its rate of change [m, m/s].
     is_in_path, is_cleared, is_avoidable
         Whether it is in the vehicle's path; has left it for good; or stays in it to the end, so that a vehicle that is
         never faster again has avoided it.
@@ -81,7 +80,6 @@ class Moving(NamedTuple):
         is_in_path = slim((np.abs(track.y) < path / 2 + half_width + TIE) & (track.kind != SCREEN))
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
         will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
-        lengthwise: FloatArray = track.y - np.sign(track.along) * track.left * track.length / 2
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
         level = np.where(is_in_path.any(axis=0), IN_PATH, np.where((track.speed > 0).any(axis=0), BESIDE, 0))
         return cls(
@@ -93,7 +91,7 @@ class Moving(NamedTuple):
             vy=vy,
             least_vx=slim(_from_now_on(np.minimum, vx)),
             most_vx=slim(_from_now_on(np.maximum, vx)),
-            lateral=slim(np.where(cosine > sine, lengthwise, track.y) * sign),
+            lateral=slim(track.y * sign),
             lateral_speed=slim(vy * sign),
             is_in_path=is_in_path,
             is_cleared=slim(has_entered & ~will_touch),

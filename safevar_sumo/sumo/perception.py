@@ -14,8 +14,8 @@ from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.bodies import Motion, SceneWorld
 
-OCCLUDED_VALUES = np.array([[np.inf], [np.inf], [0.0], [0.0]])
-"""Gap and lateral position [m], lateral speed and speed [m/s] of an occluded obstacle."""
+OCCLUDED = {"gap": np.inf, "lateral": np.inf, "lateral_speed": 0.0, "obstacle_speed": 0.0, "obstacle_width": 0.0}
+"""What is observed of an occluded obstacle [m, m/s]."""
 
 
 class Observer(Protocol):
@@ -47,19 +47,19 @@ class Perception:
 
         An occluded obstacle appears at rest, infinitely far away.
         """
-        values = np.empty((len(OCCLUDED_VALUES) + 1, len(speed)))
-        for row, quantity in enumerate((scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed)):
-            values[row] = quantity
-        if scene.visible is not ALL_TRUE:
-            values[:-1] = np.where(scene.visible, values[:-1], OCCLUDED_VALUES)
+        values = np.empty((len(OCCLUDED) + 1, len(speed)))
+        values[-1] = speed
+        for row, (quantity, occluded) in enumerate(OCCLUDED.items()):
+            values[row] = getattr(scene, quantity)
+            if scene.visible is not ALL_TRUE:
+                values[row] = np.where(scene.visible, values[row], occluded)
         seen = np.empty_like(values)
         for k, (vehicles, line) in enumerate(self._lines):
             seen[:, vehicles], next_line = line.delayed(values[:, vehicles])
             self._lines[k] = vehicles, next_line
-        gap, lateral, lateral_speed, obstacle_speed, old_speed = seen
-        return Observation(
-            time, speed, gap, old_speed - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed
-        )
+        obstacle = dict(zip(OCCLUDED, seen, strict=False))
+        closing_speed = seen[-1] - obstacle["obstacle_speed"]
+        return Observation(time=time, speed=speed, closing_speed=closing_speed, visibility=self._visibility, **obstacle)
 
 
 class SceneObserver:

@@ -113,6 +113,7 @@ class Stage:
             over=np.broadcast_to(over, self.n),
             obstacle_speed=zeros + self._row(body.vx),
             visible=seen.visible,
+            obstacle_width=zeros + 2 * self._row(body.half_width),
         )
 
     def _nearest(self, seen: Sequence[_Seen], over: BoolArray) -> Scene:

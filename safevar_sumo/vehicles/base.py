@@ -143,24 +143,22 @@ class Sensors(NamedTuple):
         return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
 
 
+DELAYED = ("gap", "closing_speed", "lateral", "lateral_speed", "obstacle_speed", "obstacle_width")
+"""What sensors report of an obstacle."""
+
+
 def sensed_observation(
     seen: Observation, past: DelayedSignal | None, latency: FloatArray, reach: FloatArray, step: float
 ) -> tuple[Observation, DelayedSignal]:
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; and the history for
     the next call.
     """
-    obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
-    sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
+    columns = (getattr(seen, name) for name in DELAYED)
+    sample = np.stack([np.broadcast_to(column, seen.gap.shape) for column in columns])
     past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
-    gap, closing_speed, lateral, lateral_speed, obstacle_speed = past.delayed()
-    is_detected = gap <= reach * seen.visibility
-    return seen._replace(
-        gap=np.where(is_detected, gap, np.inf),
-        closing_speed=closing_speed,
-        lateral=lateral,
-        lateral_speed=lateral_speed,
-        obstacle_speed=obstacle_speed,
-    ), past
+    then = dict(zip(DELAYED, past.delayed(), strict=True))
+    is_detected = then["gap"] <= reach * seen.visibility
+    return seen._replace(**then | {"gap": np.where(is_detected, then["gap"], np.inf)}), past
 
 
 Prepared = Any

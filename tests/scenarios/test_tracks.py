@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from safevar_sumo.ads import Aeb
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import Track, TrackScenario, travelled
 from safevar_sumo.study import load_study
@@ -75,6 +76,13 @@ def test_a_contact_at_the_side_counts_but_in_a_test_of_the_front() -> None:
     assert run.outcome[0] == Outcome.COLLISION
     assert run.contact.side[0] == "right"
     assert held(cast, test_speed=SPEED).outcome[0] != Outcome.COLLISION
+
+
+@pytest.mark.parametrize(("kind", "middle"), [("adult", 1.15 + 0.25), ("car", 1.15 + 1.712 / 2)])
+def test_a_driver_watches_his_corridor_up_to_the_bodys_side(kind: str, middle: float) -> None:
+    for beside, brakes in ((middle - 0.01, True), (middle + 0.01, False)):
+        run = driven(Cast(lambda times, y=beside: Track.of("body", kind, 60.0, y)), Aeb())
+        assert (run.trace.brake[run.trace.active] == 1).any() == brakes
 
 
 def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
