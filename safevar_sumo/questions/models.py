@@ -125,8 +125,12 @@ def limit_criterion(
     # A collision that is asked for stands alone.
     if criterion.below is not None or criterion.points is not None or (margin is None and unsafe is not None):
         return criterion
-    usual = SEARCHED_MARGIN if margin is None and study.scenario.search else margin_of(study, margin)
-    return replace(criterion, keep=usual)
+    return replace(criterion, keep=distance_to_keep(study, margin))
+
+
+def distance_to_keep(study: Study, margin: float | None) -> float:
+    """The stated distance [m]; without one `SEARCHED_MARGIN` or that of the study."""
+    return SEARCHED_MARGIN if margin is None and study.scenario.search else margin_of(study, margin)
 
 
 def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_unsafe_originals: bool = False) -> Models:

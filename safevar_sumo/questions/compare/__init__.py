@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import RATING_POINTS, Unsafe, margin_of
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, Margin, question
@@ -40,6 +40,7 @@ from safevar_sumo.questions.compare.settings import (
     pairs_of,
 )
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import distance_to_keep
 from safevar_sumo.questions.pairs import (
     SETTING_COLUMNS,
     SIDES,
@@ -82,8 +83,7 @@ def compare(
     limits
         A limit in the characteristic's unit, such as "treadDepth >= 3", within which is compared; may be repeated.
     margin
-        Distance to keep from a collision [m], as in `tolerance`; by default the larger error of the models that the two
-        studies state, else 0.3 m.
+        Distance to keep from a collision [m], as in `tolerance`; by default the larger one of the two studies.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
@@ -172,10 +172,8 @@ def _criteria(
                 chosen.append(one.choose_criterion(None, subject, original))
         without_points = [one for one in chosen if one.points is None]
         criterion = Unsafe() if Unsafe() in chosen else [*without_points, *chosen][0]
-    # The original's margin is what wear may use up in an encounter that is searched.
-    has_margin = margin is not None or (not stated and not evaluators[0].study.scenario.search)
-    if criterion == Unsafe() and has_margin:
-        criterion = replace(criterion, keep=max(margin_of(one.study, margin) for one in evaluators))
+    if criterion == Unsafe() and (margin is not None or not stated):
+        criterion = replace(criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators))
     return [replace(criterion, contact=contact_degree(assemble(one.study))) for one in evaluators]
 
 

@@ -41,8 +41,8 @@ def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) 
         "seconds_earlier": None if most is None else float(seconds[most]),
         "most_at": None if most is None else today.points[most // len(encounters)].name or None,
         "largest_deceleration": deceleration,
-        "needless_braking": sum(after),
-        "needless_braking_today": sum(before),
+        "needless_braking": sum(after) if after else None,
+        "needless_braking_today": sum(before) if before else None,
         "benign_scenes": len(after),
     }
 
