@@ -42,8 +42,8 @@ class _Memory(NamedTuple):
         Speed to hold [m/s] and the trim at the first call; None before that call.
     stage, intervened
         Braking stage, and whether it has ever braked.
-    obstacle_speed
-        The obstacle's speed at the last call [m/s].
+    obstacle, obstacle_speed
+        The obstacle's number and speed at the last call [-, m/s].
     warns
         Whether it warns its driver now.
     """
@@ -53,6 +53,7 @@ class _Memory(NamedTuple):
     cruise: tuple[FloatArray, Trim] | None
     stage: FloatArray
     intervened: BoolArray
+    obstacle: FloatArray
     obstacle_speed: FloatArray
     warns: BoolArray
 
@@ -107,7 +108,9 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         zeros, nobody = np.zeros(n), np.zeros(n, dtype=bool)
-        return _Memory(nominal, step, cruise=None, stage=zeros, intervened=nobody, obstacle_speed=zeros, warns=nobody)
+        return _Memory(
+            nominal, step, None, zeros, intervened=nobody, obstacle=zeros, obstacle_speed=zeros, warns=nobody
+        )
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
@@ -120,8 +123,13 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
         command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
         warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > NO_BRAKING)
-        return command, _Memory(
-            nominal, memory.step, (cruise_speed, cruise_trim), stage, has_intervened, _obstacle_speed(seen), warns
+        return command, memory._replace(
+            cruise=(cruise_speed, cruise_trim),
+            stage=stage,
+            intervened=has_intervened,
+            obstacle=seen.obstacle,
+            obstacle_speed=_obstacle_speed(seen),
+            warns=warns,
         )
 
     def warns(self, memory: _Memory) -> BoolArray:
@@ -132,7 +140,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The braking stage; it does not fall while the obstacle blocks the way, nor at standstill."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
-        obstacle_deceleration = (memory.obstacle_speed - obstacle_speed) / memory.step
+        lost_speed = np.where(seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0)
+        obstacle_deceleration = lost_speed / memory.step
         obstacle_stop = obstacle_speed * obstacle_speed / (2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
         stop_difference = speed * speed / (2 * deceleration) - obstacle_stop
         closing_speed = np.maximum(seen.closing_speed, 0.0)

@@ -96,17 +96,19 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere)
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
-        is_perceived, memory = self._perceive(seen, memory)
+        is_same = seen.obstacle == memory.reaction.leader
+        is_perceived, memory = self._perceive(seen, memory, is_same)
         is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
         deceleration, reaction = self.watch_leader(seen, memory.reaction, is_in_way)
         brakes_now = deceleration > self.leader_braking + DECELERATION_ROUNDING
         begun = np.where(brakes_now, reaction.step, -1.0)  # it is seen a step after it began
-        braking_time = np.where(memory.braking_time >= 0, memory.braking_time + reaction.step, begun)
+        braking_time = np.where(is_same & (memory.braking_time >= 0), memory.braking_time + reaction.step, begun)
         still_brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
         brakes = (braking_time >= self.perception_time - TIME_ROUNDING) & ((seen.closing_speed > 0) | still_brakes)
         is_near = time_to_reach(seen) < self.critical_ttc
         danger = is_in_way & (brakes | (is_near & ~still_brakes))
-        first_gap = np.where(is_in_way, np.where(np.isfinite(memory.first_gap), memory.first_gap, seen.gap), np.inf)
+        is_followed = is_same & np.isfinite(memory.first_gap)
+        first_gap = np.where(is_in_way, np.where(is_followed, memory.first_gap, seen.gap), np.inf)
         command, reaction = self.react(
             seen,
             reaction,
@@ -122,20 +124,21 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         braking_time = np.where(is_in_way, braking_time, -1.0)
         return command, memory._replace(reaction=reaction, braking_time=braking_time, first_gap=first_gap)
 
-    def _perceive(self, seen: Observation, memory: _Perceiving) -> tuple[BoolArray, _Perceiving]:
+    def _perceive(self, seen: Observation, memory: _Perceiving, is_same: BoolArray) -> tuple[BoolArray, _Perceiving]:
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
         `perception_time` ago or earlier.
         """
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
-        is_first_sight = is_sighted & ~np.isfinite(memory.first_lateral)
+        is_first_sight = is_sighted & ~(is_same & np.isfinite(memory.first_lateral))
         first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
         is_in_corridor = np.abs(lateral) <= self.corridor + seen.obstacle_width / 2
-        appeared_in_way = memory.appeared_in_way | (is_first_sight & is_in_corridor)
+        appeared_in_way = (memory.appeared_in_way & ~is_first_sight) | (is_first_sight & is_in_corridor)
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         strays_now = is_sighted & (deviation >= self.stray)
         new_stray_time = np.where(strays_now, 0.0, -1.0)
-        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
+        strayed_before = ~is_first_sight & (memory.stray_time >= 0)
+        stray_time = np.where(strayed_before, memory.stray_time + memory.reaction.step, new_stray_time)
         is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time

@@ -68,8 +68,9 @@ class Reaction(NamedTuple):
         Time since the driver first saw the danger [s]; negative without a danger.
     felt_deceleration, intended_deceleration
         The vehicle's deceleration without the driver's braking, and the one that the driver aims at [m/s^2].
-    leader_speed, leader_has_braked
-        Speed of who was in the way at the last call [m/s], 0 for nobody; whether he has braked there.
+    leader, leader_speed, leader_has_braked
+        Number of the obstacle at the last call; its speed if it was in the way [m/s], 0 for nobody; whether it has
+        braked there.
     """
 
     nominal: Nominal
@@ -79,6 +80,7 @@ class Reaction(NamedTuple):
     danger_time: FloatArray
     felt_deceleration: FloatArray
     intended_deceleration: FloatArray
+    leader: FloatArray
     leader_speed: FloatArray
     leader_has_braked: BoolArray
 
@@ -98,19 +100,21 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     corridor: PositiveParameter = CORRIDOR
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        nobody, never = np.zeros(n), np.zeros(n, dtype=bool)
-        return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n), nobody, never)
+        zeros = np.zeros(n)
+        never = np.zeros(n, dtype=bool)
+        return Reaction(nominal, step, None, zeros, np.full(n, -1.0), zeros, zeros, zeros, zeros, never)
 
     def watch_leader(self, seen: Observation, memory: Reaction, is_in_way: BoolArray) -> tuple[FloatArray, Reaction]:
         """The mean deceleration of a leader since the last call [m/s^2], 0 without one; and the memory with the
         leader as it is now.
         """
         speed = np.where(is_in_way, seen.obstacle_speed, 0.0)
-        is_led = is_in_way & (memory.leader_speed > 0)
+        is_same = seen.obstacle == memory.leader
+        is_led = is_in_way & is_same & (memory.leader_speed > 0)
         deceleration = np.where(is_led, (memory.leader_speed - speed) / memory.step, 0.0)
         brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
-        has_braked = is_in_way & (memory.leader_has_braked | brakes)
-        return deceleration, memory._replace(leader_speed=speed, leader_has_braked=has_braked)
+        has_braked = is_in_way & (memory.leader_has_braked & is_same | brakes)
+        return deceleration, memory._replace(leader=seen.obstacle, leader_speed=speed, leader_has_braked=has_braked)
 
     def react(
         self,

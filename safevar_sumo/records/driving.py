@@ -57,8 +57,8 @@ class Observation(NamedTuple):
     while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
     vehicle's lane, negative on the side that the obstacle comes from, infinite while it is out of sight [m].
     `closing_speed` is the rate at which the gap shrinks, `obstacle_speed` the obstacle's own speed along the vehicle's
-    path [m/s], `obstacle_width` its extent across the lane [m], 0 where the scenario does not state it; `throttle` and
-    `brake` are the pedals' positions [-].
+    path [m/s], `obstacle_width` its extent across the lane [m], 0 where the scenario does not state it; `obstacle` is
+    the number of the body that it is, of several; `throttle` and `brake` are the pedals' positions [-].
     """
 
     time: float
@@ -72,6 +72,7 @@ class Observation(NamedTuple):
     throttle: FloatArray = ZERO
     brake: FloatArray = ZERO
     obstacle_width: FloatArray = ZERO
+    obstacle: FloatArray = ZERO
 
 
 class Command(NamedTuple):

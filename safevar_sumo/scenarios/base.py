@@ -178,6 +178,7 @@ class Scene(NamedTuple):
     visible: BoolArray = ALL_TRUE
     obstacle_length: FloatArray = ZERO
     obstacle_width: FloatArray = ZERO
+    obstacle: FloatArray = ZERO
 
 
 MAX_DURATION = 3600.0

@@ -14,7 +14,10 @@ from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.bodies import Motion, SceneWorld
 
-OCCLUDED = {"gap": np.inf, "lateral": np.inf, "lateral_speed": 0.0, "obstacle_speed": 0.0, "obstacle_width": 0.0}
+OCCLUDED = {
+    **{"gap": np.inf, "lateral": np.inf, "lateral_speed": 0.0, "obstacle_speed": 0.0},
+    **{"obstacle_width": 0.0, "obstacle": 0.0},
+}
 """What is observed of an occluded obstacle [m, m/s]."""
 
 

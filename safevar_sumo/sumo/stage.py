@@ -114,6 +114,7 @@ class Stage:
             obstacle_speed=zeros + self._row(body.vx),
             visible=seen.visible,
             obstacle_width=zeros + 2 * self._row(body.half_width),
+            obstacle=zeros + seen.body,
         )
 
     def _nearest(self, seen: Sequence[_Seen], over: BoolArray) -> Scene:

@@ -143,7 +143,7 @@ class Sensors(NamedTuple):
         return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
 
 
-DELAYED = ("gap", "closing_speed", "lateral", "lateral_speed", "obstacle_speed", "obstacle_width")
+DELAYED = ("gap", "closing_speed", "lateral", "lateral_speed", "obstacle_speed", "obstacle_width", "obstacle")
 """What sensors report of an obstacle."""
 
 

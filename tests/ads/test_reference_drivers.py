@@ -143,6 +143,20 @@ def test_the_competent_driver_perceives_a_crossing_pedestrian_after_a_stray_of_t
     assert onset_gap == pytest.approx(20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP)
 
 
+@pytest.mark.parametrize("is_another", [False, True])
+def test_another_body_ahead_that_is_slower_is_no_braking_leader(is_another: bool) -> None:
+    """A leader at 15 m/s leaves; the next car, 30 m farther, drives 10 m/s."""
+    driver = CompetentDriver()
+    memory = driver.start(1, KNOWN, STEP)
+    pedals = []
+    for k in range(100):
+        gap, leader = (20.0, 15.0) if k < 40 else (50.0 - 5 * (k - 40) * STEP, 10.0)
+        one = seen(k * STEP, 15.0, gap, leader=leader)._replace(obstacle=np.array([float(is_another and k >= 40)]))
+        command, memory = driver.drive(one, memory)
+        pedals.append(command.brake[0])
+    assert (max(pedals) > 0.05) == (not is_another), "the same body would have braked by 100 m/s^2"
+
+
 def test_r157_brakes_with_6_at_once_when_the_regulation_says() -> None:
     onset_gap, decelerations = braking(R157(), 12.0, 60.0)
     assert onset_gap == pytest.approx(12.0 * (12.0 / 12 + 0.45 - 0.35), abs=2 * 12 * STEP)
