@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,16 +19,18 @@ from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
 from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
-from safevar_sumo.sumo.moving import row
+from safevar_sumo.sumo.moving import Column, row
 from safevar_sumo.sumo.network import Network, copied_network
 from safevar_sumo.sumo.stage import Stage
-from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld
+from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
 
 PLACE_TOLERANCE = 1e-6
 """Largest distance in SUMO of an actor from its track, and of a vehicle from where it has driven to [m]."""
-ANY_PLACE, ANY_LANE = 2, -1
-"""Values of `moveToXY` that allow places beside every road, and leave the lane to SUMO."""
+ANY_PLACE, ANY_LANE = 1 + 2 + 4, -1
+"""Values of `moveToXY`: SUMO looks for the lane on the actor's own route, whoever may use it, and allows places beside
+every road. Elsewhere it would look at the lanes of all copies, which are in the same place.
+"""
 SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle"}
 """Shapes that sumo-gui draws, by kind; of all others the one whose corners SUMO does not cut off."""
 WAIT = 1e6
@@ -43,6 +46,26 @@ def start_frame(network: Network, options: tuple[str, ...]) -> Frame:
         return Frame((x, y), Frame.of(world.lane_of(VUT)).direction)
 
 
+class Placed(NamedTuple):
+    """An actor in SUMO: its ids in the copies, whether it is a person, and at every sample the place of its front or,
+    of a person, of its middle [m], and its angle [degrees clockwise from north], in columns as `Moving` has them.
+    """
+
+    track: Track
+    ids: list[str]
+    is_person: bool
+    x: FloatArray
+    y: FloatArray
+    angle: FloatArray
+
+    @classmethod
+    def of(cls, track: Track, ids: list[str], start: Frame) -> Placed:
+        x, y = start.point(track.x + track.along * track.length / 2, track.y + track.left * track.length / 2)
+        east, north = start._replace(origin=(0.0, 0.0)).point(track.along, track.left)
+        angle = np.degrees(np.arctan2(east, north)) % 360
+        return cls(track, ids, track.kind in PERSONS, np.asarray(x), np.asarray(y), angle)
+
+
 class StageWorld(SumoWorld):
     """N copies of a road in SUMO with the bodies of a stage.
 
@@ -53,8 +76,13 @@ class StageWorld(SumoWorld):
         super().__init__(api, n)
         self._stage, self._start, self._sample = stage, start, 0
         self._lane = LaneWorld(stage, start_speeds, self.step_length)
-        self._actors = [track for track in stage.cast if track.kind != SCREEN]
-        self._edges = [str(api.vehicle.getRoute(id_)[0]) for id_ in self.ids(VUT)]
+        self._actors = [Placed.of(track, self.ids(track.name), start) for track in stage.cast if track.kind != SCREEN]
+        self._move_person, self._move_vehicle, self._set_previous_speed = (
+            function_of(api, *name)
+            for name in (("person", "moveToXY"), ("vehicle", "moveToXY"), ("vehicle", "setPreviousSpeed"))
+        )
+        self._routes = [api.vehicle.getRoute(id_) for id_ in self.ids(VUT)]
+        self._edges = [str(route[0]) for route in self._routes]
         """The edges on which the vehicles under test depart."""
 
     @property
@@ -66,8 +94,8 @@ class StageWorld(SumoWorld):
         return self._checked(self._lane.enter(types))
 
     def _depart(self) -> None:
-        for track in self._actors:
-            self._add(track)
+        for actor in self._actors:
+            self._add(actor)
         self._put()
         super()._depart()
 
@@ -86,21 +114,21 @@ class StageWorld(SumoWorld):
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
         return {}
 
-    def _add(self, actor: Track) -> None:
+    def _add(self, actor: Placed) -> None:
         """Add an actor to every copy, wherever it may be put."""
-        is_person, types = actor.kind in PERSONS, self.api.vehicletype
-        lengths, widths = self._of_copies(actor.length), self._of_copies(actor.width)
-        for id_, edge, length, width in zip(self.ids(actor.name), self._edges, lengths, widths, strict=True):
-            types.copy("DEFAULT_PEDTYPE" if is_person else "DEFAULT_VEHTYPE", id_)
+        types, track = self.api.vehicletype, actor.track
+        lengths, widths = self._of_copies(track.length), self._of_copies(track.width)
+        for id_, route, length, width in zip(actor.ids, self._routes, lengths, widths, strict=True):
+            types.copy("DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE", id_)
             types.setLength(id_, length)
             types.setWidth(id_, width)
             types.setMinGap(id_, 0)
-            types.setShapeClass(id_, SHAPES.get(actor.kind, "evehicle"))
-            if is_person:
-                self.api.person.add(id_, edge, 0.0, typeID=id_)
+            types.setShapeClass(id_, SHAPES.get(track.kind, "evehicle"))
+            if actor.is_person:
+                self.api.person.add(id_, route[0], 0.0, typeID=id_)
                 self.api.person.appendWaitingStage(id_, WAIT)
             else:
-                self.api.route.add(id_, [edge])
+                self.api.route.add(id_, route)
                 self.api.vehicle.add(id_, id_, typeID=id_)
                 self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
                 self.api.vehicle.setLaneChangeMode(id_, 0)
@@ -108,32 +136,25 @@ class StageWorld(SumoWorld):
     def _put(self) -> None:
         """Put all actors where they are at the sample that the coming step leads to."""
         for actor in self._actors:
-            places, directions = self._fronts_of(actor)
-            degrees = np.degrees(np.arctan2(directions[:, 0], directions[:, 1]))
-            speeds = self._of_copies(actor.speed)
-            domain = self.api.person if actor.kind in PERSONS else self.api.vehicle
-            for copy, id_ in enumerate(self.ids(actor.name)):
-                x, y = places[copy].tolist()
-                edge, angle = self._edges[copy], float(degrees[copy]) % 360
-                if domain is self.api.person:
-                    domain.moveToXY(id_, edge, x, y, angle, ANY_PLACE)
-                else:
-                    domain.moveToXY(id_, edge, ANY_LANE, x, y, angle, ANY_PLACE)
-                    domain.setPreviousSpeed(id_, speeds[copy])
+            places = (self._of_copies(column) for column in (actor.x, actor.y, actor.angle))
+            placed = zip(actor.ids, self._edges, *places, strict=True)
+            if actor.is_person:
+                for id_, edge, x, y, angle in placed:
+                    self._move_person(id_, edge, x, y, angle, ANY_PLACE)
+            else:
+                for id_, edge, x, y, angle in placed:
+                    self._move_vehicle(id_, edge, ANY_LANE, x, y, angle, ANY_PLACE)
+                for id_, speed in zip(actor.ids, self._of_copies(actor.track.speed), strict=True):
+                    self._set_previous_speed(id_, speed)
 
     def _of_copies(self, column: FloatArray) -> list[float]:
         """A column at this sample, for every copy."""
-        values: list[float] = np.broadcast_to(row(column, self._sample, self._stage.group), self.n).tolist()
+        values: list[float] = self._at_copies(column).tolist()
         return values
 
-    def _fronts_of(self, actor: Track) -> tuple[FloatArray, FloatArray]:
-        """Where the front of an actor is in the network, and its direction; shape (N, 2)."""
-        x, y, along, left, length = (
-            np.array(self._of_copies(column)) for column in (actor.x, actor.y, actor.along, actor.left, actor.length)
-        )
-        places = self._start.point(x + along * length / 2, y + left * length / 2)
-        directions = self._start._replace(origin=(0.0, 0.0)).point(along, left)
-        return np.stack(places, axis=1), np.stack(directions, axis=1)
+    def _at_copies(self, column: Column) -> Column:
+        values = row(column, self._sample, self._stage.group)
+        return values if len(values) == self.n else np.repeat(values, self.n)
 
     def _checked(self, motion: Motion) -> Motion:
         """The motion on the lane; refuses a simulation in which SUMO has a vehicle or an actor elsewhere."""
@@ -141,9 +162,9 @@ class StageWorld(SumoWorld):
         driving = [*self.driving.values()]
         wanted = {"vehicle under test": (front[driving], self._fronts[driving])}
         for actor in self._actors:
-            domain = self.api.person if actor.kind in PERSONS else self.api.vehicle
-            there = np.array([domain.getPosition(id_) for id_ in self.ids(actor.name)])
-            wanted[f"actor {actor.name!r}"] = self._fronts_of(actor)[0], there
+            get_position = self._get_person_position if actor.is_person else self._get_position
+            here = np.stack([self._at_copies(actor.x), self._at_copies(actor.y)], axis=1)
+            wanted[f"actor {actor.track.name!r}"] = here, np.array([*map(get_position, actor.ids)])
         for name, (here, there) in wanted.items():
             if not (np.abs(there - here) <= PLACE_TOLERANCE).all():
                 off, time = np.abs(there - here).max(), self._sample * self.step_length

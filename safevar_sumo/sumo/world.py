@@ -43,9 +43,9 @@ class SumoWorld:
         self.api, self.n = api, n
         self.step_length: float = api.simulation.getDeltaT()
         self._set_speed, self._get_speed, self._get_position = (
-            _function(api, "vehicle", name) for name in ("setSpeed", "getSpeed", "getPosition")
+            function_of(api, "vehicle", name) for name in ("setSpeed", "getSpeed", "getPosition")
         )
-        self._get_person_position = _function(api, "person", "getPosition")
+        self._get_person_position = function_of(api, "person", "getPosition")
         self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
         self.driving = dict(self._copy_of)
         """Copies whose vehicle under test is on the road, by the vehicle's id."""
@@ -269,7 +269,7 @@ def direction_of(angle: float) -> FloatArray:
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
-def _function(api: Api, domain: str, name: str) -> Callable[..., Any]:
+def function_of(api: Api, domain: str, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
     function: Callable[..., Any] = getattr(compiled or getattr(api, domain), f"{domain}_{name}" if compiled else name)
