@@ -8,13 +8,15 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
 
 from safevar_sumo.campaign import local
+from safevar_sumo.cli.program import COMMANDS, function_of
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
@@ -60,6 +62,24 @@ def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactor
             "XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache")
         )
         patch.setattr(local, "ProcessWorker", inline_worker)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _answers_have_what_their_questions_declare() -> Iterator[None]:
+    """Whatever a test asks of the shipped questions."""
+    create = Answer.__init__
+
+    def create_and_check(answer: Answer, **values: Any) -> None:
+        create(answer, **values)
+        if answer.question in COMMANDS:
+            declared = contents_of(function_of(answer.question))
+            assert declared is not None
+            for key in Contents(answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}).keys:
+                declared.check_key(key)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Answer, "__init__", create_and_check)
         yield
 
 

@@ -16,11 +16,12 @@ from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import MAX_BATCH, InputError, warn
 from safevar_sumo.metrics import RATING_POINTS
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Jobs, Range
 from safevar_sumo.questions.case import UnanswerableError, are_collisions
-from safevar_sumo.questions.research_questions.answer import answer_questions
+from safevar_sumo.questions.research_questions.answer import REMARKS, answer_questions
 from safevar_sumo.questions.research_questions.comparisons import titles_of
+from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.questions.words import (
     demanded_in_words,
@@ -48,8 +49,17 @@ ALGORITHMS: Columns = {
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
     "solutions": "solutions of finished runs",
 }
+RUN_TESTS = ("rq1-runs", "rq2-runs")
+"""The tables of the tests over runs."""
 
 
+@contents(
+    *("results", "finished", "runs", "evaluations", "solutions", "original_outcome", "original_degree"),
+    *("engine", "evaluations_per_second", "seconds"),
+    algorithms=[*ALGORITHMS, ...],
+    **{name: TABLES[name].columns for name in RUN_TESTS},
+    remarks=REMARKS,
+)
 def study(
     study: str,
     *,
@@ -221,7 +231,7 @@ def summarise(results: Results) -> Answer:
     metrics = {metric.name: Column(metric.unit, "mean over solutions", ".2f") for metric in case.scoring.metrics}
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     try:
-        over_runs = answer_questions([case], names=("rq1-runs", "rq2-runs")).tables
+        over_runs = answer_questions([case], names=RUN_TESTS).tables
     except UnanswerableError:
         over_runs = {}
     runs = study.search.runs * len(rows)

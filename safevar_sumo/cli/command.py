@@ -19,7 +19,7 @@ from rich.console import Console
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import check_writable
-from safevar_sumo.questions.answer import FORMATS, Answer
+from safevar_sumo.questions.answer import FORMATS, Answer, contents_of
 from safevar_sumo.questions.ask import Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.study import study_names
@@ -59,6 +59,11 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         form: str, as_json: bool, table: str | None, plot: Path | None, fail_if: tuple[str, ...], **values: Any
     ) -> None:
         conditions = [_parse(text) for text in fail_if]
+        if declared:
+            for key, _, _ in conditions:
+                declared.check_key(key)
+            if table is not None:
+                declared.check_table(table)
         if plot is not None:
             check_writable(plot, "plot", PICTURE_ENDINGS)
         form = "json" if as_json else form
@@ -81,6 +86,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
+    declared = contents_of(function)
     gives_answer = "Answer" in str(signature.return_annotation)
     return click.Command(
         name,

@@ -10,11 +10,11 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import click
 
@@ -68,10 +68,9 @@ class LazyCommands(click.Group):
             if ":" in name:  # a question of the user's
                 from safevar_sumo.questions.ask import find_question
 
-                function = find_question(name)
+                function: Callable[..., Any] = find_question(name)
             elif name in COMMANDS:
-                module, _, attribute = COMMANDS[name].partition(":")
-                function = getattr(importlib.import_module(f"safevar_sumo.{module}"), attribute)
+                function = function_of(name)
             else:
                 return None
             from safevar_sumo.cli.command import command_of
@@ -104,6 +103,12 @@ class LazyCommands(click.Group):
         for title, group in COMMANDS_BY_GROUP.items():
             with formatter.section(title):
                 formatter.write_dl([(name, first_sentence(function)) for name, function in group.items()])
+
+
+def function_of(command: str) -> Callable[..., Any]:
+    """The function of a command, by its name."""
+    module, _, name = COMMANDS[command].partition(":")
+    return cast("Callable[..., Any]", getattr(importlib.import_module(f"safevar_sumo.{module}"), name))
 
 
 def first_sentence(function: str) -> str:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import TYPE_CHECKING, Any
+from types import EllipsisType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import pandas as pd
 from rich.console import Console
@@ -39,11 +40,58 @@ from safevar_sumo.terminal import print_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+AnswerFunction = TypeVar("AnswerFunction", bound="Callable[..., Answer]")
 FORMATS = ("text", "json", "csv", "latex", "html")
 MAX_ROWS = 200
 """Number of rows up to which readers see a table; JSON and CSV have them all."""
 WIDTH = 80
 """Width of text that is not printed to a terminal [characters]."""
+
+
+class Contents(NamedTuple):
+    """The names of an answer's numbers, and of the columns of its tables; `...` among them stands for names that a
+    study gives, such as its metrics.
+    """
+
+    numbers: Collection[str | EllipsisType]
+    tables: Mapping[str, Collection[str | EllipsisType]]
+
+    def check_table(self, name: str) -> None:
+        """Refuse the name of no table; raises an InputError."""
+        check_name("table", f"there is no table {name!r}", name, self.tables)
+
+    def check_key(self, key: str) -> None:
+        """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""
+        name, _, rest = key.rpartition(".")
+        number = name if name and rest.isdecimal() else key
+        wanted, names = (rest, self.tables[name]) if name in self.tables else (number, self.numbers)
+        if wanted not in names and ... not in names:
+            raise unknown_name("fail_if", f"the answer has no number {key!r}", key, self.keys)
+
+    @property
+    def keys(self) -> list[str]:
+        """All names of numbers, and `table.column`, without those that a study gives."""
+        columns = ((f"{table}.", name) for table, names in self.tables.items() for name in names)
+        return [f"{before}{name}" for before, name in (*(("", name) for name in self.numbers), *columns) if name != ...]
+
+
+def contents(
+    *numbers: str | EllipsisType, **tables: Collection[str | EllipsisType]
+) -> Callable[[AnswerFunction], AnswerFunction]:
+    """Decorator: declares the names of all numbers that a function's answers may hold, and of the columns of their
+    tables, so that its command refuses others before anything is computed. `driven` is among the numbers.
+    """
+
+    def declare(function: AnswerFunction) -> AnswerFunction:
+        vars(function)["contents"] = Contents(("driven", *numbers), tables)
+        return function
+
+    return declare
+
+
+def contents_of(function: Callable[..., Any]) -> Contents | None:
+    """What a function's answers may hold; None if it does not say so."""
+    return vars(function).get("contents")
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -206,16 +254,16 @@ class Answer:
         InputError
             If there is no such number.
         """
-        name, _, rest = key.partition(".")
-        if not rest and name in self.numbers:
-            return [self.numbers[name]]
-        value = self.numbers.get(name)
-        if isinstance(value, list | tuple) and rest.isdecimal() and int(rest) < len(value):
-            return [value[int(rest)]]
-        if name in self.tables and rest in self.tables[name]:
+        Contents(self.numbers, {name: [*map(str, frame)] for name, frame in self.tables.items()}).check_key(key)
+        name, _, rest = key.rpartition(".")
+        if name in self.tables:
             return list(plain(self.tables[name][rest].tolist()))
-        known = [*self.numbers, *(f"{table}.{column}" for table, frame in self.tables.items() for column in frame)]
-        raise unknown_name("fail_if", f"the answer has no number {key!r}", key, known)
+        if key in self.numbers:
+            return [self.numbers[key]]
+        value = self.numbers[name]
+        if not (isinstance(value, list | tuple) and int(rest) < len(value)):
+            raise InputError("fail_if", f"the answer has no number {key!r}", f"{name}, which is {text_of(value)}")
+        return [value[int(rest)]]
 
 
 def _draw_intervals(answer: Answer) -> Figure:

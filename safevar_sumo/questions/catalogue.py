@@ -11,7 +11,7 @@ import pandas as pd
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear, searchable_in
 from safevar_sumo.search import DESCRIPTIONS
@@ -56,6 +56,17 @@ FINDINGS: Columns = {
 }
 
 
+@contents(
+    "passed",
+    studies=STUDIES,
+    vehicles=VEHICLES,
+    ads=DESCRIBED,
+    scenarios=SCENARIO,
+    weathers=WEATHER,
+    algorithms=DESCRIBED,
+    metrics=DESCRIBED,
+    objectives=DESCRIBED,
+)
 def list_models(kind: str | None = None) -> Answer:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with KIND only these."""
     effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
@@ -105,6 +116,7 @@ def _scenarios() -> Iterator[tuple[str, ...]]:
         yield name, description, "; ".join(domains)
 
 
+@contents("passed", findings=FINDINGS)
 def check(name: str) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep the promises that
     results rest on.

@@ -14,13 +14,22 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, draw_neighbours, robustness_in_words
 from safevar_sumo.questions.multi_body import load_bmw_parameters
-from safevar_sumo.questions.pairs import SETTING_COLUMNS, SIDES, counts_of, draw_pairs, paired_test, table_of_pairs
+from safevar_sumo.questions.pairs import (
+    ENDS,
+    SETTING_COLUMNS,
+    SIDES,
+    UNSAFE_IN,
+    counts_of,
+    draw_pairs,
+    paired_test,
+    table_of_pairs,
+)
 from safevar_sumo.questions.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject
@@ -48,6 +57,7 @@ CHANGE_SHARES = np.arange(1, 10) / 10
 
 
 @question
+@contents("unsafe", *UNSAFE_IN.values(), "p", "a12", *get_args(Verdict), *ENDS, settings=COLUMNS)
 def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = (), unsafe: Criterion = None) -> Answer:
     """Check the minimal causes of failures with a second vehicle model.
 
@@ -134,7 +144,7 @@ def judge_causes(
         progress(STAGE, row + 1, count)
         if vehicle.reasons_to_omit(cause["changes"]):
             frame.loc[row, ["b_outcome", "b_degree"]] = None, np.nan
-    originals = {str(name): frame[name][0] for name in frame.columns.drop(["solution", "unsafe_in"])}
+    originals = {str(name): frame[name][0] for name in ENDS}
     frame = frame.iloc[1:count].reset_index(drop=True)
     frame = pd.concat([frame, pd.DataFrame(judged, columns=["opinion", "changes", "encounter", "because"])], axis=1)
     frame.loc[frame["opinion"] == "outside", "unsafe_in"] = ""

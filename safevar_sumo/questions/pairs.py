@@ -30,6 +30,7 @@ SETTING_COLUMNS = {
         )
     },
 }
+ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 
 
 def table_of_pairs(

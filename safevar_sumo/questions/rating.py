@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
@@ -74,6 +74,13 @@ CELLS: Columns = TEST | {
 
 
 @question
+@contents(
+    *("points", "possible", "lost", "not_simulated", "layers_not_simulated"),
+    tests=TESTS,
+    vehicles=VEHICLES,
+    not_simulated=NOT_SIMULATED,
+    cells=CELLS,
+)
 def rating(
     subject: Study | Case,
     evaluator: Evaluator,

@@ -17,7 +17,7 @@ import pandas as pd
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, Share, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -41,9 +41,14 @@ VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
 """What varies, by the beginning of the names of its columns."""
+COLUMNS = [
+    "characteristic",
+    *(f"{output}_{index}{end}" for output in OUTPUTS for index in ("first", "total") for end in ("", LOW, HIGH)),
+]
 
 
 @question
+@contents(*("unsafe", "samples", "failures", "probability", "interval", "confidence"), sensitivity=COLUMNS)
 def risk(
     subject: Study | Case,
     evaluator: Evaluator,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
@@ -47,6 +47,7 @@ COLUMNS: Columns = {
 
 
 @question
+@contents("unsafe", "samples", "failures", "share", "interval", rules=COLUMNS)
 def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_384, unsafe: Criterion = None) -> Answer:
     """Find rules, in physical units, that say where in the domain a study is unsafe.
 

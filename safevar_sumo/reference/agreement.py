@@ -12,7 +12,7 @@ import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
@@ -41,6 +41,7 @@ SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_len
 
 
 @question
+@contents("rows", *(f"collisions_{where}" for where in ("here", "reference", "both")), agreement=COLUMNS)
 def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> Answer:
     """Compare a study with settings and metrics in the published package's CSV format, row by row.
 

@@ -16,7 +16,7 @@ from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName, Range
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
@@ -91,6 +91,15 @@ class Target(NamedTuple):
         return np.array([self.row[name] for name in system.characteristics.names], dtype=float)
 
 
+@contents(
+    ...,
+    characteristics=CHARACTERISTICS,
+    results=RESULTS,
+    points=POINTS,
+    spread=SPREAD,
+    sweep=["outcome", "gap", ...],
+    remarks=REMARKS,
+)
 def simulate(
     source: str,
     *,

@@ -15,7 +15,7 @@ from pathlib import Path
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable
 from safevar_sumo.plugins import code_files, file_by_name, is_shipped, only_from
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Jobs
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.subject import study_or_case
@@ -130,6 +130,7 @@ def _files_of_user(study: Study, named: Mapping[str, str], questions: Sequence[s
     return {f"{CODE}/{name}": path.read_bytes() for name, path in sorted(paths.items())}
 
 
+@contents("passed", "sha256", "claims", "same", "differs", "cannot", claims=CLAIMS)
 def verify(
     pack: str | Path,
     *,

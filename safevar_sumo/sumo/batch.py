@@ -177,7 +177,7 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
 
 def open_points_world(system: System, settings: FloatArray, stage: Stage | None) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
-    (point,), options, n = system.points, system.scenes.options, len(settings)
+    (point,), step, n = system.points, system.scenes.step, len(settings)
     encounters, scenarios = system.characteristics.scenario, [point.scenario]
     if len(encounters):
         rows = settings[:, ~system.characteristics.of_vehicle].tolist()
@@ -186,10 +186,10 @@ def open_points_world(system: System, settings: FloatArray, stage: Stage | None)
     create: Callable[[Api, int], SumoWorld] = SumoWorld
     if stage is not None:
         speeds = _start_speeds(system.at_encounters(settings)[0].points, n)
-        create = partial(StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], options))
+        create = partial(StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], step))
     if len(encounters):
-        return open_varied_world(networks, options, create)
-    return open_world(copied_network(networks[0], n), n, options, create)
+        return open_varied_world(networks, step, create)
+    return open_world(copied_network(networks[0], n), n, step, create)
 
 
 @np.errstate(all="ignore")

@@ -6,6 +6,7 @@ Both libraries have the same API: libsumo runs SUMO in this process, traci contr
 from __future__ import annotations
 
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from io import StringIO
 from pathlib import Path
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
-from safevar_sumo.sumo.network import CopiedNetwork, Network, varied_network
+from safevar_sumo.sumo.network import CopiedNetwork, Network, options_of, varied_network
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 CONNECTION_ATTEMPTS = 15
@@ -37,10 +38,16 @@ OWN_OPTIONS = {
     "time-to-teleport.ride": "-1",
     "time-to-teleport.bidi": "-1",
     "time-to-teleport.railsignal-deadlock": "-1",
+    "save-state.times": "",
+    "save-state.period": "-1",
 }
 """Options with which SUMO starts, whatever options a network's file has: how far a vehicle comes at its speeds, and
 what a collision is, depends on no user's file, and nobody who collides or waits leaves his place.
 """
+OUTPUT, NO_FILE = re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log"), "NUL"
+"""SUMO's options that name a file to write, which would grow beside the user's network; and its name of no file."""
+STEP_LENGTH = 0.05
+"""Time step where neither a study nor its network's file names one [s]: SUMO's own, 1 s, is no time to brake in."""
 
 
 class Engine(StrEnum):
@@ -55,10 +62,11 @@ class Engine(StrEnum):
 
 @contextmanager
 def open_world(
-    files: CopiedNetwork, n: int, options: Sequence[str] = (), create: Callable[[Api, int], SumoWorld] = SumoWorld
+    files: CopiedNetwork, n: int, step: float | None = None, create: Callable[[Api, int], SumoWorld] = SumoWorld
 ) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an error. `create` makes
-    the world of SUMO's API and the number of copies.
+    """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by default that of the
+    network; close SUMO at the end, also after an error. `create` makes the world of SUMO's API and the number of
+    copies.
 
     Raises
     ------
@@ -69,7 +77,7 @@ def open_world(
         import libsumo
     with _open(libsumo, "SUMO"):
         try:
-            libsumo.start(["sumo", *sumo_options(files), *options])
+            libsumo.start(["sumo", *sumo_options(files, step)])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
         yield create(libsumo, n)
@@ -77,10 +85,10 @@ def open_world(
 
 @contextmanager
 def open_varied_world(
-    networks: Sequence[Network], options: Sequence[str] = (), create: Callable[[Api, int], SumoWorld] = SumoWorld
+    networks: Sequence[Network], step: float | None = None, create: Callable[[Api, int], SumoWorld] = SumoWorld
 ) -> Iterator[SumoWorld]:
     """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
-    with varied_network(networks) as files, open_world(files, len(networks), options, create) as world:
+    with varied_network(networks) as files, open_world(files, len(networks), step, create) as world:
         yield world
 
 
@@ -127,8 +135,8 @@ def traci_api() -> Api:
     return traci
 
 
-def sumo_options(files: CopiedNetwork) -> list[str]:
-    """The options with which SUMO simulates copies of a network."""
+def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
+    """The options with which SUMO simulates copies of a network; see `open_world`."""
     options = {
         "-c": files.options,
         "-n": files.network,
@@ -142,9 +150,21 @@ def sumo_options(files: CopiedNetwork) -> list[str]:
         "--xml-validation.net": "never",
         "--xml-validation.routes": "never",
     }
-    return [*own_options(), *(str(text) for option in options.items() for text in option)]
+    stated = options_of(files.options)
+    own = own_options(stated) | {"step-length": repr(step_of(stated) if step is None else step)}
+    return [*as_arguments(own), *(str(text) for option in options.items() for text in option)]
 
 
-def own_options() -> list[str]:
-    """`OWN_OPTIONS` as arguments of SUMO."""
-    return [text for name, value in OWN_OPTIONS.items() for text in (f"--{name}", value)]
+def own_options(stated: Mapping[str, str]) -> dict[str, str]:
+    """The options with which SUMO starts whatever a network's file states: `OWN_OPTIONS`, and no file to write."""
+    return OWN_OPTIONS | {name: NO_FILE for name in stated if OUTPUT.fullmatch(name)}
+
+
+def step_of(stated: Mapping[str, str]) -> float:
+    """The time step of a network by the options that its file states [s]."""
+    return float(stated.get("step-length", STEP_LENGTH))
+
+
+def as_arguments(options: Mapping[str, str]) -> list[str]:
+    """Options as arguments of SUMO."""
+    return [text for name, value in options.items() for text in (f"--{name}", value)]

@@ -36,8 +36,8 @@ LEGAL_FOLDERS = (
 )
 NETWORK_KEY = "scenario.parameters.network"
 """Key of a study that names the network, the source of errors about a network that does not exist."""
-SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon)-files")
-"""Options of netconvert that name source files."""
+SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon|additional)-files")
+"""Options of netconvert, and of SUMO beside the network and its traffic, that name files to read."""
 DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
 """Numbers of characters of a digest, and of a program's message, that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
@@ -47,8 +47,9 @@ Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
 class Network(NamedTuple):
     """A network as its files are now.
 
-    `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the recipe's sources, traffic
-    and options, by file name. A scenario's parameters change its lanes once it is built, and its traffic.
+    `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the recipe's sources, traffic,
+    options and the files that they add, by file name. A scenario's parameters change its lanes once it is built, and
+    its traffic.
     """
 
     folder: Path
@@ -84,6 +85,8 @@ def open_network(network: str, source: str = NETWORK_KEY) -> Network:
         )
     folder, roads_file = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
     names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
+    if (folder / OPTIONS_FILE).is_file():
+        names += _sources_of(folder / OPTIONS_FILE)
     for name in names:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
@@ -122,11 +125,11 @@ def _roads_in(folder: Path) -> str:
     return names[0]
 
 
-def _sources_of(roads: Path) -> list[str]:
-    """The files that a recipe names; none for a built network."""
-    if not roads.name.endswith(RECIPE_ENDING):
+def _sources_of(file: Path) -> list[str]:
+    """The files that a configuration names; none for a built network."""
+    if file.name.endswith(NETWORK_ENDING):
         return []
-    values = [value for option, value in options_of(roads).items() if SOURCE_OPTION.fullmatch(option)]
+    values = [value for option, value in options_of(file).items() if SOURCE_OPTION.fullmatch(option)]
     return [name.strip() for value in values for name in value.split(",")]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import ensure_cached, parse_seconds, parse_xml
-from safevar_sumo.sumo.engine import OWN_OPTIONS, open_world, own_options
+from safevar_sumo.sumo.engine import STEP_LENGTH, as_arguments, open_world, own_options
 from safevar_sumo.sumo.network import (
     OPTIONS_FILE,
     TRAFFIC_FILE,
@@ -108,13 +108,17 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
         remarks.append(f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone")
     options_file = network.path(OPTIONS_FILE)
     stated = DEFAULT_OPTIONS | options_of(options_file)
+    if "step-length" not in stated:
+        remarks.append(
+            f"{options_file} has no step-length: {STEP_LENGTH:g} s unless the study has `step_length` (SUMO: 1 s)"
+        )
     overruled = [
-        f"{option} = {stated[option]} ({value} counts)"
-        for option, value in OWN_OPTIONS.items()
+        f"{option} = {stated[option]} ({value or 'none'} counts)"
+        for option, value in own_options(stated).items()
         if option in stated and not _is_same(stated[option], value)
     ]
     if overruled:
-        reason = "how vehicles move at their speeds, what a collision is, and that nobody is teleported"
+        reason = "how vehicles move, what a collision is, and that nobody is teleported and nothing written"
         remarks.append(f"{options_file}: no effect: {', '.join(overruled)}: {reason}, is the same in every study")
     if warnings := _warnings_file(network).read_text(encoding="utf-8"):
         remarks.append(f"{network.folder}: {warnings}")
@@ -133,7 +137,7 @@ def _is_same(stated: str, own: str) -> bool:
 
 @lru_cache(maxsize=100)
 def _check_files(network: Network) -> None:
-    options = {"step-length": "1", "route-files": TRAFFIC_FILE, **options_of(network.path(OPTIONS_FILE))}
+    options = {"step-length": str(STEP_LENGTH), "route-files": TRAFFIC_FILE, **options_of(network.path(OPTIONS_FILE))}
     is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
     if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
         names = ("remote-port", "step-length", "route-files")  # SUMO would wait for a client at the port
@@ -190,8 +194,9 @@ def _try_network(network: Network, into: Path) -> None:
     """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of two copies."""
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
+    own = own_options(options_of(network.path(OPTIONS_FILE)))
     only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")
-    exit_code, messages = run_program(network.folder, "sumo", *files, *only_load, *own_options())
+    exit_code, messages = run_program(network.folder, "sumo", *files, *only_load, *as_arguments(own))
     if exit_code != 0:
         problem = f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: {messages or f'exit code {exit_code}'}"
         raise InputError(network.folder, problem, legal)

@@ -23,7 +23,7 @@ from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
-from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.engine import open_world, step_of
 from safevar_sumo.sumo.network import (
     OPTIONS_FILE,
     Network,
@@ -37,8 +37,6 @@ from safevar_sumo.sumo.network import (
 from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
 
 SCENES_FILE = "scenes.msgpack"
-SUMOS_STEP = 1.0
-"""SUMO's time step, unless an option sets another one [s]."""
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 STRAIGHTNESS = 1e-6
@@ -101,20 +99,17 @@ class Recording:
 
 
 class Scenes:
-    """The scenes of a study, each recorded when it is first needed, with SUMO's options for the study's time step [s]
-    (None: that of the network); errors name the study by `source`.
+    """The scenes of a study, each recorded when it is first needed, with the study's time step [s] (None: that of the
+    network); errors name the study by `source`.
     """
 
     def __init__(self, step_length: float | None = None, source: str = "study") -> None:
-        self._step_length, self._source = step_length, source
-        self.options = () if step_length is None else ("--step-length", repr(step_length))
+        self.step, self._source = step_length, source
         self._recorded: dict[WorldScenario, Recording | str] = {}
 
     def step_of(self, scenario: Scenario) -> float:
         """Time step of a scenario [s]."""
-        if self._step_length is not None:
-            return self._step_length
-        return float(options_of(open_network(scenario.network).path(OPTIONS_FILE)).get("step-length", SUMOS_STEP))
+        return self.step or step_of(options_of(open_network(scenario.network).path(OPTIONS_FILE)))
 
     def of(self, scenarios: Sequence[WorldScenario]) -> list[Recording | str]:
         """Each scenario's scene, or the reason why SUMO must simulate it.
@@ -133,7 +128,7 @@ class Scenes:
         new = [scenario for scenario, reason in reasons.items() if not reason]
         with user_errors(self._source):
             networks = stage_networks(new)
-            keys = [(scenario, network, self.options) for scenario, network in zip(new, networks, strict=True)]
+            keys = [(scenario, network, self.step) for scenario, network in zip(new, networks, strict=True)]
             self._recorded |= reasons | dict(zip(new, _recordings_of(keys) if keys else [], strict=True))
         return [self._recorded[scenario] for scenario in scenarios]
 
@@ -152,8 +147,8 @@ def _reason_against_recording(scenario: WorldScenario) -> str:
     return ""
 
 
-_Key = tuple[WorldScenario, Network, tuple[str, ...]]
-"""A scenario, its network, and additional options of SUMO."""
+_Key = tuple[WorldScenario, Network, float | None]
+"""A scenario, its network, and the study's time step [s]."""
 
 
 def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
@@ -165,8 +160,7 @@ def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
     if any(scenario.is_user_code for scenario, _, _ in keys):
         return play()
     inputs = [
-        (type(scenario).__name__, to_builtins(scenario), network.digests, options)
-        for scenario, network, options in keys
+        (type(scenario).__name__, to_builtins(scenario), network.digests, step) for scenario, network, step in keys
     ]
     digest = sha256(_code_bytes() + repr(inputs).encode())
 
@@ -193,9 +187,9 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     return np.frombuffer(content).reshape(shape)
 
 
-def _play(scenario: WorldScenario, network: Network, options: tuple[str, ...]) -> Recording | str:
+def _play(scenario: WorldScenario, network: Network, step: float | None) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
-    with open_world(copied_network(network, 1), 1, options) as world:
+    with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
         api, vehicle, vut = world.api, world.api.vehicle, copied_id(0, VUT)
         way = _way_of(api, vut)

@@ -38,9 +38,9 @@ WAIT = 1e6
 
 
 @lru_cache(maxsize=100)
-def start_frame(network: Network, options: tuple[str, ...]) -> Frame:
+def start_frame(network: Network, step: float | None) -> Frame:
     """The coordinates of the lane on which the vehicle under test departs, with their origin at its front."""
-    with open_world(copied_network(network, 1), 1, options) as world:
+    with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
         x, y = world.vehicle_positions(VUT)[0].tolist()
         return Frame((x, y), Frame.of(world.lane_of(VUT)).direction)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import json
 import os
 import re
@@ -17,7 +18,8 @@ import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
 
-from safevar_sumo.cli.program import COMMANDS, commands, main
+from safevar_sumo.cli.program import COMMANDS, commands, function_of, main
+from safevar_sumo.questions.answer import contents_of
 from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study, load_study
@@ -224,3 +226,19 @@ def test_a_question_with_one_parameter_is_refused(in_tmp: Path, monkeypatch: pyt
         "from safevar_sumo.questions.ask import question\n\n\n@question\ndef one(subject): ...\n"
     )
     refused("asks:one", "smoke", message=("question 'asks:one': takes (subject)", "(subject, evaluator"))
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if contents_of(function_of(name))])
+def test_names_of_no_table_and_no_number_are_refused_before_anything_is_loaded(command: str) -> None:
+    """The subjects do not exist, and the message names what there is."""
+    subjects = ["nothing"] * (2 if command in ("compare", "validate") else 1)
+    declared = contents_of(function_of(command))
+    assert declared is not None
+    refused(command, *subjects, "--table", "nope", message=("--table: there is no table 'nope'", *declared.tables))
+    if ... not in declared.numbers:
+        refused(command, *subjects, "--fail-if", "nope > 1", message=("--fail-if: the answer has no number 'nope'",))
+
+
+def test_every_command_that_gives_an_answer_declares_its_names() -> None:
+    gives = [name for name in COMMANDS if "Answer" in str(inspect.signature(function_of(name)).return_annotation)]
+    assert [name for name in COMMANDS if contents_of(function_of(name))] == gives

@@ -125,7 +125,13 @@ def test_a_label_is_that_of_one_study_question_table_and_command() -> None:
         return found
 
     other = sv.load_study("rain")
-    answers: list[dict[str, Any]] = [{}, {"study": other}, {"question": "risk"}, {"command": "one"}, {"command": "two"}]
+    answers: list[dict[str, Any]] = [
+        {},
+        {"study": other},
+        {"question": "other"},
+        {"command": "one"},
+        {"command": "two"},
+    ]
     labels = [label(**changes) for changes in answers]
     assert len({*labels}) == len(answers)
     assert label(command="one") == labels[3], "the same command, the same label"

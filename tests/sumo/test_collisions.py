@@ -99,17 +99,25 @@ def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> 
 def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """It names outputs, and no time step, with SUMO's of which the original collides."""
     network = own_network(tmp_path / "lead_vehicle_stopped", "lead_vehicle_stopped")
     (network / "scenario.sumocfg").write_text(WIZARD)
+    files = {*network.iterdir()}
     study = tmp_path / "mine.toml"
     study.write_text(
-        'extends = "native"\nname = "mine"\nstep_length = 0.1\n[scenario]\nmodel = "lead_vehicle_stopped"\n'
+        'extends = "native"\nname = "mine"\n[scenario]\nmodel = "lead_vehicle_stopped"\n'
         f'parameters = {{ network = "{network}" }}\n'
     )
     changes = [f"{name}={value}" for name, value in WEAK_BRAKES.items()]
     answer = json_of("simulate", str(study), "--set", changes[0], "--set", changes[1], "--json")
-    assert answer["numbers"]["safety_degree"] == pytest.approx(-6.62, abs=0.005)
+    shipped = sv.simulate({"extends": "native", "name": "finer", "step_length": 0.05}, WEAK_BRAKES)
+    assert answer["numbers"]["safety_degree"] == shipped.metrics["safety_degree"] < 0
+    assert answer["tables"]["results"]["rows"][0]["original"] == "stopped"
     assert capfd.readouterr().out == ""  # of SUMO itself
+    assert {*network.iterdir()} == files
+    remarks = str(answer["tables"]["remarks"])
+    assert "has no step-length: 0.05 s unless the study has `step_length`" in remarks
+    assert "tripinfo-output = tripinfos.xml (NUL counts)" in remarks
 
 
 def test_one_remark_names_the_options_that_are_overruled(tmp_path: Path) -> None:

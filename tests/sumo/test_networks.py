@@ -263,3 +263,12 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
     assert originals
     assert not originals & kept
     assert len(root.findall("edge")) == 2 * len(plain.findall("edge"))
+
+
+def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(mine: Path) -> None:
+    (mine / "more.add.xml").write_text('<additional><vType id="more"/></additional>')
+    rewritten(mine / "scenario.sumocfg", "</input>", '<additional-files value="more.add.xml"/></input>')
+    check_network(str(mine), "study")
+    before = open_network(str(mine)).digests
+    (mine / "more.add.xml").write_text('<additional><vType id="more" length="7"/></additional>')
+    assert open_network(str(mine)).digests != before

@@ -18,7 +18,7 @@ import pandas as pd
 
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
@@ -42,6 +42,7 @@ from safevar_sumo.questions.compare.settings import (
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import distance_to_keep
 from safevar_sumo.questions.pairs import (
+    ENDS,
     SETTING_COLUMNS,
     SIDES,
     UNSAFE_IN,
@@ -60,6 +61,14 @@ from safevar_sumo.sumo.system import assemble
 
 
 @question
+@contents(
+    *("unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12", "better_in", "worse_in"),
+    *("limits_grown", "limits_shrunk", "outside", "not_simulated", *ENDS, "metres_earlier", "metres_later"),
+    *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking", "points")),
+    "benign_scenes",
+    limits=LIMIT_COLUMNS,
+    settings=["source", *SETTING_COLUMNS, ...],
+)
 def compare(
     subject: Study | Case,
     evaluator: Evaluator,

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.evaluator import Evaluator
@@ -116,6 +116,15 @@ DISTINCT_COLUMNS: Columns = {
 
 
 @question
+@contents(
+    *("unsafe", "settings", "failures", "other_outcomes", "left_out", "original_outcome", "original_degree"),
+    *("analysed", "explained", *COLLISION_NUMBERS, "fits", "unsafe_in_fits"),
+    causes=CAUSE_COLUMNS,
+    solutions=SOLUTION_COLUMNS,
+    characteristics=[*CHARACTERISTIC_COLUMNS, "needed_in_fits"],
+    drivers=[*DRIVER_COLUMNS, "share_in_fits"],
+    distinct_causes=DISTINCT_COLUMNS,
+)
 def explain(
     subject: Study | Case,
     evaluator: Evaluator,

@@ -21,7 +21,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
@@ -72,6 +72,11 @@ REPAIRS = {
 
 
 @question
+@contents(
+    *("margin", "promise", "worst_today", "kept_today", "repairs", "not_repairable", "simulations"),
+    *("fits", "fits_tried"),
+    repairs=REPAIRS,
+)
 def repair(
     subject: Study | Case,
     evaluator: Evaluator,

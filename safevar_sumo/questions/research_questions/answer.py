@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import pandas as pd
 
 from safevar_sumo.errors import check_name
-from safevar_sumo.questions.answer import Answer, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Jobs, Range, Share
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, load_cases, solutions_for_metric
 from safevar_sumo.questions.research_questions import changes
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 REMARKS: Columns = {"table": "table", "remark": "what is missing or left out there, and why"}
 
 
+@contents("cases", "solutions", "alpha", **{name: table.columns for name, table in TABLES.items()}, remarks=REMARKS)
 def tables(
     *results: Results | str | Path,
     algorithm: str = "",

@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
@@ -80,6 +80,11 @@ POINTS: Columns = {
     "first_point_lost": Column("", "value nearest to the original that loses a whole point", ".5g"),
     "least_points": Column("-", "fewest points anywhere in the domain", ".2f"),
 }
+OF_BOX = (
+    *("box", "samples", "failures", "at_most", "not_simulated"),
+    *("fits", "fits_tried", "attacked", "least_attacked"),
+)
+"""Numbers about the limits together."""
 NEAREST: Columns = {
     **CHARACTERISTIC,
     "limit": Column("", "the specified value", ".10g"),
@@ -88,6 +93,15 @@ NEAREST: Columns = {
 
 
 @question
+@contents(
+    *("unsafe", "margin", "kept", "scope", "boxes", *OF_BOX),
+    limits=LIMITS,
+    intervals=INTERVALS,
+    fits=FITS,
+    points=POINTS,
+    nearest=NEAREST,
+    wider=WIDER,
+)
 def tolerance(
     subject: Study | Case,
     evaluator: Evaluator,
@@ -181,19 +195,8 @@ def _numbers(
         "kept": not broken,
         "scope": scope_of(study, between=attack > 0),
     }
-    of_box = (
-        "box",
-        "samples",
-        "failures",
-        "at_most",
-        "not_simulated",
-        "fits",
-        "fits_tried",
-        "attacked",
-        "least_attacked",
-    )
     if together is None:
-        return {**numbers, **dict.fromkeys(of_box), "boxes": 0}
+        return {**numbers, **dict.fromkeys(OF_BOX), "boxes": 0}
     proof, found = together.proof, together.attack
     return {
         **numbers,
