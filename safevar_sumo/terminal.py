@@ -17,7 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress, called with the stage, the amount done in it, and its total; first with nothing done.
+"""A function that shows progress, called with the stage, the amount done in it, and its total, 0 where it is unknown;
+first with nothing done.
 """
 SECONDS_BETWEEN_LINES = 30.0
 """Interval of the lines that show progress without a terminal [s]."""
@@ -86,10 +87,11 @@ def show_within(progress: Progress, whole: str, stage: str, done: int, total: in
 
 
 class _Count(ProgressColumn):
-    """How much is done of a known total."""
+    """How much is done, and of what total."""
 
     def render(self, task: Task) -> Text:
-        return Text("" if task.total is None else f"{task.completed:.0f}/{task.total:.0f}")
+        total = "" if task.total is None else f"/{task.total:.0f}"
+        return Text(f"{task.completed:.0f}{total}")
 
 
 class _Pace(ProgressColumn):
@@ -128,9 +130,9 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal line
-        line = f"{stage}: {done} of {total}, "
+        line = f"{stage}: {done} of {total}, " if total else f"{stage}: {done}"
         pace.update(done, total)
-        bar.update(task, description=stage, completed=done, total=total)
+        bar.update(task, description=stage, completed=done, total=total or None)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:

@@ -86,6 +86,16 @@ class Proof(NamedTuple):
     not_simulated: int
 
 
+def proof_size(attempt: int, share: float) -> int:
+    """The number of settings of which none may be unsafe in a test, so that at most this share of all is."""
+    return math.ceil(math.log(_error_of(attempt)) / math.log1p(-share))
+
+
+def _error_of(attempt: int) -> float:
+    """The probability with which a test may be wrong."""
+    return float((1 - CONFIDENCE) * 0.5**attempt)
+
+
 def prove(
     draw: Callable[[int], FloatArray], judge: Callable[[FloatArray], Judgement], share: float, attempt: int
 ) -> tuple[Proof, FloatArray]:
@@ -102,8 +112,8 @@ def prove(
     """
     import scipy  # takes longer to load than a simulation
 
-    error = (1 - CONFIDENCE) / 2**attempt
-    settings = draw(math.ceil(math.log(error) / math.log1p(-share)))
+    error = _error_of(attempt)
+    settings = draw(proof_size(attempt, share))
     judgement = judge(settings)
     is_unsafe = judgement.unsafe & judgement.counted
     samples = int(np.count_nonzero(judgement.counted))

@@ -93,9 +93,10 @@ class Evaluator:
         self.progress = show_numbered
 
     @contextmanager
-    def stage(self, name: str, total: int) -> Iterator[Callable[[int], None]]:
+    def stage(self, name: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
         """Show all that is evaluated within the context, by evaluators of other studies, too, as one stage of about
-        `total` settings; the function that it yields takes a better estimate of how many are left.
+        `total` settings, None where that is open; the function that it yields takes a better estimate of how many are
+        left.
         """
         show = self.progress
         earlier = 0
@@ -110,13 +111,13 @@ class Evaluator:
             if not done:
                 earlier += under_way
                 under_way = of
-            show(name, earlier + done, max(total, earlier + of))
+            show(name, earlier + done, 0 if total is None else max(total, earlier + of))
 
         def expect(left: int) -> None:
             nonlocal total
             total = earlier + under_way + left
 
-        show(name, 0, total)
+        show(name, 0, total or 0)
         self.progress = show_part
         try:
             yield expect
@@ -288,7 +289,11 @@ class Evaluator:
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
-        return Evaluator(study, self._pool, self.progress, self._verified if verified is None else verified)
+        return Evaluator(study, self._pool, self._show, self._verified if verified is None else verified)
+
+    def _show(self, stage: str, done: int, total: int) -> None:
+        """Show the progress of another evaluator as part of this one's."""
+        self.progress(stage, done, total)
 
 
 def side_by_side(
@@ -347,14 +352,6 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
         max(0, math.ceil(math.log2(number)))
     )
     return np.asarray(points[:number])
-
-
-def proof_size(attempt: int, share: float) -> tuple[float, int]:
-    """The probability alpha / 2^k with which attempt k at a proof may be wrong, alpha = 1 - `CONFIDENCE`, and the
-    number of settings of which none may be unsafe, so that at most this share of all is.
-    """
-    error = (1 - CONFIDENCE) / 2**attempt
-    return error, math.ceil(math.log(error) / math.log1p(-share))
 
 
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:

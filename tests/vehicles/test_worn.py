@@ -200,7 +200,7 @@ def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumptio
     evaluator = Evaluator(load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}), InlinePool())
     columns = [list(evaluator.characteristics.names).index(name) for name in LIMITED]
     cells = []
-    for found in scan(evaluator, columns, Unsafe(keep=0.3), coarse=True):
+    for found in scan(evaluator, columns, Unsafe(keep=0.3)):
         item = found.characteristic
         end, worst = (ends[item.name in LATE] for ends in (found.safe or (0.0, 0.0), (item.lower, item.upper)))
         cells.append("whole" if end == worst else f"{end:.{LIMITED[item.name]}f}")

@@ -27,7 +27,7 @@ from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
 from safevar_sumo.questions.models import Models, fit_names, models_of
-from safevar_sumo.questions.repair.attack import find_failures, prove_change
+from safevar_sumo.questions.repair.attack import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE, find_failures, prove_change
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import Search
@@ -116,6 +116,7 @@ def repair(
         _check_file(Path(out), study)
     unsafe_today = Unsafe(keep=margin_of(study, margin), contact=contact_degree(assemble(study)))
     promised, parameters = Promise.of(study, evaluator.region, promise), parameters_of(study, change)
+    evaluator.plan(SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE)
     models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
@@ -188,7 +189,8 @@ def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> li
     search, proofs = Search(problems, vehicles), dict[bytes, Proof]()
     attacks, failed_proofs = 0, 0
     for _ in range(MAX_ROUNDS):
-        changes = search.smallest_changes()
+        with problems[0].evaluator.stage(SEARCH_STAGE):
+            changes = search.smallest_changes()
         unproved = [change for change in changes if change.tobytes() not in proofs]
         if not unproved:
             return [(change, proofs[change.tobytes()]) for change in changes]

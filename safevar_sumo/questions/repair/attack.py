@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from safevar_sumo.questions.attack import attack
-from safevar_sumo.questions.box import Judgement, Proof, prove
+from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.records import FloatArray
 
@@ -18,6 +18,7 @@ KNOWN = 256
 """Number of the worst known settings with which an attack begins; with each other fit an eighth."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
+SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = "search of a change", "attack on the change", "proof on fresh wear"
 Failures = dict[int, FloatArray]
 """Failures by the number of the problem, of one fit, in which they are, shape (M, n)."""
 
@@ -28,9 +29,10 @@ def find_failures(problems: Sequence[RepairProblem], change: FloatArray, known: 
     """
     own = problems[0]
     rng = np.random.default_rng((own.study.search.seed, number))
-    judges = [partial(problem.left, change, stage="attack") for problem in problems]
+    judges = [partial(problem.left, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
-    found = attack(own.promise, judges, starts, BUDGET, rng)
+    with own.evaluator.stage(ATTACK_STAGE, BUDGET):
+        found = attack(own.promise, judges, starts, BUDGET, rng)
     is_unsafe = found.left < 0
     numbers = np.unique(found.judges[is_unsafe]).tolist()
     return {row: np.unique(found.settings[is_unsafe & (found.judges == row)], axis=0) for row in numbers}
@@ -48,19 +50,21 @@ def prove_change(
     own, seed = problems[0], problems[0].study.search.seed
 
     def judge(settings: FloatArray) -> Judgement:
-        left = own.left(change, settings, "proof on fresh wear")
+        left = own.left(change, settings, PROOF_STAGE)
         return Judgement(left < 0, np.zeros(len(left), dtype=bool), np.isfinite(left))
 
     rng = np.random.default_rng((seed, 7, number))
-    proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)
-    failures = {0: unsafe} if len(unsafe) else {}
-    if failures or len(problems) == 1:
-        return proof, failures
-    settings = own.draw(proof.samples, rng)
-    fits = rng.integers(1, len(problems), size=len(settings))
-    for row in range(1, len(problems)):
-        of_fit = settings[fits == row]
-        is_unsafe = problems[row].left(change, of_fit, "proof on fresh wear") < 0
-        if is_unsafe.any():
-            failures[row] = of_fit[is_unsafe]
+    size = proof_size(attempt, MAX_UNSAFE_SHARE)
+    with own.evaluator.stage(PROOF_STAGE, size if len(problems) == 1 else 2 * size):
+        proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)
+        failures = {0: unsafe} if len(unsafe) else {}
+        if failures or len(problems) == 1:
+            return proof, failures
+        settings = own.draw(proof.samples, rng)
+        fits = rng.integers(1, len(problems), size=len(settings))
+        for row in range(1, len(problems)):
+            of_fit = settings[fits == row]
+            is_unsafe = problems[row].left(change, of_fit, PROOF_STAGE) < 0
+            if is_unsafe.any():
+                failures[row] = of_fit[is_unsafe]
     return proof, failures

@@ -22,12 +22,13 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, limit_criterion, models_of, with_points_between
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
-from safevar_sumo.questions.tolerance.alone import limits_alone
+from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, limits_alone
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
 from safevar_sumo.questions.tolerance.rows import limit_rows
-from safevar_sumo.questions.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, scan
-from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
-from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
+from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES, WHOLE_POINT_LOSS, OneAtATimeScan, scan
+from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
+from safevar_sumo.questions.tolerance.together import TEST_STAGE, LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE, wider_rows
 from safevar_sumo.questions.tolerance.words import verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray
@@ -140,6 +141,7 @@ def tolerance(
     """
     study = evaluator.study
     members = evaluator.characteristics
+    evaluator.plan(SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, TEST_STAGE, *([WIDER_STAGE] if study.wider else []))
     columns = _columns_of(members.vehicle.names, characteristics)
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -147,10 +149,13 @@ def tolerance(
     is_sought = not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
     if is_sought:
         _check_drawable(evaluator)
-    scans = scan(evaluator, columns, criterion)
+    with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(columns)):
+        scans = scan(evaluator, columns, criterion)
     is_safe = not criterion.of(original)[0]
     models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
-    alone = limits_alone(scans, columns, _denser(models, attack) if is_sought else models.members, attack)
+    judges = _denser(models, attack) if is_sought else models.members
+    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
+        alone = limits_alone(scans, columns, judges, attack)
     together = None
     if is_sought and is_safe:
         all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]

@@ -22,7 +22,7 @@ PARTS, ROUNDS = 8, 4
 """Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts."""
 ATTACKS, ATTACK_SHARE = 3, 0.1
 """Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each."""
-STAGE = "limits alone with each fit"
+ALONE_STAGE = "limits alone with each fit"
 
 
 class AloneLimit(NamedTuple):
@@ -70,7 +70,7 @@ class _Ends:
             values = safe + (unsafe - safe) * np.arange(1, PARTS + 1) / PARTS
             settings = np.tile(failure, (PARTS, 1))
             settings[:, self.column] = values
-            first = int(np.argmax([*model.are_unsafe(settings[:-1], STAGE), True]))
+            first = int(np.argmax([*model.are_unsafe(settings[:-1], ALONE_STAGE), True]))
             safe, unsafe = (safe if first == 0 else values[first - 1]), values[first]
         self.ends[side] = float(safe)
         beyond = failure.copy()
@@ -97,7 +97,7 @@ def limits_alone(
     encounters = np.concatenate([models[0].evaluator.characteristics.original[np.newaxis], encounters])
     for model in models:
         settings = [_settings_within(each, encounters) for each in ends]
-        lefts = np.split(model.left(np.concatenate(settings), STAGE), np.cumsum([*map(len, settings)])[:-1])
+        lefts = np.split(model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1])
         for each, rows, left in zip(ends, settings, lefts, strict=True):
             _move(each, model, rows[left < 0])
     if len(models[0].evaluator.characteristics.scenario) and budget:

@@ -18,14 +18,13 @@ from safevar_sumo.vehicles import Characteristic
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
 """Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
-COARSE_SCAN_VALUES = 26
-"""Their number with each further fit of the vehicle, which only moves the ends that the first scan found."""
 PARTS_PER_ROUND = 8
 """Number of parts into which a round divides each interval with a change of state."""
 ROUNDS, RATED_ROUNDS = 4, 1
 """Number of such rounds; fewer in a rated study."""
 WHOLE_POINT_LOSS = 1 - 1e-6
 """A loss of more rating points than this counts as a whole point."""
+SCAN_STAGE = "one characteristic at a time"
 POINT_ROUNDING = 1e-9
 """A loss of at most so many rating points is a rounding error."""
 
@@ -79,13 +78,10 @@ class OneAtATimeScan(NamedTuple):
         return min(values, key=lambda value: abs(value - original), default=math.nan)
 
 
-def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, *, coarse: bool = False) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, one at a time; `coarse` with fewer values, and as fine where the state
-    changes.
-    """
+def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, one at a time."""
     scanned = [evaluator.characteristics.members[column] for column in columns]
     number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
-    number = COARSE_SCAN_VALUES if coarse else number
     values = [np.union1d(np.linspace(item.lower, item.upper, number), item.original) for item in scanned]
     profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
@@ -116,7 +112,7 @@ def _evaluate_profiles(
     ends = np.cumsum(sizes)[:-1]
     settings = np.tile(evaluator.characteristics.original, (sum(sizes), 1))
     settings[np.arange(len(settings)), np.repeat(columns, sizes)] = np.concatenate(values)
-    evaluations = evaluator.evaluate_over_encounters(settings, "one characteristic at a time")
+    evaluations = evaluator.evaluate_over_encounters(settings, SCAN_STAGE)
     state = np.select(
         [evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
         ["infeasible", "not_simulated", "unsafe"],

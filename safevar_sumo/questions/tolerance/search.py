@@ -40,7 +40,7 @@ where the response is not monotone, the next one would lie beside them.
 """
 ROUNDING = 1e-9
 """Rounding errors of a setting, as a share of the domain."""
-STAGE = "limits together"
+SEARCH_STAGE = "search of the limits together"
 Step = Sequence[int]
 """A side of a box, below or above, and the column of its characteristic."""
 
@@ -185,7 +185,7 @@ class BoxSearch(BoxGeometry):
             rows = groups[waiting].reshape(-1, len(self.original))
             if not len(rows):
                 break
-            is_unsafe = model.are_unsafe(rows, STAGE)
+            is_unsafe = model.are_unsafe(rows, SEARCH_STAGE)
             if is_unsafe.any():
                 self.models.remove(model)
                 self.models.insert(0, model)

@@ -8,7 +8,7 @@ import numpy as np
 
 from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box
-from safevar_sumo.questions.tolerance.search import STAGE, BoxSearch, Step
+from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch, Step
 from safevar_sumo.records import FloatArray
 
 LEAST_MOVE = 1 / 50
@@ -82,7 +82,7 @@ class Settlement:
             return True
         beyond = [wider.lower.copy(), wider.upper.copy()]
         beyond[1 - side][column] = (box.lower, box.upper)[side][column]
-        judges = [partial(model.left, stage=STAGE) for model in search.models]
+        judges = [partial(model.left, stage=SEARCH_STAGE) for model in search.models]
         rng = np.random.default_rng((search.seed, 10, side, column))
         found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN_CORNERS]], SLAB_ATTACK, rng)
         search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.attack import Attack, attack
-from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
+from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models, with_points_between
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
-from safevar_sumo.questions.tolerance.search import BoxSearch
+from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
 from safevar_sumo.questions.tolerance.settlement import Settlement
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
@@ -25,7 +26,7 @@ KNOWN = 32
 """Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
 PROMISE_POINTS = 256
 """Number of Sobol points, and of corners, at which specified limits are tested, all others as in the original."""
-STAGE, ATTACK_STAGE = "test of the limits together", "attack on the limits together"
+TEST_STAGE = "test of the limits together"
 
 
 class LimitsTogether(NamedTuple):
@@ -94,17 +95,24 @@ class _Test(NamedTuple):
 
 
 class _BoxTest:
-    """The test of boxes: all corners with each fit, an attack over all fits, and settings drawn at random."""
+    """The test of boxes: all corners with each fit, an attack over all fits, and settings drawn at random. Progress is
+    shown by the evaluator of the question.
+    """
 
-    def __init__(self, models: Sequence[Model], budget: int) -> None:
-        self.models, self.budget = models, budget
+    def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
+        self.models, self.budget, self.evaluator = models, budget, evaluator
         self.seed = models[0].evaluator.study.search.seed
         self.tests = 0
 
     def of(self, box: Box, attempt: int) -> _Test:
-        """Test a box; the first stage that finds failures ends it."""
+        """Test a box; the first part that finds failures ends it."""
         corners = box.corners(self.seed, attempt)
-        lefts = [model.left(corners[:MAX_CORNERS], STAGE) for model in self.models]
+        of_fits = len(corners) + (len(self.models) - 1) * min(len(corners), MAX_CORNERS)
+        with self.evaluator.stage(TEST_STAGE, of_fits + self.budget + proof_size(self.tests + 1, MAX_UNSAFE_SHARE)):
+            return self._of(box, corners, attempt)
+
+    def _of(self, box: Box, corners: FloatArray, attempt: int) -> _Test:
+        lefts = [model.left(corners[:MAX_CORNERS], TEST_STAGE) for model in self.models]
         least = {
             model.fit: model.degree(float(left.min(initial=np.inf)))
             for model, left in zip(self.models, lefts, strict=True)
@@ -120,7 +128,7 @@ class _BoxTest:
         own = self.models[0]
         if not test.failures and len(corners) > MAX_CORNERS:  # corners of a study that searches its scenario
             others = corners[MAX_CORNERS:]
-            failures = _failures(own, others, own.left(others, STAGE))
+            failures = _failures(own, others, own.left(others, TEST_STAGE))
             test = test._replace(failures=[failures] if failures else [])
         return test if test.failures else self._prove(box, test, attempt)
 
@@ -133,7 +141,7 @@ class _BoxTest:
             judges.append(denser)
             left_out.append(number)
         rng = np.random.default_rng((self.seed, 4, attempt))
-        lefts: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=ATTACK_STAGE) for model in judges]
+        lefts: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TEST_STAGE) for model in judges]
         found = attack(box, lefts, worst, self.budget, rng)
         failures = [
             _failures(model, found.settings[found.judges == number], found.left[found.judges == number])
@@ -147,7 +155,7 @@ class _BoxTest:
         model = test.judges[0] if test.judges else own
 
         def judge(settings: FloatArray) -> Judgement:
-            evaluations = model.evaluate(settings, STAGE)
+            evaluations = model.evaluate(settings, TEST_STAGE)
             failed = ~evaluations.valid & ~evaluations.infeasible
             return Judgement(model.left_by(evaluations) < 0, failed, ~evaluations.infeasible)
 
@@ -160,7 +168,7 @@ class _BoxTest:
 def _failures(model: Model, settings: FloatArray, left: FloatArray) -> _Failures | None:
     """The settings that leave less than nothing, and the model at the points where they do; None if none does."""
     unsafe = settings[left < 0]
-    return _Failures(model.at_worst_points(unsafe, STAGE), unsafe) if len(unsafe) else None
+    return _Failures(model.at_worst_points(unsafe, TEST_STAGE), unsafe) if len(unsafe) else None
 
 
 def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
@@ -222,16 +230,18 @@ def find_limits_together(
     if own.fit in broken:
         return nothing
     start = _start(search, columns, scans)
-    test = _BoxTest(members, budget)
+    test = _BoxTest(members, budget, models.own.evaluator)
     for number in range(1, MAX_BOXES + 1):
-        sides = search.best(start)
+        with test.evaluator.stage(SEARCH_STAGE):
+            sides = search.best(start)
         if sides is None:
             return nothing._replace(boxes=number)
         box = search.printed(sides)
         found = test.of(box, number)
         if not found.failures:
             return _grown(nothing, search, test, box, found, number)
-        _learn(search, found)
+        with test.evaluator.stage(SEARCH_STAGE):
+            _learn(search, found)
     return nothing._replace(boxes=MAX_BOXES)
 
 
@@ -250,18 +260,20 @@ def _grown(
     grew fails its tests, the box itself.
     """
     settlement = Settlement(search)
-    wider = settlement.of(box)
+    with test.evaluator.stage(SEARCH_STAGE):
+        wider = settlement.of(box)
     for growth in range(1, MAX_GROWTHS + 1):
         volumes = [search.log_volume(search.sides_of(each)) for each in (box, wider)]
         if volumes[1] <= volumes[0]:
             break
         found_wider = test.of(wider, number + growth)
-        if found_wider.failures:
-            _learn(search, found_wider)
-            wider = settlement.cut(wider)
-        else:
-            box, found = wider, found_wider
-            wider = settlement.of(box)
+        with test.evaluator.stage(SEARCH_STAGE):
+            if found_wider.failures:
+                _learn(search, found_wider)
+                wider = settlement.cut(wider)
+            else:
+                box, found = wider, found_wider
+                wider = settlement.of(box)
     return _result(nothing, search, settlement, box, found, number)
 
 

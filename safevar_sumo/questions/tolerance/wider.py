@@ -22,6 +22,7 @@ from safevar_sumo.questions.words import encounter_in_words
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit, Study, load_study
 
+WIDER_STAGE = "attack in the wider scope"
 WIDER: Columns = {
     "study": "the wider study",
     "scope": Column("", "what it covers", is_shown=False),
@@ -70,8 +71,9 @@ def wider_rows(
     if together.box is None and not limits:
         return []
     box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
-    judges = [partial(model.left, stage="attack in the wider scope") for model in models.members]
-    found = attack(box, judges, [], budget, np.random.default_rng((study.search.seed, 9)))
+    judges = [partial(model.left, stage=WIDER_STAGE) for model in models.members]
+    with evaluator.stage(WIDER_STAGE, budget):
+        found = attack(box, judges, [], budget, np.random.default_rng((study.search.seed, 9)))
     is_kept = not (found.left < 0).any()
     return [
         (
