@@ -1,14 +1,12 @@
-"""Metrics by name: the safety metrics of method section 4, and metrics of comfort."""
+"""Measures by name: the safety metrics of method section 4, metrics of comfort, measures of change."""
 
 from safevar_sumo.metrics.base import (
     F_DIFF as F_DIFF,
     F_NUM_DIFF as F_NUM_DIFF,
     F_SAFE as F_SAFE,
-    Metric as Metric,
-    MetricFacts as MetricFacts,
-    Objective as Objective,
+    Measure as Measure,
     Scoring as Scoring,
-    checked_metric as checked_metric,
+    checked_measure as checked_measure,
 )
 from safevar_sumo.metrics.measures import (
     AVE_DECE,
@@ -27,8 +25,11 @@ from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
 OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE)}
 """Metrics that only the studies have that name them."""
-METRIC_OF_OBJECTIVE = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
-"""The metric that an objective uses, by the objective's name."""
+OBJECTIVES = {one.name: one for one in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
+    SAFETY_DEGREE_METRIC.name: F_SAFE,
+    "f_comfort": MAX_JERK,
+}
+"""What the objectives of a search may name besides metrics."""
 PUBLISHED_SCORING = Scoring(
     metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF)
 )

@@ -1,18 +1,18 @@
-"""Records of metrics, objectives and scorings, and functions that several metrics use."""
+"""The records of measures and scorings, and functions that several metrics use."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.plugins import Legal, UserCode, quoted
+from safevar_sumo.plugins import FINITE, Legal, UserCode, quoted
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, MetricsTable, unit_text
+from safevar_sumo.study import ORIGINAL_DEGREE, unit_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,18 +51,18 @@ def sum_in_order(samples: FloatArray) -> FloatArray:
     return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
 
 
-MetricName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
+MeasureName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
 TitleText = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
-MetricFunction = Callable[[SimulationRuns, MetricsTable], FloatArray]
 
 
-class MetricFacts(Struct, frozen=True, kw_only=True):
-    """Facts about a metric for tables and figures.
+class Measure(Struct, frozen=True, kw_only=True):
+    """A column of results: a metric of simulation runs, or a measure of change of settings. A search may minimise it,
+    or maximise it if larger values are more unsafe.
 
     Attributes
     ----------
     name
-        Name of the metric in a study, and of its column in results.
+        Name of the measure in a study, and of its column in results.
     title, unit
         Title and unit in tables.
     more_is_unsafe
@@ -72,39 +72,39 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
     description
         One sentence.
     head
-        Heading of the metric's column in tables, by default title and unit.
+        Heading of the measure's column in tables, by default title and unit.
+    of
+        What it measures: `runs` or `settings`.
+    function
+        Takes N simulation runs and thresholds, or filtered settings of shape (N, n) and the characteristics; returns
+        shape (N,), of runs NaN where it is undefined. Element i depends only on run or setting i, bit for bit. None
+        in results, and for columns that all results have.
     """
 
-    name: MetricName
+    name: MeasureName
     title: TitleText
     unit: TitleText
-    more_is_unsafe: bool
+    more_is_unsafe: bool = False
     over_collisions: bool = True
     description: str = ""
     head: str = ""
+    of: Literal["runs", "settings"] = "runs"
+    function: Any = None
 
     @property
     def heading(self) -> str:
         """`head`, by default title and unit."""
         return self.head or self.title + unit_text(self.unit, ", {}")
 
-
-class Metric(MetricFacts, frozen=True, kw_only=True):
-    """A metric: `function` takes N simulation runs and thresholds and returns an array of shape (N,), NaN where it is
-    undefined.
-
-    Element i depends only on run i, bit for bit.
-    """
-
-    function: MetricFunction
-
-    def __call__(self, runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-        return self.function(runs, thresholds)
+    @property
+    def sign(self) -> float:
+        """Factor on the values after which a search minimises them."""
+        return -1.0 if self.more_is_unsafe else 1.0
 
     @property
-    def facts(self) -> MetricFacts:
+    def facts(self) -> Measure:
         """The record without the function, for results."""
-        return MetricFacts(**{name: getattr(self, name) for name in MetricFacts.__struct_fields__})
+        return replace(self, function=None)
 
 
 def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
@@ -112,46 +112,26 @@ def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
 
-def checked_metric(code: UserCode) -> Metric:
-    """A user's metric, whose values are checked.
+def checked_measure(code: UserCode) -> Measure:
+    """A user's measure, whose values are checked.
 
     Raises
     ------
     InputError
-        If it is not a valid record of a metric.
+        If it is not a valid record of a measure.
     """
-    expected = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
-    metric = code.target
-    if not (isinstance(metric, Metric) and callable(metric.function)):
-        raise UserCodeError(code.source, f"{code.name} is {quoted(metric)}", expected, code.definition())
+    expected = "a safevar_sumo.metrics.Measure(name=..., title=..., unit=..., function=...)"
+    measure = code.target
+    if not (isinstance(measure, Measure) and callable(measure.function)):
+        raise UserCodeError(code.source, f"{code.name} is {quoted(measure)}", expected, code.definition())
     try:
-        facts = msgspec.convert(msgspec.to_builtins(metric.facts), MetricFacts)
+        facts = msgspec.convert(msgspec.to_builtins(measure.facts), Measure)
     except (msgspec.ValidationError, TypeError) as error:
         raise InputError(code.source, f"{code.name}: {error}", expected) from None
-    legal = Legal(undefined=True)
-    function = code.checked_function(metric.function, facts.name, legal, lambda runs: len(runs.outcome))
-    return Metric(**msgspec.structs.asdict(facts), function=function)
-
-
-class Objective(Struct, frozen=True, kw_only=True):
-    """A column of results that a search minimises, or maximises if `maximised`."""
-
-    name: str
-    title: str
-    unit: str
-    maximised: bool = False
-
-    @classmethod
-    def of(cls, metric: MetricFacts) -> Objective:
-        """The objective that makes a metric as unsafe as possible."""
-        if metric.name == SAFETY_DEGREE:
-            return F_SAFE
-        return cls(name=metric.name, title=metric.title, unit=metric.unit, maximised=metric.more_is_unsafe)
-
-    @property
-    def sign(self) -> float:
-        """Factor on the objective's values after which smaller values are better."""
-        return -1.0 if self.maximised else 1.0
+    is_of_runs = facts.of == "runs"
+    count = (lambda runs: len(runs.outcome)) if is_of_runs else len
+    legal = Legal(undefined=True) if is_of_runs else FINITE
+    return replace(facts, function=code.checked_function(measure.function, facts.name, legal, count))
 
 
 class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -161,8 +141,8 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
     `safe_original` in the same encounter [m].
     """
 
-    metrics: tuple[MetricFacts, ...]
-    objectives: tuple[Objective, ...]
+    metrics: tuple[Measure, ...]
+    objectives: tuple[Measure, ...]
     safe_original: float | None = None
 
     def violation(self, evaluations: Evaluations) -> FloatArray:
@@ -191,11 +171,11 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
         is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
         return np.asarray(evaluations.valid & is_defined & (self.violation(evaluations) == 0))
 
-    def metric(self, name: str) -> MetricFacts:
+    def metric(self, name: str) -> Measure:
         """A metric by name."""
         return next(metric for metric in self.metrics if metric.name == name)
 
 
-F_SAFE = Objective(name="f_safe", title="safety degree", unit="m, -m/s")
-F_DIFF = Objective(name="f_diff", title="largest change", unit="fraction")
-F_NUM_DIFF = Objective(name="f_num_diff", title="characteristics changed", unit="-")
+F_SAFE = Measure(name="f_safe", title="safety degree", unit="m, -m/s")
+F_DIFF = Measure(name="f_diff", title="largest change", unit="fraction", of="settings")
+F_NUM_DIFF = Measure(name="f_num_diff", title="characteristics changed", unit="-", of="settings")

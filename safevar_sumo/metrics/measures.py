@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, mask_collisions, sampling_stride, sum_in_order
+from safevar_sumo.metrics.base import Measure, mask_collisions, sampling_stride, sum_in_order
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, FloatArray, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
@@ -24,12 +24,11 @@ def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     return np.where(np.isnan(runs.collision_speed), least_separation, -runs.closing_speed)
 
 
-SAFETY_DEGREE_METRIC = Metric(
+SAFETY_DEGREE_METRIC = Measure(
     name=SAFETY_DEGREE,
     title="SD",
     unit="m, or -m/s",
     head="SD",
-    more_is_unsafe=False,
     function=safety_degree,
     description="Least separation during the encounter [m, > 0], or minus a collision's closing speed [m/s, < 0].",
 )
@@ -65,7 +64,7 @@ def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[Float
     return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step
 
 
-TET = Metric(
+TET = Measure(
     name="tet",
     title="TET",
     unit="s",
@@ -74,7 +73,7 @@ TET = Metric(
     function=time_exposed,
     description="TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].",
 )
-TIT = Metric(
+TIT = Measure(
     name="tit",
     title="TIT",
     unit="s^2",
@@ -101,11 +100,10 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     return np.asarray(np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0))
 
 
-AVE_DECE = Metric(
+AVE_DECE = Measure(
     name="ave_dece",
     title="aveDece",
     unit="m/s^2",
-    more_is_unsafe=False,
     function=average_deceleration,
     description="Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.",
 )
@@ -129,7 +127,7 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     return mask_collisions(runs, np.where(has_stopped, distance, np.nan))
 
 
-STOPPING_DISTANCE = Metric(
+STOPPING_DISTANCE = Measure(
     name="stopping_distance",
     title="stop",
     unit="m",
@@ -144,11 +142,10 @@ def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     return np.full(len(runs.outcome), np.nan)
 
 
-RATING_POINTS = Metric(
+RATING_POINTS = Measure(
     name="rating_points",
     title="points kept",
     unit="points",
-    more_is_unsafe=False,
     function=_undefined_points,
     description="Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are simulated.",
 )
@@ -232,7 +229,7 @@ def _step_count(time: float, step: float, largest_count: int) -> int:
     return max(1, min(round(time / step), largest_count))
 
 
-MAX_JERK = Metric(
+MAX_JERK = Measure(
     name="max_jerk",
     title="jerk",
     unit="m/s^3",
@@ -241,7 +238,7 @@ MAX_JERK = Metric(
     function=max_jerk,
     description="Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision.",
 )
-RMS_ACCELERATION = Metric(
+RMS_ACCELERATION = Measure(
     name="rms_acceleration",
     title="RMS a_w",
     unit="m/s^2",
@@ -252,7 +249,7 @@ RMS_ACCELERATION = Metric(
         "Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision."
     ),
 )
-BRAKE_HARSHNESS = Metric(
+BRAKE_HARSHNESS = Measure(
     name="brake_harshness",
     title="harshness",
     unit="m/s^2",

@@ -31,8 +31,8 @@ WARNING_TESTS = ("CPLA", "CBLA")
 """Tests in which a row with a choice of AEB or FCW is rated by the warning; in other tests the calculator always rates
 the impact.
 """
-MODELS = {"CCR": "car_to_car", "CMR": "car_to_car", "CPLA": "along", "CBLA": "along"}
-"""Scenario models by the prefix of a test's name; the model of all other tests is `crossing`."""
+MODELS = {"CCR": "car_to_car", "CMR": "car_to_car", "CPLA": "along", "CBLA": "along", "": "crossing"}
+"""Scenario models by the prefix of a test's name, the first one that fits."""
 REQUIRED, UNCHECKED = "CCRs at 10 and 20 km/h", "CPNA at 10 km/h and 75 %"
 """The cells that the protocol requires to be green, and those that the calculator does not check, in words."""
 TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
@@ -159,7 +159,7 @@ class Cell(NamedTuple):
     def scenario(self) -> tuple[str, Parameters, bool]:
         """The simulation of the cell: scenario model, parameters, and whether it is by night."""
         test = self.matrix.test_name
-        model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
+        model = next(model for prefix, model in MODELS.items() if test.startswith(prefix))
         parameters = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
         if self.impact_location is not None:
             parameters["impact_location"] = self.impact_location

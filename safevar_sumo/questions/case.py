@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError, describe_error
-from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
+from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
@@ -159,7 +159,7 @@ class Case:
         return remarks
 
 
-def solutions_for_metric(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
+def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFrame:
     """The solutions that count for a metric; for TET and TIT only those without collision (docs/method.md, section
     4).
     """

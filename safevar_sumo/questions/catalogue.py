@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from inspect import getdoc
 from typing import Any
 
 import msgspec
@@ -10,13 +11,22 @@ import pandas as pd
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import check_name
-from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
+from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS
+from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear, searchable_in
+from safevar_sumo.scenarios import (
+    SCENARIOS,
+    WEATHERS,
+    Scenario,
+    TrackScenario,
+    WorldScenario,
+    equals_clear,
+    searchable_in,
+)
 from safevar_sumo.search import DESCRIPTIONS
 from safevar_sumo.study import load_study, study_names, unit_text
-from safevar_sumo.vehicles import CHANGES, CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet
 
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
@@ -41,9 +51,8 @@ WEATHER: Columns = NAME | {
     "water": Column("mm", "depth of the water on the road"),
     "effect": "none: an ADS drives as in clear weather, unless its parameters differ",
 }
-OBJECTIVES: Mapping[str, object] = {
-    **{name: f"The search drives {metric.name} to unsafe values." for name, metric in METRIC_OF_OBJECTIVE.items()},
-    **{change.name: f"{change.title.capitalize()} [{change.unit}]." for change in CHANGES.values()},
+FURTHER_OBJECTIVES: Mapping[str, object] = {
+    **{name: f"{one.title.capitalize()} [{one.unit}]." for name, one in OBJECTIVES.items() if name not in METRICS},
     RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
 }
 FINDINGS: Columns = {
@@ -68,20 +77,26 @@ FINDINGS: Columns = {
     objectives=DESCRIBED,
 )
 def list_models(kind: str | None = None) -> Answer:
-    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with KIND only these."""
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with KIND only these, or
+    your own scenario, package.module:Name.
+    """
+    own = {}
+    if kind is not None and ":" in kind:
+        own[kind] = Lookup("list").class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario).target
+        kind = "scenarios"
     effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
     weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
     tables = {
         "studies": tabulate("Studies", STUDIES, _studies()),
         "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
         "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
-        "scenarios": tabulate("Scenarios", SCENARIO, _scenarios()),
+        "scenarios": tabulate("Scenarios", SCENARIO, _scenarios(own or SCENARIOS)),
         "weathers": tabulate("Weathers", WEATHER, weathers),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
         "metrics": tabulate(
             "Metrics", DESCRIBED, ((name, one.description) for name, one in {**METRICS, **OPTIONAL_METRICS}.items())
         ),
-        "objectives": tabulate("Objectives; every metric can be one, too", DESCRIBED, OBJECTIVES.items()),
+        "objectives": tabulate("Objectives; every metric can be one, too", DESCRIBED, FURTHER_OBJECTIVES.items()),
     }
     if kind is not None:
         check_name("kind", f"there is no {kind!r} to list", kind, tables)
@@ -106,12 +121,12 @@ def _characteristics() -> Iterator[tuple[Any, ...]]:
 
 def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """The first paragraph of each model's docstring."""
-    return ((name, " ".join((model.__doc__ or "").partition("\n\n")[0].split())) for name, model in models.items())
+    return ((name, " ".join((getdoc(model) or "").partition("\n\n")[0].split())) for name, model in models.items())
 
 
-def _scenarios() -> Iterator[tuple[str, ...]]:
-    for name, description in _described(SCENARIOS):
-        parameters = searchable_in(SCENARIOS[name]).items()
+def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]]:
+    for name, description in _described(models):
+        parameters = searchable_in(models[name]).items()
         domains = (f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in parameters)
         yield name, description, "; ".join(domains)
 

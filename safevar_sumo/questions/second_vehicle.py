@@ -178,28 +178,24 @@ class SecondState(NamedTuple):
 class SecondVehicle(Vehicle):
     """A vehicle of the second model for every setting of a study; the contract is `safevar_sumo.vehicles.Vehicle`.
 
-    The study's vehicle is a shipped one or derived from one.
-
     Attributes
     ----------
-    name
-        The shipped vehicle that the study's vehicle is.
     spinning
         The settings, as bytes, of the vehicles whose wheels spun in a simulation.
 
     Raises
     ------
     InputError
-        If the vehicle is no shipped one.
+        If the vehicle says by no `second_model` how it is represented.
     """
 
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
         self._vehicle, self.UNITS, self.spinning = vehicle, vehicle.UNITS, set[bytes]()
-        self.name = next((name for name, cls in VEHICLES.items() if isinstance(vehicle, cls)), "")
-        if not self.name:
+        if vehicle.second_model not in MAPPINGS:
             problem = f"vehicle.model = {study.vehicle.model!r} is no vehicle that the second model can represent"
             raise InputError(study.source, problem, f"one of {', '.join(MAPPINGS)}, or a class derived from one")
-        cls, (shipped, self._represent) = VEHICLES[self.name], MAPPINGS[self.name]
+        cls = VEHICLES[vehicle.second_model]
+        shipped, self._represent = MAPPINGS[vehicle.second_model]
         self._engine = cls(**{key: getattr(vehicle, key) for key in cls.__struct_fields__})
         rows = study.vehicle.characteristics.items()
         matching = {name: row.original for name, row in rows if cls.UNITS.get(name) == row.unit}
@@ -263,8 +259,9 @@ class SecondVehicle(Vehicle):
 
     def advance(self, prepared: Prepared, state: SecondState, command: Command) -> SecondState:
         plant, body, brake = prepared.plant, state.body, state.brake
-        if isinstance(self._engine, WornVehicle):
-            plant = plant._replace(friction=self._engine.friction(prepared.vehicle, state.speed))
+        friction = self._engine.friction(prepared.vehicle, state.speed)
+        if friction is not None:
+            plant = plant._replace(friction=friction)
         original, drive_torque = self._advance_engine(prepared, state, command.throttle)
         commands = state.brake_commands.extended(command.brake)
         demand = commands.delayed()

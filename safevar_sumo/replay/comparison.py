@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
-from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
+from safevar_sumo.metrics import METRICS, RATING_POINTS, Measure
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
@@ -81,7 +81,7 @@ class Comparison:
     evaluations: Evaluations
     runs: SimulationRuns
     tracks: Mapping[str, Film]
-    objectives: tuple[MetricFacts, ...] = ()
+    objectives: tuple[Measure, ...] = ()
     point: str = ""
 
     @property

@@ -57,17 +57,18 @@ Listener = Callable[[Observation], None]
 def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     """The metrics and objectives of settings that have been simulated in `runs`."""
     is_invalid = runs.outcome == Outcome.INVALID_TEST
+    metrics = dict[str, FloatArray]()
     with user_errors(system.source):
         try:
-            metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
+            for name, measure in system.measuring.measures.items():
+                if measure.of == "settings":
+                    metrics[name] = measure.function(settings, system.characteristics)
+                else:
+                    metrics[name] = np.where(is_invalid, np.nan, measure.function(runs, system.metrics_table))
         except InputError as error:
             if error.source == STUDY_SOURCE:
                 raise InputError(system.source, error.problem, error.legal) from None
             raise
-        if is_invalid.any():
-            metrics = {name: np.where(is_invalid, np.nan, values) for name, values in metrics.items()}
-        for name, change in system.measuring.changes.items():
-            metrics[name] = change.function(settings, system.characteristics)
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,

@@ -7,20 +7,21 @@ from typing import NamedTuple
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.metrics import (
-    METRIC_OF_OBJECTIVE,
+    F_DIFF,
+    F_NUM_DIFF,
+    F_SAFE,
     METRICS,
+    OBJECTIVES,
     OPTIONAL_METRICS,
     RATING_POINTS,
     STOPPING_DISTANCE,
-    Metric,
-    Objective,
+    Measure,
     Scoring,
-    checked_metric,
+    checked_measure,
 )
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
-from safevar_sumo.vehicles import CHANGES, Change, checked_change
 
 RESULT_COLUMNS = (
     "algorithm",
@@ -31,20 +32,19 @@ RESULT_COLUMNS = (
     "collision",
     "collision_speed",
     "setting",
-    "f_safe",
-    "f_diff",
-    "f_num_diff",
+    F_SAFE.name,
+    F_DIFF.name,
+    F_NUM_DIFF.name,
     ORIGINAL_DEGREE,
 )
-"""Names of result columns, which no characteristic or metric may use."""
+"""Names of result columns, which no characteristic or measure may use."""
 OBJECTIVES_KEY = "search.objectives"
 
 
 class Measuring(NamedTuple):
-    """Metrics and additional measures of change by column, and the objectives."""
+    """The measures that are computed, of runs before those of settings, by column; and the scoring."""
 
-    metrics: Mapping[str, Metric]
-    changes: Mapping[str, Change]
+    measures: Mapping[str, Measure]
     scoring: Scoring
 
 
@@ -54,47 +54,39 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     Raises
     ------
     InputError
-        If a metric or measure of change does not exist, is invalid, or has a name that is taken.
+        If a measure does not exist, is invalid, or has a name that is taken.
     """
-    further = [
-        metric for metric, is_meant in ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops)) if is_meant
-    ]
-    metrics = {**METRICS, **{metric.name: metric for metric in further}}
-    shipped: Mapping[str, Metric] = {**metrics, **OPTIONAL_METRICS}
-    changes, user_records = dict[str, Change](), dict[str, Metric | Change]()
+    further = ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops))
+    measures = {**METRICS, **{metric.name: metric for metric, is_meant in further if is_meant}}
+    shipped = {**measures, **OPTIONAL_METRICS}
+    own: dict[str, Measure] = {}
+    taken = {*RESULT_COLUMNS, *shipped, *study.domains}
 
-    def look_up(known: Mapping[str, Metric | Change], name: str, key: str) -> Metric | Change:
-        if name in user_records:
-            return user_records[name]
-        member = lookup.find(known, name, key)
-        record: Metric | Change = member.target
+    def look_up(name: str, key: str, known: Mapping[str, Measure]) -> Measure:
+        member = lookup.find({**known, **own}, name, key)
+        measure: Measure = member.target
         if member.code is not None:
-            is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
-            record = (checked_change if is_change else checked_metric)(member.code)
-            if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.domains):
-                raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
-            user_records[name] = user_records[record.name] = record
-            if isinstance(record, Change):
-                changes[record.name] = record
-        if isinstance(record, Metric):
-            metrics.setdefault(record.name, record)
-        return record
+            measure = own[name] = checked_measure(member.code)
+            if measure.name in taken:
+                raise InputError(
+                    lookup.source, f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name"
+                )
+            own[measure.name] = measure
+            taken.add(measure.name)
+        if measure.function is not None:
+            measures.setdefault(measure.name, measure)
+        return measure
 
     for name in study.metrics.also:
         if name in METRICS:
             problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
             raise InputError(lookup.source, problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
-        look_up(shipped, name, "metrics.also")
-    objectives = []
-    for name in study.search.objectives:
-        record = look_up({**shipped, **CHANGES, **METRIC_OF_OBJECTIVE}, name, OBJECTIVES_KEY)
-        if isinstance(record, Metric):
-            objectives.append(Objective.of(record))
-        else:
-            objectives.append(Objective(name=record.name, title=record.title, unit=record.unit))
+        if look_up(name, "metrics.also", shipped).of == "settings":
+            raise InputError(lookup.source, f"metrics.also = {name!r} measures settings", "a measure of runs")
+    objectives = [look_up(name, OBJECTIVES_KEY, {**shipped, **OBJECTIVES}).facts for name in study.search.objectives]
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"
-        raise InputError(lookup.source, problem, one_of([*METRICS, *OPTIONAL_METRICS, *CHANGES]))
-    scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
-    return Measuring(metrics, changes, scoring)
+        raise InputError(lookup.source, problem, one_of([*shipped, *OBJECTIVES]))
+    metrics = tuple(measure.facts for measure in measures.values() if measure.of == "runs")
+    return Measuring(measures, Scoring(metrics=metrics, objectives=tuple(objectives)))

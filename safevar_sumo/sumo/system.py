@@ -198,6 +198,7 @@ def _assemble(study: Study, source: str) -> System:
     matrix = _matrix_points(expand_protocol(study, weather), source)
     has_stops = any(one.brakes_fully for one in (scenario, *(point.scenario for point in matrix)))
     measuring = measuring_of(study, Lookup.of(study, source), has_stops=has_stops)
+    metrics = [metric.name for metric in measuring.scoring.metrics]
     tables_of_metrics = {
         "published": study.published,
         "repeatability": study.repeatability,
@@ -205,7 +206,7 @@ def _assemble(study: Study, source: str) -> System:
     }
     for key, table in tables_of_metrics.items():
         for name in table:
-            check_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
+            check_name(source, f"{key}.{name} is no metric", name, metrics)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network, f"{source}: {NETWORK_KEY}")
     if study.scenario.search:

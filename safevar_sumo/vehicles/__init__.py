@@ -18,11 +18,8 @@ from safevar_sumo.vehicles.base import (
 )
 from safevar_sumo.vehicles.carla import Carla as Carla
 from safevar_sumo.vehicles.characteristics import (
-    CHANGES as CHANGES,
-    Change as Change,
     Characteristic as Characteristic,
     CharacteristicSet as CharacteristicSet,
-    checked_change as checked_change,
 )
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of

@@ -208,6 +208,8 @@ class Vehicle:
         Highest speed at which the parameters were identified [m/s].
     remarks
         Remarks for the user.
+    second_model
+        Name of the shipped vehicle whose equations represent it in CommonRoad's multi-body model; "" for none.
     RETURNS
         What the methods of a user's class must return.
     """
@@ -227,6 +229,7 @@ class Vehicle:
     PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType({})
     FITTED_UP_TO: ClassVar[float] = np.inf
     remarks: Sequence[str] = ()
+    second_model: ClassVar[str] = ""
 
     @abstractmethod
     def prepare(
@@ -276,6 +279,10 @@ class Vehicle:
         """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None if they see
         everything at once.
         """
+        return None
+
+    def friction(self, prepared: Prepared, speed: FloatArray) -> FloatArray | None:
+        """The friction coefficient of tyres and road at speeds [m/s], shape (N,); None if it is the same at all."""
         return None
 
     def compile(self, *, only_load: bool = False) -> bool:

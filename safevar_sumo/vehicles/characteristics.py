@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -14,10 +14,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Struct
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.plugins import FINITE, UserCode, quoted
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, plain_values, unit_text
 
@@ -265,47 +263,3 @@ class CharacteristicSet:
             self.members[column].check(value, source, beyond=beyond)
             setting[column] = value
         return setting
-
-
-ChangeFunction = Callable[[FloatArray, CharacteristicSet], FloatArray]
-
-
-class Change(Struct, frozen=True, kw_only=True):
-    """A measure of change: `function` takes filtered settings, shape (N, n), and the characteristics; returns shape
-    (N,).
-    """
-
-    name: str
-    title: str
-    unit: str
-    function: ChangeFunction
-
-
-CHANGES = {
-    change.name: change
-    for change in (
-        Change(
-            name="f_diff",
-            title="largest change",
-            unit="fraction",
-            function=lambda settings, characteristics: characteristics.largest_change(settings),
-        ),
-        Change(
-            name="f_num_diff",
-            title="characteristics changed",
-            unit="-",
-            function=lambda settings, characteristics: characteristics.number_changed(settings),
-        ),
-    )
-}
-
-
-def checked_change(code: UserCode) -> Change:
-    """A user's measure of change, whose values are checked; raises an `InputError` if the record is wrong."""
-    change: Change = code.target
-    texts = [change.name, change.title, change.unit]
-    is_text = all(isinstance(text, str) and text.isprintable() for text in texts)
-    if not (is_text and change.name.isidentifier() and callable(change.function)):
-        expected = "printable texts, the name an identifier, and a function"
-        raise InputError(code.source, f"{code.name} is {quoted(change)}", expected)
-    return msgspec.structs.replace(change, function=code.checked_function(change.function, change.name, FINITE, len))

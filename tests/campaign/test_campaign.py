@@ -198,7 +198,6 @@ ENDS = {
     "sumo/recorded_world.py": ("RecordedWorld.enter", "RecordedWorld.step"),
     "sumo/bodies.py": ("Contacts.count",),
     "sumo/batch.py": ("_Log.write", "_Log.trace", "_Outcomes.judge", "_Outcomes.classify"),
-    "metrics/base.py": ("Metric.__call__",),
     "results/journal.py": ("Journal.append", "Journal.finish"),
     "results/store.py": ("evaluations_frame",),
     "results/manifest.py": ("write_whole",),

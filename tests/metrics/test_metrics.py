@@ -10,16 +10,7 @@ import pytest
 from scipy import signal
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import (
-    F_DIFF,
-    F_SAFE,
-    METRICS,
-    OPTIONAL_METRICS,
-    Objective,
-    Scoring,
-    Unsafe,
-    time_to_collision,
-)
+from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, OPTIONAL_METRICS, Measure, Scoring, Unsafe, time_to_collision
 from safevar_sumo.records import NO_CONTACT, Encounter, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
@@ -56,7 +47,7 @@ COARSE = MetricsTable(ttc_threshold=2.0, sampling_interval=0.2)
 
 
 def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS) -> float:
-    return float(METRICS[name](run, thresholds)[0])
+    return float(METRICS[name].function(run, thresholds)[0])
 
 
 def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_collision() -> None:
@@ -154,7 +145,7 @@ def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
 def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     """Without a simulation, a user's metric is undefined, and so is the safety degree."""
     failed = made_up_evaluations([np.nan, np.nan], outcome=np.full(2, "simulator-error"))
-    scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Objective(name="jerk", title="jerk", unit="m/s^3")))
+    scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Measure(name="jerk", title="jerk", unit="m/s^3")))
     assert scoring.valid(failed).tolist() == [False, False]
     assert np.isnan(scoring.values(failed)[:, 2]).all()
 
@@ -188,7 +179,7 @@ def comfort(name: str, speed: FloatArray, until: float = np.inf, collision_speed
     v = speed.reshape(len(speed), -1)
     active = np.broadcast_to((np.arange(len(v)) * SAMPLED <= until)[:, np.newaxis], v.shape)
     runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=active)
-    return OPTIONAL_METRICS[name](runs, THRESHOLDS)
+    return OPTIONAL_METRICS[name].function(runs, THRESHOLDS)
 
 
 def sampled(speed: Callable[[FloatArray], FloatArray], seconds: float = 6.0) -> FloatArray:

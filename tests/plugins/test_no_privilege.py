@@ -9,9 +9,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, Unsafe, time_to_collision
+from safevar_sumo.protocol.cells import MODELS
+from safevar_sumo.questions.opinion import judge_causes
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
@@ -33,7 +37,7 @@ def each(names: Iterable[str]) -> list[Any]:
     return [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in names]
 
 
-def copied(model: type, folder: Path) -> str:
+def copied(model: Any, folder: Path) -> str:
     """The name of a class in a copy of its source, in a user's folder."""
     source = Path(inspect.getfile(model)).read_text()
     (folder / f"copy_of_{model.__name__.lower()}.py").write_text(source)
@@ -103,7 +107,7 @@ def test_a_driving_system_in_a_users_file_is_the_same(name: str, in_tmp: Path) -
     assert_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("name", each(["nsga2", "rs"]))
+@pytest.mark.parametrize("name", each(ALGORITHMS))
 def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(name: str, in_tmp: Path) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""
     module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
@@ -114,3 +118,55 @@ def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(name:
         rows = load_runs(searched(load_study("smoke", search=search), in_tmp / f"results{number}")).solutions
         tables.append(rows.drop(columns=["algorithm", "handle"], errors="ignore").to_csv(index=False))
     assert tables[0] == tables[1]
+
+
+def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> None:
+    """A column has one name, so the copies have others."""
+    shipped = {**METRICS, **OPTIONAL_METRICS}
+    module, _, _ = copied(time_to_collision, in_tmp).partition(":")
+    lines = ["import msgspec", f"from {module} import *", "from safevar_sumo.metrics import Measure"]
+    lines.append("known = [one for one in list(globals().values()) if isinstance(one, Measure)]")
+    lines.append("globals().update({one.name: msgspec.structs.replace(one, name='own_' + one.name) for one in known})")
+    lines.append("def largest(settings, characteristics): return characteristics.largest_change(settings)")
+    lines.append("own_f_diff = Measure(name='own_f_diff', title='largest', unit='-', of='settings', function=largest)")
+    (in_tmp / "named.py").write_text("\n".join(lines))
+    own = [f"named:{name}" for name in shipped]
+    objectives = ["named:tit", "f_safe", "named:own_f_diff"]
+    system = assemble(
+        load_study("smoke", metrics={"also": [*OPTIONAL_METRICS, *own]}, search={"objectives": objectives})
+    )
+    found = evaluate(system, drawn(system, 8, 2))
+    for name in shipped:
+        np.testing.assert_array_equal(found.column(f"own_{name}"), found.column(name), err_msg=name)
+    np.testing.assert_array_equal(found.column("own_f_diff"), found.f_diff)
+    values = system.measuring.scoring.values(found)
+    np.testing.assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
+
+
+@pytest.mark.slow
+def test_a_rating_of_scenarios_in_a_users_file_is_the_same(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = load_study("euro_ncap_rating")
+    own = {prefix: copied(SCENARIOS[model], in_tmp) for prefix, model in MODELS.items()}
+    points = []
+    for models in (MODELS, own):
+        monkeypatch.setattr("safevar_sumo.protocol.cells.MODELS", models)
+        system = assemble(study)
+        points.append(evaluate(system, drawn(system, 2, 2)).column("rating_points"))
+    np.testing.assert_array_equal(*points)
+    assert points[0].max() > 0
+
+
+@pytest.mark.slow
+def test_a_second_opinion_on_models_in_a_users_file_is_the_same(in_tmp: Path) -> None:
+    ours = load_study(
+        "wear", matrix=None, scenario={"model": "crossing", "parameters": {"test": "CPFA", "speed": 40.0}}
+    )
+    scenario = msgspec.structs.replace(ours.scenario, model=copied(SCENARIOS["crossing"], in_tmp))
+    vehicle = msgspec.structs.replace(ours.vehicle, model=copied(VEHICLES["worn"], in_tmp))
+    theirs = msgspec.structs.replace(ours, scenario=scenario, vehicle=vehicle)
+    causes = pd.DataFrame(
+        {"solution": ["a"], "changes": [{"brakeTorque": 0.5}], "fraction": [0.5], "robust_share": [1.0]}
+    )
+    frames = [judge_causes(study, causes, Unsafe())[0] for study in (ours, theirs)]
+    assert frames[0]["opinion"].tolist() != ["outside"]
+    pd.testing.assert_frame_equal(*frames)

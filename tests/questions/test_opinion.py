@@ -129,7 +129,7 @@ def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float
 def test_every_characteristic_acts_or_is_outside(name: str) -> None:
     study = load_study(MAPPINGS[name][0])
     system, vehicle = assemble_both_systems(study)
-    assert vehicle.name == name
+    assert system.vehicle.second_model == name
     original = {one.name: one.original * ONE for one in system.characteristics}
 
     def constants(**changes: float) -> list[float]:

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
-from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.metrics import Measure
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, solutions_for_metric
 from safevar_sumo.questions.research_questions.fronts import (
     INDICATOR_TITLES,
@@ -286,7 +286,7 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
     return samples
 
 
-def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) -> pd.Series[float]:
+def _values(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.Series[float]:
     """A metric's defined values over the solutions that count for it; over runs, the mean of each run."""
     solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(subset=metric.name)
     values = solutions[metric.name].astype(float)
@@ -296,7 +296,7 @@ def _values(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) ->
     return values.groupby(solutions["run"]).agg(lambda sample: np.mean(sample.to_numpy()))
 
 
-def _originals(case: Case, algorithm: str, metric: MetricFacts, over_runs: bool) -> pd.Series[float]:
+def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.Series[float]:
     """The original vehicle's metric beside each of `_values`; in a study that searches its scenario, the safety degree
     in the same encounters, and undefined for other metrics.
     """
