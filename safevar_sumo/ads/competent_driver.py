@@ -29,9 +29,9 @@ class _Perceiving(NamedTuple):
         What every reference driver remembers.
     first_lateral, appeared_in_way
         Lateral position at which the driver first saw the obstacle [m], infinite before; whether this position is in
-        the way.
+        the way, and nobody had strayed from his before.
     stray_time
-        Time since the obstacle strayed from this position [s], negative before.
+        Time since an obstacle first strayed from this position [s], negative before.
     braking_time
         Time since a leader began to brake harder than `leader_braking` [s], negative before.
     first_gap
@@ -53,7 +53,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     up to 0.774 g. The danger is
 
     - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a standing car this is a
-      time headway of 2 s;
+      time headway of 2 s; a car that cuts in is a danger wherever the vehicle will meet it, also beside;
     - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
       by the letter the driver does not react while the leader brakes.
 
@@ -70,7 +70,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
         An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
-        position [m, s].
+        position [m, s]; one that a leader reveals when he leaves, the same time after the leader has.
     leader_braking
         Deceleration of a leader above which its braking is a danger [m/s^2], perceived `perception_time` after it
         begins; 5 by the letter of the regulation, 0.5 for any braking.
@@ -98,7 +98,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         is_same = seen.obstacle == memory.reaction.leader
         is_perceived, memory = self._perceive(seen, memory, is_same)
-        is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
+        is_in_way = is_perceived & (is_in_the_way(seen, self.corridor) | _cuts_in(seen))
         deceleration, reaction = self.watch_leader(seen, memory.reaction, is_in_way)
         brakes_now = deceleration > self.leader_braking + DECELERATION_ROUNDING
         begun = np.where(brakes_now, reaction.step, -1.0)  # it is seen a step after it began
@@ -133,16 +133,22 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         is_first_sight = is_sighted & ~(is_same & np.isfinite(memory.first_lateral))
         first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
         is_in_corridor = np.abs(lateral) <= self.corridor + seen.obstacle_width / 2
-        appeared_in_way = (memory.appeared_in_way & ~is_first_sight) | (is_first_sight & is_in_corridor)
+        appears_in_way = is_in_corridor & (memory.stray_time < 0)
+        appeared_in_way = np.where(is_first_sight, appears_in_way, memory.appeared_in_way)
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         strays_now = is_sighted & (deviation >= self.stray)
         new_stray_time = np.where(strays_now, 0.0, -1.0)
-        strayed_before = ~is_first_sight & (memory.stray_time >= 0)
-        stray_time = np.where(strayed_before, memory.stray_time + memory.reaction.step, new_stray_time)
+        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
         is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
         )
+
+
+def _cuts_in(seen: Observation) -> BoolArray:
+    """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than across it."""
+    moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
+    return np.isfinite(seen.gap) & (seen.gap > 0) & moves_inwards & (seen.obstacle_speed >= np.abs(seen.lateral_speed))
 
 
 def _following(seen: Observation, is_in_way: BoolArray, first_gap: FloatArray) -> FloatArray:

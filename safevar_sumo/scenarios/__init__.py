@@ -19,6 +19,7 @@ from safevar_sumo.scenarios.base import (
     WorldScenario as WorldScenario,
 )
 from safevar_sumo.scenarios.crossing import Crossing
+from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.stop import Stop
 from safevar_sumo.scenarios.tracks import Track as Track, TrackScenario as TrackScenario, travelled as travelled
@@ -30,6 +31,8 @@ SCENARIOS: Mapping[str, type[Scenario]] = {
     "along": Along,
     "car_to_car": CarToCar,
     "crossing": Crossing,
+    "cut_in": CutIn,
+    "cut_out": CutOut,
     "lead_vehicle_stopped": LeadVehicleStopped,
     "stop": Stop,
 }

@@ -32,8 +32,6 @@ from safevar_sumo.scenarios.euro_ncap import (
 from safevar_sumo.scenarios.tracks import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Track, first_in_strip, travelled
 from safevar_sumo.study import searched
 
-FINAL_SPEED = 2.0
-"""Speed at which the braking target stops braking [km/h]."""
 STEADY_SPEED_LIMIT = 80.0
 """Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower.
 """
@@ -170,8 +168,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         width].
     headway
         Gap at the start divided by the vehicle's speed [s].
-    brakes_at, target_deceleration
-        Time at which the target of CCRb and CMRb begins to brake, and its deceleration, down to 2 km/h [s, m/s^2].
+    brakes_at, target_deceleration, final_speed
+        Time at which the target of CCRb and CMRb begins to brake, its deceleration, and the speed at which it stops
+        braking [s, m/s^2, km/h].
     heading
         Rotation of a standing target around the middle of its rear, counterclockwise seen from above [degrees].
     time_after
@@ -198,8 +197,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     ) = None
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
     target_deceleration: Annotated[
-        float, Meta(gt=0, le=12), searched(0.5, 9.0, "m/s^2", "deceleration of the target")
+        float, Meta(gt=0, le=12), searched(0.5, 10.0, "m/s^2", "deceleration of the target")
     ] = 4.0
+    final_speed: Annotated[float, Meta(ge=0, le=150)] = 2.0
     heading: Heading = 0.0
     time_after: Seconds = 5.0
 
@@ -246,7 +246,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         first_speed, brakes_at, deceleration = self._target_speed, self.brakes_at, self.target_deceleration
         if not self._target_brakes:
             return lambda time: first_speed
-        last_speed = np.minimum(first_speed, FINAL_SPEED * KMH)
+        last_speed = np.minimum(first_speed, self.final_speed * KMH)
         return lambda time: np.maximum(first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed)
 
     @np.errstate(all="ignore")  # of the speeds that do not count

@@ -313,6 +313,9 @@ class Scenario:
         """Changes to the network's traffic."""
         return {}
 
+    def check(self) -> None:
+        """Refuse parameters of a study's test, by an `InputError`; those of searched encounters are not checked."""
+
     def remarks(self) -> list[str]:
         """Remarks for the user on the scenario's parameters."""
         return []
@@ -385,6 +388,7 @@ class PreCrash(StrEnum):
     PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
     CYCLIST = "pedalcyclist crash without prior vehicle manoeuvre"
     STRAIGHT_PATHS = "straight crossing paths at non-signalised junctions"
+    CUT_IN = "vehicle changing lanes, same direction"
     LEAD_STOPPED = "lead vehicle stopped"
     LEAD_SLOWER = "lead vehicle moving at lower constant speed"
     LEAD_DECELERATING = "lead vehicle decelerating"
@@ -395,6 +399,7 @@ OBSTACLES: Mapping[str, str] = {
     PreCrash.PEDESTRIAN: "a pedestrian",
     PreCrash.CYCLIST: "a cyclist",
     PreCrash.STRAIGHT_PATHS: "a crossing vehicle",
+    PreCrash.CUT_IN: "a car that cuts in",
     PreCrash.LEAD_STOPPED: "a standing vehicle",
     PreCrash.LEAD_SLOWER: "a slower vehicle ahead",
     PreCrash.LEAD_DECELERATING: "a braking vehicle ahead",

@@ -43,6 +43,8 @@ MAX_LENGTH = 100.0
 """Largest size of a vehicle [m]."""
 PERSONS = ("adult", "child")
 """Kinds of bodies that are persons in SUMO; all others are vehicles."""
+DEPARTURE = "vehicle[@id='vut']"
+"""Where a network's traffic says how the vehicle under test departs."""
 SCREEN = "screen"
 """Kind of a body that only hides others: it is neither hit nor in SUMO."""
 
@@ -205,5 +207,5 @@ class TrackScenario(Scenario):
         """The vehicle under test, at its speed."""
         return {
             "vType[@id='vut']": {"length": as_text(self.vut_length), "width": as_text(self.vut_width)},
-            "vehicle[@id='vut']": {"departSpeed": as_text(self.start_speed)},
+            DEPARTURE: {"departSpeed": as_text(self.start_speed)},
         }

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import TOUCH_OVERLAP, BoolArray, Contact, FloatArray, IntArray, Quantity
+from safevar_sumo.records import TOUCH_OVERLAP, ZERO, BoolArray, Contact, FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
 from safevar_sumo.scenarios.base import NETWORK_KEY, Frame, ScenarioMemory, World as ScenariosWorld
 from safevar_sumo.scenarios.tracks import corners_of
@@ -28,18 +28,28 @@ class Motion(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its direction, a unit vector."""
+    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its direction, a unit vector,
+    `drift` its speed to the left of it.
+    """
 
     middle: FloatArray
     along: FloatArray
     length: Any
     width: Any
     speed: Any
+    drift: Any = ZERO
 
     @classmethod
     def behind(cls, front: FloatArray, along: FloatArray, length: Any, width: Any, speed: FloatArray | float) -> Body:
         """The body whose front's middle is at `front`, or M such bodies."""
-        return cls(front - along * (np.asarray(length)[..., np.newaxis] / 2), along, length, width, speed)
+        middle = front - along * (np.asarray(length)[..., np.newaxis] / 2)
+        return cls(middle, along, length, width, speed, np.zeros_like(speed))
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
+        left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
+        return np.asarray(self.along * self.speed[:, np.newaxis] + left * np.asarray(self.drift)[..., np.newaxis])
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
@@ -229,7 +239,7 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     smaller overlap.
     """
     axes, extent, distance = _along_axes(own, other)
-    speed = _dot(own.along * own.speed[:, np.newaxis] - other.along * other.speed[:, np.newaxis], axes)
+    speed = _dot(own.velocity - other.velocity, axes)
     overlap, closing_speed = extent - np.abs(distance), np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
     ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)

@@ -128,7 +128,9 @@ class Stage:
             )
             at_arrival = np.abs(self._row(body.track.y) + self._row(body.vy) * arrival)
             comes = (one.closing > 0) & (at_arrival < self.width / 2 + self._row(body.half_width))
-            is_in_way = self._row(body.is_in_path) | comes
+            # A leader at the vehicle's speed who makes way is nobody to brake for.
+            leaves = (np.sign(self._row(body.track.y)) * self._row(body.vy) > 0) & (one.closing <= APPROACH_SPEED)
+            is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
             rank = (
                 one.gap + OFF_THE_WAY * ~is_in_way + HIDDEN * ~one.visible + PASSED * one.is_passed + NOT_MET * ~counts
             )
@@ -182,10 +184,12 @@ class Stage:
 
     def _body(self, number: int, vehicles: IntArray) -> Body:
         """A body at this sample, as the given vehicles meet it."""
-        length, width, x, y, along, left, speed = (
-            np.broadcast_to(self._row(column), self.n)[vehicles] for column in self._bodies[number].track[2:]
+        body = self._bodies[number]
+        length, width, x, y, along, left, speed, vy = (
+            np.broadcast_to(self._row(column), self.n)[vehicles] for column in (*body.track[2:], body.vy)
         )
-        return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed)
+        drift = vy if body.faces_along else np.zeros_like(vy)
+        return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed, drift)
 
     def encounter(self, trace: Trace) -> Encounter:
         """The distance to the nearest body that still counts, and how fast it shrinks, at all samples of a trace whose

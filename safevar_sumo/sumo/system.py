@@ -209,6 +209,9 @@ def _assemble(study: Study, source: str) -> System:
             check_name(source, f"{key}.{name} is no metric", name, metrics)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network, f"{source}: {NETWORK_KEY}")
+    if not study.scenario.search:
+        for one in (point.scenario for point in matrix or (Point(scenario, weather),)):
+            one.check()
     if study.scenario.search:
         points = matrix or (Point(scenario, weather),)
         check_domains(study, points, source)

@@ -135,7 +135,7 @@ def test_what_a_class_does_not_declare_is_refused(
 def test_the_list_of_scenarios_has_what_their_classes_declare() -> None:
     rows = {row["name"]: row for row in json_of("list", "scenarios", "--json")["tables"]["scenarios"]["rows"]}
     assert {*rows} == {*SCENARIOS}
-    assert "target_deceleration 0.5 to 9 m/s^2" in str(rows["car_to_car"])
+    assert "target_deceleration 0.5 to 10 m/s^2" in str(rows["car_to_car"])
 
 
 BODY = """from safevar_sumo.scenarios import Track

@@ -1,0 +1,191 @@
+"""A car from the next lane cuts in; a leader cuts out and reveals a standing car (UN R157, annex 4, appendix 3).
+
+The lateral movement is as the regulation draws it: at a constant speed from one lane's middle to the other's, with
+bodies that stay parallel to the lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios.ahead import HEADWAYS, LANE_WIDTH, VEHICLE_SPEED, next_lane
+from safevar_sumo.scenarios.base import Grade, PreCrash, Roads, Scenario, XmlChanges
+from safevar_sumo.scenarios.euro_ncap import Seconds
+from safevar_sumo.scenarios.tracks import (
+    BODIES,
+    DEPARTURE,
+    KMH,
+    VUT_LENGTH,
+    VUT_WIDTH,
+    BodySize,
+    Track,
+    TrackScenario,
+    travelled,
+)
+from safevar_sumo.study import searched
+
+CAR = BodySize(BODIES["car"].length, 1.9)
+"""Size of the other cars [m]: as wide as the regulation's."""
+BEGINS_AT = 1.0
+"""Time at which the lateral movement begins [s]: until then a driver sees where the car drives."""
+MotorwaySpeed = Annotated[float, Meta(gt=0, le=130), VEHICLE_SPEED]
+"""Speed of the vehicle under test [km/h], up to that of the regulation's 01 series."""
+Gap = Annotated[float, Meta(gt=0, le=500), searched(5.0, 120.0, "m", "gap when the lateral movement begins")]
+LateralSpeed = Annotated[float, Meta(gt=0, le=5), searched(0.5, 3.0, "m/s", "speed of the lateral movement")]
+
+
+class LaneChange(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of both scenarios: a car changes the lane, `side` of the vehicle's."""
+
+    speed: MotorwaySpeed = 80.0
+    gap: Gap = 40.0
+    lateral_speed: LateralSpeed = 1.0
+    side: Literal["left", "right"] = "left"
+    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
+    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
+    network: str = "two_lanes"
+
+    @property
+    def test_speed(self) -> Any:
+        """Speed that the vehicle holds until its driving system acts [m/s]."""
+        return self.start_speed
+
+    def actors(self, roads: Roads) -> XmlChanges:
+        """The vehicle under test, with the next lane at the side where it is needed."""
+        lane = {"departLane": "0" if self.side == "left" else "1"}
+        changes = super().actors(roads)
+        return {**changes, DEPARTURE: {**(changes[DEPARTURE] or {}), **lane}}
+
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
+        """A car stays in the next lane."""
+        return next_lane(self.speed, HEADWAYS, self.vut_length, self.vut_width)
+
+    def moved(self, times: FloatArray) -> Any:
+        """Distance that the car has moved sideways [m]."""
+        return np.minimum(self.lateral_speed * np.maximum(times - BEGINS_AT, 0.0), LANE_WIDTH)
+
+    @property
+    def sign(self) -> float:
+        """1 if the next lane is to the left, -1 if it is to the right."""
+        return 1.0 if self.side == "left" else -1.0
+
+
+class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A car in the next lane moves into the vehicle's lane, and may brake there.
+
+    Parameters
+    ----------
+    speed, target_speed
+        Speeds of the vehicle under test and of the other car at the start [km/h].
+    gap
+        Distance of the other car's rear ahead of the vehicle's front when it begins to move sideways [m].
+    lateral_speed
+        Speed at which it moves sideways, 3.5 m from lane's middle to lane's middle [m/s].
+    side
+        The side that it comes from.
+    target_deceleration
+        Deceleration from the middle of the lane on, down to a stop [m/s^2].
+    duration
+        Length of a run [s].
+    vut_length, vut_width
+        Size of the vehicle under test [m].
+    grade
+        Rise of the road over its length, negative downhill [%].
+
+    Notes
+    -----
+    Only contacts of the vehicle's front are collisions: a car that drives its flank or rear corner into the vehicle's
+    side is listed.
+    """
+
+    target_speed: Annotated[
+        float, Meta(ge=0, le=130), searched(10.0, 130.0, "km/h", "speed of the car that cuts in")
+    ] = 60.0
+    target_deceleration: Annotated[
+        float, Meta(ge=0, le=12), searched(0.0, 10.0, "m/s^2", "deceleration of the car once it is in the lane")
+    ] = 0.0
+    duration: Seconds = 30.0
+    pre_crash = PreCrash.CUT_IN
+
+    def check(self) -> None:
+        """Refuse a car that is beside the vehicle before any of it is in the vehicle's lane."""
+        enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
+        left = self.gap - (self.speed - self.target_speed) * KMH * enters_after
+        if left <= 0:
+            problem = f"gap = {self.gap:g} m is closed before the car is in the lane, after {enters_after:.2f} s"
+            raise InputError("scenario.parameters", problem, f"a gap above {self.gap - left:.4g} m")
+
+    def tracks(self, times: FloatArray) -> list[Track]:
+        """The car that cuts in."""
+        first_speed = self.target_speed * KMH
+        arrives = BEGINS_AT + LANE_WIDTH / self.lateral_speed
+        speed = np.maximum(first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0)
+        ahead = self.gap + (self.start_speed - first_speed) * BEGINS_AT
+        x = ahead + CAR.length / 2 + travelled(speed, times)
+        y = self.sign * (LANE_WIDTH - self.moved(times))
+        return [Track("target", "car", *CAR, x, y, 1.0, 0.0, speed)]
+
+
+class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A leader at the vehicle's speed leaves the lane and reveals a standing car.
+
+    Parameters
+    ----------
+    speed
+        Speed of both at the start [km/h].
+    headway
+        Gap to the leader divided by the speed [s].
+    gap
+        Distance of the standing car's rear ahead of the leader's front when the leader begins to move sideways [m].
+    lateral_speed
+        Speed at which the leader moves sideways, 3.5 m from lane's middle to lane's middle [m/s].
+    side
+        The side to which the leader leaves.
+    time_after
+        Time from the impact, if nobody brakes, to the end of the run [s].
+    vut_length, vut_width
+        Size of the vehicle under test [m].
+    grade
+        Rise of the road over its length, negative downhill [%].
+
+    Notes
+    -----
+    The standing car is hidden until no line from the sensors to its middle is blocked.
+    """
+
+    gap: Gap = 80.0
+    headway: Annotated[
+        float, Meta(gt=0, le=60), searched(0.5, 4.0, "s", "headway, gap to the leader divided by the speed")
+    ] = 2.0
+    time_after: Seconds = 10.0
+    pre_crash = PreCrash.LEAD_STOPPED
+
+    @property
+    def duration(self) -> Any:
+        """Length of a run [s]."""
+        return BEGINS_AT + self.headway + (CAR.length + self.gap) / self.start_speed + self.time_after
+
+    def tracks(self, times: FloatArray) -> list[Track]:
+        """The leader and the standing car.
+
+        Raises
+        ------
+        InputError
+            If the leader is too slow sideways to get past the standing car.
+        """
+        speed, apart = self.start_speed, self.gap / self.start_speed * self.lateral_speed
+        if np.any(apart < CAR.width):
+            problem = f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the standing car"
+            raise InputError("scenario.parameters", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")
+        front = self.headway * speed + CAR.length
+        x = front - CAR.length / 2 + speed * times
+        leader = Track("leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed)
+        standing = front + speed * BEGINS_AT + self.gap + CAR.length / 2
+        return [leader, Track.of("target", "car", standing, 0.0, size=CAR)]

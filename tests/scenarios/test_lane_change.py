@@ -1,0 +1,275 @@
+"""Cut-in, cut-out and following of UN R157: who moves how, and its driver by a second implementation of the rule."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import pytest
+
+from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import SimulationRuns
+from safevar_sumo.scenarios.ahead import CarToCar
+from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.batch import drive
+from safevar_sumo.sumo.lane_world import LaneWorld
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.stage import Stage
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
+from safevar_sumo.vehicles import Vehicle, calibration_drive
+from safevar_sumo.vehicles.base import SumoType
+from tests.scenarios.holding import Hold, at_contact, driven
+
+WEAR = assemble(load_study("wear", matrix=None))
+ORIGINAL = WEAR.characteristics.original[np.newaxis]
+LENGTH, WIDTH = 4.7, 1.85
+BODY: dict[str, Any] = {"vut_length": LENGTH, "vut_width": WIDTH}
+PATH = (WIDTH + CAR.width) / 2
+STEP = 0.05
+HARDEST, JERK, LETS_GO = 0.774 * 9.81, 12.65, 0.4
+
+
+class Rolling(NamedTuple):
+    speed: Any
+    throttle: Any
+    brake: Any
+    gear: Any
+
+
+class Ideal(Vehicle):
+    """A vehicle without drag or lag: the pedals are accelerations of up to 3 and 9.9 m/s^2."""
+
+    UNITS: ClassVar[dict[str, str]] = {}
+
+    def prepare(self, characteristics: Any, road_friction: Any, step: float, *_: Any) -> Any:
+        return step, len(next(iter(characteristics.values())))
+
+    def sumo_type(self, prepared: Any) -> SumoType:
+        return SumoType(*(np.full(prepared[1], value) for value in (1500.0, 3.0, 9.9, 70.0, 1e-3)))
+
+    def at_rest(self, prepared: Any) -> Rolling:
+        return Rolling(*np.zeros((4, prepared[1])))
+
+    def at_speed(self, prepared: Any, speed: Any) -> Rolling:
+        return Rolling(speed, *np.zeros((3, prepared[1])))
+
+    def sense(self, prepared: Any, state: Any, seen: Any) -> Any:
+        return seen, state
+
+    def advance(self, prepared: Any, state: Any, command: Any) -> Rolling:
+        speed = np.maximum(state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0], 0.0)
+        return Rolling(speed, command.throttle, command.brake, state.gear)
+
+
+def by_the_driver(scenario: Any) -> SimulationRuns:
+    """Runs of N encounters, whose parameters are arrays, with an ideal vehicle and the competent driver."""
+    n, vehicle = N, Ideal()
+    nominal = calibration_drive(vehicle, WEAR.characteristics)
+    system = replace(WEAR, vehicle=vehicle, ads=CompetentDriver(), nominal=nominal, scenario=scenario)
+    samples = round(float(np.max(scenario.duration)) / STEP) + 1
+    stage = Stage([scenario], n, 1, n_samples=samples, step=STEP)
+    settings = np.tile(WEAR.characteristics.original, (n, 1))
+    return drive(system, settings, LaneWorld(stage, np.zeros(n) + scenario.start_speed, STEP), stage)
+
+
+class Rule(NamedTuple):
+    """What the regulation's driver does: whether he hits the car with his front, at which closing speed [m/s], his
+    least gap in the path [m]; and whether the car is ahead of his front when it enters the path, if he held his speed.
+    """
+
+    hits: Any
+    speed: Any
+    least: Any
+    is_ahead: Any
+
+
+def rule(v: Any, gap: Any, u: Any, beside: Any, perceived: Any, deceleration: Any = 0.0, arrives: Any = np.inf) -> Rule:
+    """The rule, integrated in fine steps: perceived at a time, a danger at a TTC below 2 s, 0.75 s later the brake
+    rises at 12.65 m/s^3 to 0.774 g; meanwhile the accelerator is released.
+
+    `gap` and `u` are those at time 0, `beside` is how long the other car stays beside the path [s].
+    """
+    n, step = len(v), 0.005
+    speed, left, danger, braking = v + np.zeros(n), gap + np.zeros(n), np.full(n, np.nan), np.zeros(n)
+    hits, impact, least = np.zeros(n, dtype=bool), np.zeros(n), np.full(n, np.inf)
+    for time in np.arange(0.0, 30.0, step):
+        other = np.maximum(u - deceleration * np.maximum(time - arrives, 0.0), 0.0)
+        closing = speed - other
+        is_in_path = time >= beside
+        is_near = (left > 0) & (left < 2.0 * closing)
+        danger = np.where(np.isnan(danger) & (time >= perceived) & is_near, time, danger)
+        is_braking = time >= danger + 0.75
+        braking = np.where(is_braking, np.minimum(np.maximum(braking, LETS_GO) + JERK * step, HARDEST), braking)
+        slowing = np.where(is_braking, braking, np.where(time >= danger, LETS_GO, 0.0))
+        after = np.maximum(speed - slowing * step, np.minimum(other, speed))
+        then = left + (other - (speed + after) / 2) * step
+        touches = is_in_path & (left > 0) & (then <= 0) & ~hits
+        impact = np.where(touches, after - other, impact)
+        hits |= touches
+        least = np.where(is_in_path & (then > -LENGTH - CAR.length), np.minimum(least, then), least)
+        speed, left = after, then
+    return Rule(hits, impact, least, gap - (v - u) * beside > 0)
+
+
+def agreement(runs: SimulationRuns, expected: Rule) -> tuple[Any, Any]:
+    """Where outcomes are equal; and by how much the driver brakes later than the rule [m], of whom a step of 0.05 s is
+    his own: from gaps, and of two collisions from what their speeds need to be braked off.
+    """
+    hits = runs.outcome == "collision"
+    closing = runs.collision_speed - runs.contact.speed
+    is_in_path = runs.trace.active & (np.abs(runs.trace.lateral) < PATH)
+    gap = np.where(is_in_path, runs.trace.gap, np.inf).min(axis=0)
+    braked_off = (closing * closing - expected.speed * expected.speed) / (2 * HARDEST)
+    with np.errstate(invalid="ignore"):  # nobody is ever in the path
+        late = np.nan_to_num(np.where(hits, braked_off, expected.least - gap))
+    return hits == expected.hits, late
+
+
+N = 1000
+RANDOM = np.random.default_rng(7)
+
+
+def draw(low: float, high: float) -> Any:
+    return low + RANDOM.random(N) * (high - low)
+
+
+def assert_near(same: Any, late: Any, closing: Any) -> None:
+    """98 % are equal; gaps are within 0.5 m of the rule's, and what a step of the simulation costs."""
+    assert same.mean() >= 0.98
+    assert np.mean(np.abs(late) < 0.5 + closing * STEP) >= 0.98
+
+
+@pytest.mark.slow
+def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
+    """Ahead and beside: he brakes for a car that he will be beside, too."""
+    v = draw(40.0, 130.0)
+    scenario = CutIn(
+        speed=v,
+        target_speed=np.maximum(v - draw(10.0, 60.0), 10.0),
+        gap=draw(3.0, 60.0),
+        lateral_speed=draw(0.5, 1.8),
+        **BODY,
+    )
+    beside = (3.5 - PATH) / scenario.lateral_speed
+    perceived = 0.375 / scenario.lateral_speed + 0.4
+    expected = rule(v / 3.6, scenario.gap, scenario.target_speed / 3.6, beside, perceived)
+    same, late = agreement(by_the_driver(scenario), expected)
+    is_ahead, closing = expected.is_ahead, (v - scenario.target_speed) / 3.6
+    assert 0.1 < expected.hits.mean() < 0.9
+    assert_near(same[is_ahead], late[is_ahead & same], closing[is_ahead & same])
+    assert same[~is_ahead].mean() >= 0.98
+
+
+@pytest.mark.slow
+def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
+    """At the regulation's headway of 2 s."""
+    v, lateral_speed = draw(20.0, 130.0), draw(0.5, 1.8)
+    gap = v / 3.6 * CAR.width / lateral_speed * draw(1.0, 2.0)
+    scenario = CutOut(speed=v, headway=2.0, gap=gap, lateral_speed=lateral_speed, **BODY)
+    perceived = np.maximum(0.375 / lateral_speed + 0.4, CAR.width / 2 / lateral_speed)
+    expected = rule(v / 3.6, 2.0 * v / 3.6 + CAR.length + gap, 0.0, 0.0, perceived)
+    same, late = agreement(by_the_driver(scenario), expected)
+    assert 0.1 < expected.hits.mean() < 0.9
+    assert_near(same, late[same], v[same] / 3.6)
+
+
+def test_a_cut_in_moves_as_it_says() -> None:
+    """Gap, place and speed when it begins, when it is in the lane and when it has stopped, from either side."""
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        one = CutIn(speed=90.0, target_speed=72.0, gap=30.0, lateral_speed=1.75, target_deceleration=5.0, side=side)
+        (car,) = one.tracks(np.array([[0.0], [1.0], [2.0], [3.0], [5.0], [7.0], [9.0]]))
+        rear = car.x[:, 0] - CAR.length / 2
+        assert rear[1] - 25.0 == pytest.approx(30.0)
+        assert (car.y[:, 0] * sign).tolist() == pytest.approx([3.5, 3.5, 1.75, 0.0, 0.0, 0.0, 0.0])
+        assert car.speed[:, 0].tolist() == pytest.approx([20.0, 20.0, 20.0, 20.0, 10.0, 0.0, 0.0])
+        assert rear[-1] - rear[1] == pytest.approx(2 * 20.0 + 20.0**2 / (2 * 5.0))
+
+
+def test_a_cut_out_hides_the_standing_car_until_the_leader_is_aside() -> None:
+    """The line of sight leads along the lane, so the leader hides it until he is half his width off his way."""
+    one = CutOut(speed=72.0, headway=1.0, gap=60.0, lateral_speed=1.0, **BODY)
+    run = driven(one, Hold(), system=WEAR)
+    gap = run.trace.gap[:, 0]
+    assert gap[20] == pytest.approx(20.0)
+    shown = int(np.argmax(np.diff(gap) > 10)) + 1
+    assert run.trace.time[shown] == pytest.approx(1.0 + CAR.width / 2, abs=2 * STEP)
+    assert gap[shown] == pytest.approx(20.0 + CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0))
+    impact = 1.0 + (20.0 + CAR.length + 60.0) / 20.0
+    assert at_contact(run, run.trace.time) == pytest.approx(impact)
+
+
+def test_whose_collision_it_is() -> None:
+    """At 80 against 60 km/h and 1 m/s the car is in the path after 1.63 s, when a gap of 9.03 m is closed: from then on
+    the vehicle drives into its rear; before, the car drives its flank into the vehicle's side, and that is listed only.
+    """
+    border = (20.0 / 3.6) * (3.5 - PATH)
+    for gap, side, outcome in ((border - 0.3, "left", "passed"), (border + 0.3, "front", "collision")):
+        run = driven(CutIn(speed=80.0, target_speed=60.0, gap=gap, **BODY), Hold(), system=WEAR)
+        assert (run.contact.side[0], run.outcome[0]) == (side, outcome)
+    mirrored = driven(CutIn(speed=80.0, target_speed=60.0, gap=border - 0.3, side="right", **BODY), Hold(), system=WEAR)
+    assert mirrored.contact.side[0] == "right"
+
+
+REFUSED = {
+    "closed": ("cut_in", {"speed": 130.0, "target_speed": 30.0, "gap": 10.0}, r"gap = 10 m is closed before"),
+    "fast": ("cut_in", {"target_speed": 140.0}, "target_speed = 140"),
+    "through": ("cut_out", {"speed": 100.0, "gap": 20.0}, r"0\.72 m sideways when he drives through"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_refused_in_two_lines(name: str) -> None:
+    model, parameters, message = REFUSED[name]
+    scenario = {"model": model, "parameters": parameters}
+    with pytest.raises(InputError, match=message) as caught:
+        simulate(assemble(load_study("wear", matrix=None, scenario=scenario)), ORIGINAL)
+    assert len(str(caught.value).splitlines()) == 2
+
+
+SCRIPT = """
+def step(traci, vehicle_id):
+    leader = traci.vehicle.getLeader(vehicle_id, 100)
+    if leader and leader[1] < 30:
+        traci.vehicle.slowDown(vehicle_id, 8, 1.0)
+"""
+FOLLOWING = {"test": "CCRb", "speed": 80.0, "headway": 2.0, "target_deceleration": 7.0, "final_speed": 0.0}
+ENCOUNTERS = (
+    ("cut_in", {"gap": 25.0}),
+    ("cut_in", {"gap": 8.0, "side": "right"}),
+    ("cut_out", {}),
+    ("car_to_car", FOLLOWING),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ads", ["aeb", "idm", "acc", "script:step"])
+@pytest.mark.parametrize(("model", "parameters"), ENCOUNTERS)
+def test_whoever_drives_the_actors_are_where_sumo_has_them(
+    model: str, parameters: dict[str, Any], ads: str, in_tmp: Path
+) -> None:
+    """The test's speed is held until the driving system acts, be it an AEB, one that drives itself or a script."""
+    (in_tmp / "script.py").write_text(SCRIPT)
+    scenario = {"model": model, "parameters": BODY | parameters}
+    driver = {"model": ads, "parameters": {}, "kind": "traci" if ":" in ads else ""}
+    system = assemble(load_study("wear", matrix=None, scenario=scenario, ads=driver))
+    vehicles = np.stack([system.characteristics.original, system.characteristics.lower])
+    run = simulate(system, vehicles)
+    assert not verify_in_sumo(system, vehicles)
+    assert (run.trace.speed[0] == system.points[0].scenario.test_speed).all()
+    assert (np.abs(run.test_speed_error) < 0.1).all()
+    acts = (np.abs(np.diff(run.trace.speed, axis=0)) > 0.01).any(axis=0)
+    assert acts.any()
+
+
+def test_a_leader_brakes_down_to_a_stop() -> None:
+    """R157's following: the leader's way to a stop is v^2 / (2 b), and the run lasts until he stands."""
+    one = CarToCar(test="CCRb", speed=72.0, headway=2.0, target_deceleration=8.0, final_speed=0.0)
+    run = driven(one, Hold(), system=WEAR)
+    impact = at_contact(run, run.trace.time)
+    assert impact == pytest.approx((40.0 + 60.0 + 20.0**2 / 16.0) / 20.0)
+    assert one.duration >= 3.0 + 20.0 / 8.0
