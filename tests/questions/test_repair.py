@@ -19,9 +19,9 @@ from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
-from safevar_sumo.questions.repair import attack, smallest, write_repair
+from safevar_sumo.questions.repair import attack, full_braking, smallest, write_repair
 from safevar_sumo.questions.repair.price import benign_scenes
-from safevar_sumo.questions.repair.problem import Parameter, RepairProblem
+from safevar_sumo.questions.repair.problem import Parameter, Promise, RepairProblem
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
@@ -258,7 +258,29 @@ def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_d
     assert any(key.startswith("ads.parameters.") for key in study.spread)
     with open_evaluator(study, InlinePool()) as evaluator:
         problem: Any = RepairProblem(evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3))  # type: ignore[arg-type]
-        assert problem.best_driver.evaluate(evaluator.characteristics.original[np.newaxis], "").f_safe[0] > 0.3
+        assert (
+            problem.best_driver.evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "").f_safe[0] > 0.3
+        )
+
+
+def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(full_braking, "LEAST_SETTINGS", 1)
+    with open_evaluator(sv.load_study("wear"), InlinePool()) as evaluator:
+        problem = RepairProblem(
+            evaluator=evaluator,
+            promise=Promise.of(evaluator.study, evaluator.region, ["all"]),
+            parameters=[],
+            unsafe=Unsafe(keep=0.3),
+        )
+        settings = problem.promise.draw(20, np.random.default_rng(1))
+        driver = problem.best_driver
+        assert driver is not None
+        is_safe = full_braking.degrees_of(driver.evaluator.evaluate(settings, "")) >= problem.margin
+        assert 0 < np.count_nonzero(is_safe) < len(settings)
+        for rows in (np.arange(20), np.flatnonzero(~is_safe)):  # the second time the hardest points are known
+            assert (driver.saves(settings[rows]) == is_safe[rows]).all()
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:

@@ -221,7 +221,7 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     """
     if not len(failures) or problem.best_driver is None:
         return []
-    driver, unsafe = problem.best_driver, Unsafe(problem.margin)
+    driver, unsafe = problem.best_driver.evaluator, Unsafe(problem.margin)
     chosen = failures[np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)]
     causes = [cause for group in find_minimal_causes(driver, chosen, unsafe) for cause in group]
     limits: dict[tuple[object, ...], dict[str, float]] = {}

@@ -20,6 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
 from safevar_sumo.questions.preventability import approach_parameters
+from safevar_sumo.questions.repair.full_braking import FullBraking, degrees_of
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
@@ -222,7 +223,7 @@ class RepairProblem:
         """
         values = self.values(np.repeat(shares, len(settings), axis=0))
         evaluations = self._evaluate(values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays)
-        return _degrees_of(evaluations).reshape(len(shares), len(settings)), evaluations.worst_points
+        return degrees_of(evaluations).reshape(len(shares), len(settings)), evaluations.worst_points
 
     def degrees_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
         """Safety degrees of settings with one set of parameters, shape (L,)."""
@@ -268,13 +269,15 @@ class RepairProblem:
         return np.concatenate([original[np.newaxis], settings[self.promise.holds(settings)]])
 
     @cached_property
-    def best_driver(self) -> Evaluator | None:
+    def best_driver(self) -> FullBraking | None:
         """Full braking at the first possible moment; None where it has no approach (`approach_parameters`)."""
         approach = approach_parameters(assemble(self.study))
         if approach is None:
             return None
         ads = ModelTable(model="full_braking", parameters=approach)
-        return self.evaluator.for_study(replace_in(self.study, ads=ads, spread={}), verified=0)
+        return FullBraking(
+            self.evaluator.for_study(replace_in(self.study, ads=ads, spread={}), verified=0), self.margin
+        )
 
     def repairable(self, settings: FloatArray) -> BoolArray:
         """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe; all without
@@ -282,13 +285,7 @@ class RepairProblem:
         """
         if self.best_driver is None:
             return np.ones(len(settings), dtype=bool)
-        is_safe = _degrees_of(self.best_driver.evaluate(settings, "full braking")) >= self.margin
+        is_safe = self.best_driver.saves(settings)
         unsafe = np.flatnonzero(~is_safe)
         is_safe[unsafe] = self.degrees_with(self.today, settings[unsafe], "full braking") >= self.margin
         return is_safe
-
-
-def _degrees_of(evaluations: Evaluations) -> FloatArray:
-    """Safety degrees [m, or -m/s], shape (M,); infinite without a conflict, minus infinity without a valid result."""
-    degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
-    return np.where(evaluations.valid, degrees, -np.inf)

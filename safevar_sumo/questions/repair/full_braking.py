@@ -1,0 +1,50 @@
+"""Which vehicles full braking at the first possible moment keeps safe: of many points, the hardest are asked first."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.sumo.system import assemble
+
+HARDEST = (2, 8)
+"""Numbers of the hardest points that are asked first, and then; all others follow."""
+LEAST_SETTINGS = 128
+"""Number of settings from which on the points are asked one after another: fewer cost no more than the steps of a
+simulation.
+"""
+STAGE = "full braking"
+
+
+class FullBraking:
+    """Full braking at the first possible moment, whose safety degrees have to be at least `margin` at every point.
+
+    Who is not safe at one point need not drive at the others; so those points come first at which most others were not.
+    """
+
+    def __init__(self, evaluator: Evaluator, margin: float) -> None:
+        self.evaluator, self._margin = evaluator, margin
+        self._failures = np.zeros(len(assemble(evaluator.study).points))
+        """How many vehicles were least safe, and not safe, at each point."""
+
+    def saves(self, settings: FloatArray) -> BoolArray:
+        """Which settings are safe, shape (M,)."""
+        has_encounters = len(self.evaluator.characteristics.scenario) > 0
+        if has_encounters or len(self._failures) <= HARDEST[-1] or len(settings) < LEAST_SETTINGS:
+            return degrees_of(self.evaluator.evaluate(settings, STAGE)) >= self._margin
+        is_safe = self.evaluator.region.feasible(settings)
+        for points in np.split(np.argsort(-self._failures, kind="stable"), HARDEST):
+            rows, selection = np.flatnonzero(is_safe), Selection(points=tuple(points.tolist()))
+            evaluations = self.evaluator.evaluate_selection(settings[rows], selection, STAGE)
+            is_safe[rows] = degrees_of(evaluations) >= self._margin
+            if evaluations.worst_points is not None:
+                np.add.at(self._failures, points[evaluations.worst_points[~is_safe[rows]]], 1)
+        return is_safe
+
+
+def degrees_of(evaluations: Evaluations) -> FloatArray:
+    """Safety degrees [m, or -m/s], shape (M,); infinite without a conflict, minus infinity without a valid result."""
+    degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
+    return np.where(evaluations.valid, degrees, -np.inf)
