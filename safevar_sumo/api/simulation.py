@@ -25,7 +25,7 @@ from safevar_sumo.records import (
     finite_or_none,
 )
 from safevar_sumo.results import record
-from safevar_sumo.scenarios import Scenario, distance_in_words
+from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study as read_study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -114,7 +114,6 @@ class Simulation:
     evaluation: Evaluations
     runs: SimulationRuns
     scoring: Scoring
-    _scenario: Scenario
     _observations: Sequence[Observation]
     no_verdict: str
     reset_values: Mapping[str, float] = field(default_factory=dict)
@@ -168,14 +167,9 @@ class Simulation:
         return trace_frame(self.runs, self._observations)
 
     @property
-    def _contact(self) -> float:
-        """The safety degree at which bodies touch [m]."""
-        return self.runs.middles_apart if self._scenario.centre_to_centre else 0.0
-
-    @property
     def gap(self) -> float:
         """The least distance between bodies during the encounter [m]; 0 on a collision, NaN without an encounter."""
-        return float(self.evaluation.gaps(self._contact)[0])
+        return float(self.evaluation.gaps(self.runs.middles_apart)[0])
 
     @property
     def numbers(self) -> JsonObject:
@@ -191,7 +185,7 @@ class Simulation:
         safety_degree = self.metrics[SAFETY_DEGREE]
         if self.outcome is Outcome.COLLISION:
             return f"collides at {-safety_degree:.2f} m/s"
-        distance = distance_in_words(safety_degree, self._contact)
+        distance = distance_in_words(safety_degree, self.runs.middles_apart)
         return OUTCOME_VERBS[self.outcome] + (
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
         )
@@ -313,6 +307,5 @@ def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict:
         runs=runs,
         scoring=system.measuring.scoring,
         no_verdict=no_verdict,
-        _scenario=system_at_point.points[0].scenario,
         _observations=observations,
     )

@@ -35,7 +35,6 @@ from safevar_sumo.results import CHOICES
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import System
 
 ALGORITHMS: Columns = {
@@ -199,7 +198,7 @@ def _verdict(results: Results, system: System) -> str:
     if failures.empty:
         return counts
     fewest = failures.iloc[0]
-    ending = ending_in_words(fewest["outcome"], fewest["f_safe"], contact_degree(system))
+    ending = ending_in_words(fewest["outcome"], fewest["f_safe"], system.contact)
     if system.rater:
         ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
     changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})

@@ -19,7 +19,7 @@ from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.scenarios import searchable_in
 from safevar_sumo.study import MatrixTest, Study
-from safevar_sumo.sumo.matrix import contact_degree, simulate_all_points
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def limit_criterion(
     is by default that of the study; `SEARCHED_MARGIN` in one that searches its scenario, whose originals keep more.
     """
     study = evaluator.study
-    criterion = replace(evaluator.choose_criterion(unsafe, subject, original), contact=contact_degree(assemble(study)))
+    criterion = replace(evaluator.choose_criterion(unsafe, subject, original), contact=assemble(study).contact)
     # A collision that is asked for stands alone.
     if criterion.below is not None or criterion.points is not None or (margin is None and unsafe is not None):
         return criterion

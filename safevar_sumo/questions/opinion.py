@@ -34,7 +34,7 @@ from safevar_sumo.questions.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.questions.words import ending_in_words, join_phrases, number_of
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import contact_degree, evaluate
+from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 
@@ -155,7 +155,7 @@ def _drive_both(
     system: System, second_system: System, causes: Sequence[dict[Any, Any]], unsafe: Unsafe
 ) -> tuple[pd.DataFrame, _Runs]:
     """Simulate the original vehicle and the causes with both models: a frame with `SETTING_COLUMNS`, and the runs."""
-    characteristics, contact = system.characteristics, contact_degree(system)
+    characteristics, contact = system.characteristics, system.contact
     values = [{}, *(cause["changes"] | cause.get("encounter", {}) for cause in causes)]
     settings = np.stack([characteristics.setting(one, "cause", beyond=True) for one in values])
     originals = characteristics.with_original_vehicle(settings)

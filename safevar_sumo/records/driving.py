@@ -265,9 +265,11 @@ class SimulationRuns:
 
     @property
     def middles_apart(self) -> float:
-        """How far the middles of bodies that touch are apart, in a scenario that measures from centre to centre [m]."""
-        differences = self.encounter.separation - np.broadcast_to(self.trace.gap, self.encounter.separation.shape)
-        return round(float(differences[np.isfinite(differences)][0]), LENGTH_DECIMALS)
+        """How far the middles of bodies that touch are apart [m], in a scenario that measures from centre to centre: it
+        states the obstacle's length; else 0.
+        """
+        length = float(np.max(self.trace.obstacle_length))
+        return round((self.trace.vehicle_length + length) / 2, LENGTH_DECIMALS) if length else 0.0
 
     @property
     def closing_speed(self) -> FloatArray:

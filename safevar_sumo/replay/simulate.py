@@ -31,7 +31,7 @@ from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_ha
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import at_point, contact_degree, point_record, simulate_all_points, vehicle_remarks
+from safevar_sumo.sumo.matrix import at_point, point_record, simulate_all_points, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -267,7 +267,7 @@ def _sweep(study: Study, system: System, requested: FloatArray, names: list[str]
     characteristics = system.characteristics
     settings = characteristics.filter(requested) if filtered else requested
     evaluations = evaluate_settings(study, np.concatenate([characteristics.original[np.newaxis], settings]))
-    contact, no_verdict = contact_degree(system), why_no_verdict(system)
+    contact, no_verdict = system.contact, why_no_verdict(system)
     frame = pd.DataFrame(settings, columns=list(characteristics.names))[names]
     columns = {item.name: Column(item.unit, "value", "g") for item in characteristics if item.name in names}
     columns["outcome"] = Column("", "how the simulation ends")

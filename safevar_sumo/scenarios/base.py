@@ -166,8 +166,9 @@ class World(Protocol):
 class Scene(NamedTuple):
     """The obstacle relative to N vehicles; arrays of shape (N,); see `Observation` for the quantities.
 
-    `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded. A scenario that
-    measures from centre to centre states the obstacle's length [m].
+    `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded. A scenario
+    whose
+    `centre_to_centre` is true states the obstacle's length [m].
     """
 
     gap: FloatArray

@@ -59,7 +59,7 @@ def point_record(result: PointResult) -> JsonObject:
         "impact_speed": evaluations.collision_speed[0],
         "relative_impact_speed": runs.relative_speed[0],
         SAFETY_DEGREE: evaluations.f_safe[0],
-        "gap": evaluations.gaps(runs.middles_apart if result.point.scenario.centre_to_centre else 0.0)[0],
+        "gap": evaluations.gaps(runs.middles_apart)[0],
         "test_speed_error": test_speed_error / KMH,
         "warning_ttc": warning_ttc,
         **{name: values[0] for name, values in evaluations.metrics.items() if name == STOPPING_DISTANCE.name},
@@ -183,17 +183,6 @@ def simulate_all_points(system: System, settings: FloatArray, engine: Engine = E
     return [by_name[point.name] for point in system.points]
 
 
-def contact_degree(system: System) -> float:
-    """The safety degree at which bodies touch [m]: 0, or half of both lengths where a scenario measures from centre to
-    centre.
-    """
-    point = system.points[0]
-    if not point.scenario.centre_to_centre:
-        return 0.0
-    runs = drive_all(system.at(point), system.characteristics.original[np.newaxis], Engine.RECORDED)
-    return runs.middles_apart
-
-
 def simulate_groups(
     system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
 ) -> Iterator[list[PointResult]]:
@@ -243,20 +232,16 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
     """
     groups: dict[Hashable, list[Point]] = {}
     for point in system.points:
-        groups.setdefault(_batch_key(point), []).append(point)
+        one = point.scenario
+        key: Hashable = point.name
+        if isinstance(one, TrackScenario):
+            n_bodies = len(one.tracks(np.zeros((1, 1))))
+            key = one.vut_length, one.vut_width, one.sensor_setback, n_bodies, one.network
+        groups.setdefault(key, []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), size):
             yield tuple(group[start : start + size])
-
-
-def _batch_key(point: Point) -> Hashable:
-    """Points with the same key may share a batch."""
-    scenario = point.scenario
-    if not isinstance(scenario, TrackScenario):
-        return point.name
-    n_bodies = len(scenario.tracks(np.zeros((1, 1))))
-    return scenario.vut_length, scenario.vut_width, scenario.sensor_setback, n_bodies, scenario.network
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from threading import RLock
@@ -21,13 +22,24 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, TrackScenario, WorldScenario, equals_clear, weather_of
+from safevar_sumo.scenarios import (
+    SCENARIOS,
+    VUT,
+    Point,
+    Scenario,
+    TrackScenario,
+    WorldScenario,
+    equals_clear,
+    weather_of,
+)
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
+from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
+from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
-from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
+from safevar_sumo.sumo.network import NETWORK_KEY, copied_network, is_network, is_shipped, stage_networks
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
@@ -86,6 +98,11 @@ class System:
     def step(self) -> float:
         """Time step of the simulations [s]."""
         return self.scenes.step_of(self.points[0].scenario)
+
+    @cached_property
+    def contact(self) -> float:
+        """The safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre."""
+        return _contact_of(self.points[0].scenario, self.scenes)
 
     def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
         """The system at the encounters of N settings, shape (N, n): its only point, with arrays as the parameters that
@@ -242,17 +259,27 @@ def _assemble(study: Study, source: str) -> System:
     )
 
 
+def _contact_of(scenario: Scenario, scenes: Scenes) -> float:
+    """The safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre."""
+    if not scenario.centre_to_centre:
+        return 0.0
+    assert isinstance(scenario, WorldScenario)
+    (recording,) = scenes.of([scenario])
+    with ExitStack() as stack:
+        world: SceneWorld
+        if isinstance(recording, str):
+            (network,) = stage_networks([scenario])
+            world = stack.enter_context(open_world(copied_network(network, 1), 1, scenes.step))
+            world.enter(None)
+        else:
+            world = RecordedWorld(recording, 1)
+        scene, _ = scenario.observe(world, world.step_length, world.begin(scenario))
+        return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
+
+
 def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scenario: Scenario) -> Measuring:
     """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
-    limit = study.scenario.margin
-    if scenario.centre_to_centre:
-        assert isinstance(scenario, WorldScenario)
-        (scene,) = scenes.of([scenario])
-        if isinstance(scene, str):
-            raise InputError(study.source, f"scenario.search: {scene}", "a shipped scenario on its own network")
-        world = RecordedWorld(scene, 1)
-        first, _ = scenario.observe(world, world.step_length, world.begin(scenario))
-        limit += (scene.length + float(first.obstacle_length)) / 2
+    limit = study.scenario.margin + _contact_of(scenario, scenes)
     return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
 
 

@@ -56,7 +56,6 @@ from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.words import counted_in_words, join_phrases, number_of
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
-from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
 
 
@@ -183,7 +182,7 @@ def _criteria(
         criterion = Unsafe() if Unsafe() in chosen else [*without_points, *chosen][0]
     if criterion == Unsafe() and (margin is not None or not stated):
         criterion = replace(criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators))
-    return [replace(criterion, contact=contact_degree(assemble(one.study))) for one in evaluators]
+    return [replace(criterion, contact=assemble(one.study).contact) for one in evaluators]
 
 
 def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:

@@ -21,7 +21,6 @@ from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import Limit
-from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic
 
@@ -156,11 +155,11 @@ def compare_originals(
 
 
 def _ends_of_originals(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
-    """How both original vehicles end, with the gap where degrees are from centre to centre."""
+    """How both original vehicles end, with the gap where bodies do not touch at a degree of 0."""
     numbers: JsonObject = {}
     for side, one, original in zip(SIDES, evaluators, originals, strict=True):
         numbers |= {f"{side}_outcome": str(original.outcome[0]), f"{side}_degree": float(original.f_safe[0])}
-        if contact := contact_degree(assemble(one.study)):
+        if contact := assemble(one.study).contact:
             numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
     return numbers
 

@@ -60,7 +60,6 @@ from safevar_sumo.questions.words import (
 )
 from safevar_sumo.records import BoolArray, JsonObject, Outcome
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
 
 if TYPE_CHECKING:
@@ -312,7 +311,7 @@ def _distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> 
 
 def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int, causes: pd.DataFrame) -> str:
     """How little is enough, how sure that is, and how many settings are unsafe."""
-    unsafe, contact, runs = population.unsafe, contact_degree(assemble(evaluator.study)), population.evaluations
+    unsafe, contact, runs = population.unsafe, assemble(evaluator.study).contact, population.evaluations
     counts = f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe ({unsafe.description})."
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])

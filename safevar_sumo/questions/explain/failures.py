@@ -26,7 +26,7 @@ from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import contact_degree, evaluate, simulate_all_points, worst_points
+from safevar_sumo.sumo.matrix import evaluate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
 Reasons = dict[int, str]
@@ -169,7 +169,7 @@ original's), in the study's order.
 
 def _endings_in_words(system: System, point: str, both: Evaluations) -> str:
     """How the runs of the original vehicle and of another vehicle end at a point."""
-    contact, pairs = contact_degree(system), zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
+    contact, pairs = system.contact, zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
     original, changed = (ending_in_words(outcome, degree, contact) for outcome, degree in pairs)
     return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 

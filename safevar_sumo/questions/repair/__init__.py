@@ -35,7 +35,6 @@ from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
-from safevar_sumo.sumo.matrix import contact_degree
 from safevar_sumo.sumo.system import assemble
 
 if TYPE_CHECKING:
@@ -114,7 +113,7 @@ def repair(
         raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
     if out is not None:
         _check_file(Path(out), study)
-    unsafe_today = Unsafe(keep=margin_of(study, margin), contact=contact_degree(assemble(study)))
+    unsafe_today = Unsafe(keep=margin_of(study, margin), contact=assemble(study).contact)
     promised, parameters = Promise.of(study, evaluator.region, promise), parameters_of(study, change)
     evaluator.plan(SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE)
     models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
