@@ -107,6 +107,9 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
     assert run.outcome[0] == Outcome.PASSED
     assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], "it ends when it is slower for good"
+    gap = run.trace.gap[run.trace.active]
+    assert gap.min() == pytest.approx(1.63, abs=0.005), "4.95 m at 12 m/s, where the leader still brakes"
+    assert gap[run.trace.speed[run.trace.active] >= 12].min() == pytest.approx(4.95, abs=0.02)
 
 
 angles = st.floats(-math.pi, math.pi)
