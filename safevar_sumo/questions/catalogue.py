@@ -17,15 +17,15 @@ from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tab
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
     SCENARIOS,
+    WEATHER_PARAMETERS,
     WEATHERS,
     Scenario,
     TrackScenario,
     WorldScenario,
     equals_clear,
-    searchable_in,
 )
 from safevar_sumo.search import DESCRIPTIONS
-from safevar_sumo.study import load_study, study_names, unit_text
+from safevar_sumo.study import free_parameters, load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 NAME: Columns = {"name": "name in a study"}
@@ -126,8 +126,8 @@ def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]]:
     for name, description in _described(models):
-        parameters = searchable_in(models[name]).items()
-        domains = (f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in parameters)
+        own = {} if models[name].brakes_fully else {**free_parameters(models[name]), **WEATHER_PARAMETERS}
+        domains = (f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in own.items())
         yield name, description, "; ".join(domains)
 
 

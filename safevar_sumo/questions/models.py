@@ -186,7 +186,7 @@ def tests_between(study: Study, rng: np.random.Generator) -> list[MatrixTest]:
         return []
     tests = list[MatrixTest]()
     for test, points in points_of_tests(study, assemble(study).points):
-        searchable = searchable_in(type(points[0].scenario))
+        searchable = searchable_in(points[0].scenario)
         cells = {name: _cells(values) if name in searchable else [] for name, values in test.over.items()}
         if not any(cells.values()):
             continue

@@ -59,7 +59,7 @@ def _model_in_words(model: str) -> str:
 def _parameters_in_words(study: Study, test: MatrixTest | None, points: Sequence[Point], between: bool) -> str:
     """The speeds and other parameters of a test that vary: over its axes, and in a search over the scenario."""
     over = {} if test is None else test.over
-    searchable = searchable_in(type(points[0].scenario))
+    searchable = searchable_in(points[0].scenario)
     phrases = {}
     for name, values in over.items():
         unit = unit_text(searchable[name].unit) if name in searchable else ""

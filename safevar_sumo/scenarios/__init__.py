@@ -19,6 +19,7 @@ from safevar_sumo.scenarios.base import (
     WorldScenario as WorldScenario,
 )
 from safevar_sumo.scenarios.crossing import Crossing
+from safevar_sumo.scenarios.from_file import OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.stop import Stop
@@ -34,6 +35,7 @@ SCENARIOS: Mapping[str, type[Scenario]] = {
     "cut_in": CutIn,
     "cut_out": CutOut,
     "lead_vehicle_stopped": LeadVehicleStopped,
+    "openscenario": OpenScenario,
     "stop": Stop,
 }
 
@@ -48,9 +50,9 @@ WEATHER_PARAMETERS = free_parameters(Weather)
 """Parameters of a weather that a study may search, by name."""
 
 
-def searchable_in(scenario: type[Scenario]) -> Mapping[str, FreeParameter]:
+def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     """Parameters of a scenario and its weather that a study may search; none without an encounter."""
-    return {} if scenario.brakes_fully else {**free_parameters(scenario), **WEATHER_PARAMETERS}
+    return {} if scenario.brakes_fully else {**scenario.free(), **WEATHER_PARAMETERS}
 
 
 def weather_of(choice: str | Weather, source: object) -> Weather:

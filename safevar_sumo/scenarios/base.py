@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.study import Weather
+from safevar_sumo.study import FreeParameter, Weather, free_parameters
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
@@ -305,6 +307,15 @@ class Scenario:
     else:
         pre_crash = ""
         test_speed = None
+
+    def free(self) -> Mapping[str, FreeParameter]:
+        """Parameters that a study may search, by name."""
+        return free_parameters(type(self))
+
+    def at(self, values: Mapping[str, Any]) -> Scenario:
+        """This scenario at other values of parameters, created anew."""
+        create: Any = msgspec.structs.replace if isinstance(self, msgspec.Struct) else dataclasses.replace
+        return create(self, **values)  # type: ignore[no-any-return]
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the lanes of the built network."""

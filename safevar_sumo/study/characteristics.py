@@ -66,7 +66,7 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
 
 def unit_text(unit: str, layout: str = " {}") -> str:
     """A unit as text after a number or, in another `layout`, after a name; empty for a pure number."""
-    return "" if unit == "-" else layout.format(unit)
+    return "" if unit in ("-", "") else layout.format(unit)
 
 
 class _Distribution(Table, frozen=True, tag_field="distribution"):

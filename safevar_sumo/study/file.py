@@ -17,6 +17,7 @@ import tomli_w
 from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
+from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     PYMOO,
@@ -101,7 +102,8 @@ def _raw_study(study: StudyLike) -> _RawStudy:
 def _checked_study(raw: _RawStudy) -> Study:
     if "origin" in raw.tables:
         raise InputError(raw.source, "origin: there is no such key")
-    tables = _with_parameters(_with_parameters(raw.tables, "search", SearchTable), "repair", RepairTable)
+    tables = with_file(raw.source, raw.tables, raw.origin.places)
+    tables = _with_parameters(_with_parameters(tables, "search", SearchTable), "repair", RepairTable)
     matrix, vehicle = tables.get("matrix"), tables.get("vehicle")
     if isinstance(matrix, dict) and matrix.get("tests") == [] and not matrix.get("protocol"):
         del tables["matrix"]  # of a study that it extends
@@ -186,7 +188,11 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
 
 def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
     """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none its wider study."""
-    tables = _merge({key: value for key, value in base.tables.items() if key != "wider"}, overrides)
+    inherited = {key: value for key, value in base.tables.items() if key != "wider"}
+    scenario = overrides.get("scenario")
+    if isinstance(scenario, dict) and "file" in scenario:  # in place of model and matrix
+        inherited = {key: value for key, value in inherited.items() if key not in ("scenario", "matrix", "rating")}
+    tables = _merge(inherited, overrides)
     changed_keys = [
         key
         for key in ("weather", "vehicle", "ads", "scenario", "matrix")
@@ -313,4 +319,6 @@ def data_files(study: Study) -> dict[str, str]:
                 problem = f"{key}.files: there is no file {name!r}"
                 raise InputError(study.source, problem, f"the path of a file or folder, relative to {places[0]}")
             paths[name] = found[0]
+    if study.scenario.model == MODEL:
+        paths |= files_of(study.scenario.parameters, study.origin.places, study.source)
     return paths

@@ -299,7 +299,7 @@ class Study(Table, frozen=True, kw_only=True):
             raise InputError("", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU")
         self._check_search()
         check_variation(self.domains, self.variation, self.correlations)
-        check_constraints(rows, self.constraints)
+        check_constraints(self.domains, self.constraints)
         check_limits(rows, self.limits, table="limits.")
         if len({len(values) for values in self.spread.values()}) > 1 or not all(self.spread.values()):
             problem = "spread: its lists differ in length or are empty"

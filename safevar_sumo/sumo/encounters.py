@@ -13,11 +13,10 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from msgspec import Struct
 from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, Scenario, TrackScenario, WorldScenario, searchable_in
+from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, TrackScenario, WorldScenario, searchable_in
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import stage_networks
@@ -29,12 +28,12 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
     a domain that is wider than the scenario's, and domains in which an encounter is impossible.
     """
     for point in points:
-        legal = searchable_in(type(point.scenario))
+        legal = searchable_in(point.scenario)
         for name, domain in study.scenario.search.items():
             key = f"scenario.search.{name}"
             check_name(source, f"{key}: {type(point.scenario).__name__} has no such parameter to search", name, legal)
             widest = legal[name]
-            if domain.unit != widest.unit:
+            if widest.unit and domain.unit != widest.unit:
                 raise InputError(source, f"{key}.unit = {domain.unit!r}", repr(widest.unit))
             if domain.lower < widest.lower or domain.upper > widest.upper:
                 problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
@@ -64,15 +63,8 @@ def encounter(point: Point, values: Mapping[str, Any]) -> Point:
     of_weather = {name: value for name, value in values.items() if name in WEATHER_PARAMETERS}
     of_scenario = {name: value for name, value in values.items() if name not in of_weather}
     weather = replace_fields(point.weather, **of_weather)
-    return point._replace(scenario=_with(point.scenario, of_scenario), weather=weather)
-
-
-def _with(scenario: Scenario, values: Mapping[str, Any]) -> Any:
-    """A scenario with other values of fields, created anew; the same object without any."""
-    if not values:
-        return scenario
-    create: Any = replace_fields if isinstance(scenario, Struct) else replace
-    return create(scenario, **values)
+    scenario = point.scenario.at(of_scenario) if of_scenario else point.scenario
+    return point._replace(scenario=scenario, weather=weather)
 
 
 def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:

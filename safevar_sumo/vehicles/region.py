@@ -41,7 +41,7 @@ class _Bounds(NamedTuple):
     @classmethod
     def of(cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet) -> _Bounds:
         """The computation of a study's constraint."""
-        table, widths = study.vehicle.characteristics, characteristics.upper - characteristics.lower
+        table, widths = study.domains, characteristics.upper - characteristics.lower
         weights = tuple((characteristics.names.index(name), weight) for name, weight in constraint.sum.items())
         return cls(
             constraint,

@@ -1,0 +1,339 @@
+"""Actions: each is a function with the standard's name that begins a motion of an actor.
+
+The names are those of the classes in the class reference of ASAM OpenSCENARIO XML 1.3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.openscenario.actors import Actor, Array, Following, Running
+from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
+from safevar_sumo.openscenario.places import Place, Way, line_of, neighbour, way_of
+
+if TYPE_CHECKING:
+    from safevar_sumo.openscenario.storyboard import Player
+
+IGNORED = (
+    "ActivateControllerAction",
+    "AssignControllerAction",
+    "ControllerAction",
+    "AppearanceAction",
+    "LightStateAction",
+    "AnimationAction",
+    "VisibilityAction",
+    "EnvironmentAction",
+    "VariableAction",
+    "VariableSetAction",
+    "ParameterAction",
+    "InfrastructureAction",
+    "TrafficSignalAction",
+    "UserDefinedAction",
+)
+"""Actions that move nobody."""
+
+
+class Transition(NamedTuple):
+    """How long a change takes [s], and its share, 0 to 1, at times since it began."""
+
+    duration: float
+    share: Callable[[Array], Array]
+
+
+SHAPES: dict[str, tuple[float, Callable[[Array], Array]]] = {
+    "linear": (1.0, lambda x: x),
+    "sinusoidal": (math.pi / 2, lambda x: (1 - np.cos(math.pi * x)) / 2),
+    "cubic": (1.5, lambda x: x * x * (3 - 2 * x)),
+}
+"""Shapes of a change by their names (class DynamicsShape): largest slope, and the share done at a share of the time."""
+
+
+def transition_of(dynamics: Element, change: float, speed: float, name: str) -> Transition:
+    """Class TransitionDynamics for a change; its distance is driven at a speed [m/s]. A rate is the largest one."""
+    shape, dimension = attribute(dynamics, "dynamicsShape"), attribute(dynamics, "dynamicsDimension")
+    value = number(dynamics, "value")
+    if shape == "step" or not change or (not value and dimension != "rate"):
+        return Transition(0.0, np.ones_like)
+    if shape not in SHAPES:
+        raise unsupported(f"{name}: dynamicsShape {shape} is not supported")
+    steepest, share = SHAPES[shape]
+    match dimension:
+        case "time":
+            duration = value
+        case "rate":
+            duration = steepest * abs(change / value) if value else math.inf
+        case "distance":
+            duration = value / speed if speed else math.inf
+        case _:
+            raise unsupported(f"{name}: dynamicsDimension {dimension} is not supported")
+    return Transition(duration, lambda time: share(np.minimum(time / duration, 1.0)))
+
+
+# Longitudinal
+
+
+def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """SpeedAction. Over a distance the acceleration of a linear change is constant."""
+    target, start = part(action, "SpeedActionTarget/*"), actor.speed_now
+    value = number(target, "value")
+    if target.tag == "RelativeTargetSpeed":
+        if target.get("continuous") == "true":
+            raise unsupported("SpeedAction: RelativeTargetSpeed with continuous = true is not supported")
+        other = player.other(target)
+        is_factor = target.get("speedTargetValueType") == "factor"
+        value = other.speed_now * value if is_factor else other.speed_now + value
+        player.depends(other, player.now, f"{actor.name}'s speed relative to {other.name}'s")
+    if value < 0:
+        raise unsupported(f"{actor.name} drives backwards ({value:.2f} m/s)")
+    dynamics = part(action, "SpeedActionDynamics")
+    transition = transition_of(dynamics, value - start, (start + value) / 2, "SpeedAction")
+    if actor is player.ego and transition.duration:
+        raise unsupported(f"SpeedAction of {actor.name} that takes time: its driving system drives")
+    rate = number(dynamics, "value", 0.0) if dynamics.get("dynamicsDimension") == "rate" else 1.0
+    if math.isinf(transition.duration):
+        player.remark(f"{actor.name}: SpeedAction with rate 0 has no effect")
+    elif rate < 0 < value - start:
+        player.remark(f"{actor.name}: SpeedAction with the rate {rate:g} towards a higher speed: its size counts")
+    if not transition.duration:
+        actor.speed_now = value
+    share = transition.share
+    running = actor.begin("along", transition.duration, player.now, lambda time: start + (value - start) * share(time))
+    return [running]
+
+
+def longitudinal_distance_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """LongitudinalDistanceAction: at once at a distance, which is kept if it is continuous."""
+    other = player.other(action)
+    if action.find("DynamicConstraints") is not None:
+        raise unsupported("LongitudinalDistanceAction with DynamicConstraints is not supported")
+    leads = action.get("displacement", "leadingReferencedEntity") != "trailingReferencedEntity"
+    follower = other if leads else actor
+    gap = number(action, "distance", math.nan)
+    if math.isnan(gap):
+        gap = number(action, "timeGap") * follower.speed_now
+    if action.get("freespace") == "true":
+        gap += other.shape.front - actor.shape.rear if leads else actor.shape.front - other.shape.rear
+    signed = gap if leads else -gap
+    player.depends(other, player.now, f"{actor.name}'s distance to {other.name}")
+    mine, its = actor.here, other.here
+    if isinstance(mine.path, Way) and isinstance(its.path, Way) and mine.path.chain == its.path.chain:
+        actor.at = mine._replace(distance=its.distance + signed)
+    else:
+        actor.at = Place.free(its.pose.moved(signed))
+    if action.get("continuous") != "true":
+        return []
+    speed = actor.speed_now
+    running = actor.begin("along", math.inf, player.now, lambda time: np.full_like(time, speed))
+    actor.follows = Following(other, signed)
+    player.depends(other, math.inf, f"{actor.name}'s distance to {other.name}")
+    return [running]
+
+
+def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """SynchronizeAction: the actor and its master, who holds its speed, reach their positions at the same time.
+
+    Up to its steady state the actor changes its speed evenly twice, each time for half of the time; one that stands
+    waits, and then accelerates evenly. Then its speed is the final one.
+    """
+    master = player.actor(attribute(action, "masterEntityRef"))
+    time = math.inf
+    if master.speed_now:
+        time = master.here.way_to(player.place(part(action, "TargetPositionMaster/*"))) / master.speed_now
+    if not 0 < time < math.inf:
+        raise unsupported(f"SynchronizeAction: {master.name} does not move towards its position")
+    way = actor.here.way_to(player.place(part(action, "TargetPosition/*")))
+    final, steady_time, steady_way = way / time, 0.0, 0.0
+    if (target := action.find("FinalSpeed/*")) is not None:
+        if target.tag != "AbsoluteSpeed":
+            raise unsupported(f"SynchronizeAction with {target.tag} is not supported")
+        final = number(target, "value")
+        for steady in target:
+            is_way = steady.tag == "TargetDistanceSteadyState"
+            steady_way = number(steady, "distance") if is_way else number(steady, "time") * final
+            steady_time = steady_way / final if final else 0.0
+    until, rest = time - steady_time, way - steady_way
+    if rest < -1e-6 or until < -1e-6:
+        where = f"{way:.1f} m and {time:.1f} s before its position"
+        raise unsupported(f"SynchronizeAction: {actor.name} is {where}, within its steady state")
+    player.depends(master, player.now + until, f"{actor.name}'s SynchronizeAction with {master.name}")
+    return [actor.begin("along", time, player.now, _approach(player, actor, until, rest, final))]
+
+
+def _approach(player: Player, actor: Actor, until: float, way: float, final: float) -> Callable[[Array], Array]:
+    """Speeds of a way [m] in a time [s] that end at a final speed [m/s]."""
+    start = actor.speed_now
+    if way <= 1e-6:
+        return lambda time: np.full_like(time, final)
+    if not start and final and until >= 2 * way / final:
+        ramp = 2 * way / final
+        return lambda time: final * np.clip((time - until + ramp) / ramp, 0.0, 1.0)
+    middle = 2 * way / until - (start + final) / 2
+    if middle < 0:
+        raise unsupported(f"SynchronizeAction: {actor.name} would have to drive backwards")
+    if not start:
+        player.remark(f"{actor.name} begins to move at once: it has only {until:.2f} s for {way:.2f} m")
+    return lambda time: np.interp(time, [0.0, until / 2, until], [start, middle, final])
+
+
+# Lateral
+
+
+def lane_change_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """LaneChangeAction: lanes count to the left, where t grows; no lane has the number 0."""
+    way = _way_of(action, actor)
+    target = part(action, "LaneChangeTarget/*")
+    lane = whole(target, "value")
+    if target.tag == "RelativeTargetLane":
+        place = player.other(target).here
+        if not isinstance(place.path, Way):
+            raise unsupported("LaneChangeAction: RelativeTargetLane refers to an entity that is not on a road")
+        lane = neighbour(place.path.lane_at(place.distance, place.left), lane)
+    offset = number(action, "targetLaneOffset", 0.0)
+    goal = way.lane_left(lane, actor.here.distance) + _sign(way, actor) * offset
+    dynamics = part(action, "LaneChangeActionDynamics")
+    transition = transition_of(dynamics, goal - actor.here.left, actor.speed_now, "LaneChangeAction")
+    return [_sideways(player, actor, goal, transition)]
+
+
+def lane_offset_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """LaneOffsetAction: as fast as maxLateralAcc allows; without one at once."""
+    way, target, left = _way_of(action, actor), part(action, "LaneOffsetTarget/*"), actor.here.left
+    by = _sign(way, actor) * number(target, "value")
+    goal = way.lane_left(way.lane_at(actor.here.distance, left), actor.here.distance) + by
+    if target.tag == "RelativeTargetLaneOffset":
+        goal = player.other(target).here.left + by
+    dynamics = part(action, "LaneOffsetActionDynamics")
+    shape, most = attribute(dynamics, "dynamicsShape"), number(dynamics, "maxLateralAcc", 0.0)
+    if shape == "step" or not most or goal == left:
+        return [_sideways(player, actor, goal, Transition(0.0, np.ones_like))]
+    peaks = {"sinusoidal": math.pi**2 / 2, "cubic": 6.0, "linear": 4.0}
+    if shape not in peaks:
+        raise unsupported(f"LaneOffsetAction: dynamicsShape {shape} is not supported")
+    duration = math.sqrt(peaks[shape] * abs(goal - left) / most)
+    share = SHAPES[shape][1]
+    transition = Transition(duration, lambda time: share(np.minimum(time / duration, 1.0)))
+    return [_sideways(player, actor, goal, transition)]
+
+
+def _way_of(action: Element, actor: Actor) -> Way:
+    if not isinstance(actor.here.path, Way):
+        raise unsupported(f"{action.tag} of {actor.name}, which is not on a road")
+    return actor.here.path
+
+
+def _sign(way: Way, actor: Actor) -> int:
+    """1 if the actor drives along the road's reference line, otherwise -1: offsets count along t."""
+    return 1 if way.road_at(actor.here.distance).is_forward else -1
+
+
+def _sideways(player: Player, actor: Actor, goal: float, transition: Transition) -> Running:
+    start, share = actor.here.left, transition.share
+    if not transition.duration:
+        actor.at = actor.here._replace(left=goal)
+    return actor.begin("sideways", transition.duration, player.now, lambda time: start + (goal - start) * share(time))
+
+
+# Places, routes and trajectories
+
+
+def teleport_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """TeleportAction."""
+    if player.sample:
+        raise unsupported(f"TeleportAction of {actor.name} after the start: no body jumps")
+    actor.at = player.place(part(action, "Position/*"))
+    return []
+
+
+def assign_route_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """AssignRouteAction: the actor goes on along the roads of a route, beginning with its own."""
+    way, here = way_of(part(action, "Route"), player.network), actor.here
+    if isinstance(here.path, Way) and here.path.chain != way.chain:
+        there = here.path.road_at(here.distance, here.left)
+        distance = way.distance_to(there.road.id, there.s)
+        if distance is None:
+            raise unsupported(f"AssignRouteAction: {actor.name} is not on its route")
+        actor.at = here._replace(path=way, distance=distance)
+    return []
+
+
+def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """FollowTrajectoryAction: at the actor's speed, or at the times of the vertices, even speeds in between."""
+    trajectory = action.find("TrajectoryRef/Trajectory")
+    trajectory = part(action, "Trajectory") if trajectory is None else trajectory
+    start = None if actor.at is None else actor.at.pose
+    line = line_of(trajectory, player.network, player.place_of, start)
+    actor.at = Place(line, number(action, "initialDistanceOffset", 0.0), 0.0)
+    actor.sideways = None
+    timing = action.find("TimeReference/Timing")
+    if timing is None:
+        return []
+    if not line.times:
+        raise unsupported("FollowTrajectoryAction with Timing: every vertex needs a time and a place of its own")
+    is_relative = timing.get("domainAbsoluteRelative") == "relative"
+    begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
+    times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
+    if any(b <= a for a, b in pairwise(times)):
+        raise unsupported("FollowTrajectoryAction with Timing: the times of the vertices do not grow")
+    speeds = np.array([0.0, *np.diff(line.starts) / np.diff(times)])
+    now = player.now
+    if times[0] <= now:
+        actor.speed_now = float(speeds[1])
+    running = actor.begin(
+        "along",
+        float(times[-1]) - now,
+        now,
+        lambda time: speeds[np.minimum(np.searchsorted(times, time + now - 1e-9), len(speeds) - 1)],
+    )
+    return [running]
+
+
+PRIVATE: dict[str, Callable[[Player, Element, Actor], list[Running]]] = {
+    "TeleportAction": teleport_action,
+    "SpeedAction": speed_action,
+    "LongitudinalDistanceAction": longitudinal_distance_action,
+    "SynchronizeAction": synchronize_action,
+    "LaneChangeAction": lane_change_action,
+    "LaneOffsetAction": lane_offset_action,
+    "AssignRouteAction": assign_route_action,
+    "FollowTrajectoryAction": follow_trajectory_action,
+}
+"""Actions of an actor that are supported, by the standard's names."""
+GROUPS = ("LongitudinalAction", "LateralAction", "RoutingAction")
+"""Classes of which one action is a child."""
+INIT_ORDER = (("TeleportAction",), ("FollowTrajectoryAction",), ("SpeedAction",), ("AssignRouteAction",))
+"""The order of actions in Init, whose list has none: places, speeds, routes, and then all others."""
+
+
+def leaf_of(action: Element) -> Element:
+    """The element of a private or global action that says what is done."""
+    leaf = part(action, "*")
+    return part(leaf, "*") if leaf.tag in GROUPS else leaf
+
+
+def is_ignored(action: Element) -> bool:
+    """Whether an action moves nobody."""
+    leaf = leaf_of(action) if action.tag in ("PrivateAction", "GlobalAction") else action
+    return leaf.tag in IGNORED
+
+
+def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
+    """Begin a PrivateAction or GlobalAction; returns what goes on in time."""
+    if is_ignored(action):
+        player.ignored.add(leaf_of(action).tag if len(action) else action.tag)
+        return []
+    leaf = leaf_of(action)
+    if action.tag == "GlobalAction":
+        if leaf.tag == "EntityAction" and leaf.find("DeleteEntityAction") is not None:
+            player.other(leaf).deleted = player.now  # class DeleteEntityAction
+            return []
+        raise unsupported(f"{part(leaf, '*').tag if len(leaf) else leaf.tag} is not supported")
+    if leaf.tag not in PRIVATE:
+        raise unsupported(f"{leaf.tag} is not supported")
+    if player.sample and player.ego in actors:
+        raise unsupported(f"{leaf.tag} of {player.ego.name} after the start: its driving system drives")
+    return [running for actor in actors for running in PRIVATE[leaf.tag](player, leaf, actor)]

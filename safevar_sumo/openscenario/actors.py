@@ -1,0 +1,206 @@
+"""Entities of a scenario: their bodies, and how they move from sample to sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported
+from safevar_sumo.openscenario.places import Place, Way
+from safevar_sumo.openscenario.road import Line, Pose
+
+STEP = 0.01
+"""Time between two samples [s]."""
+MIN_SPEED = 0.1
+"""Speed from which on a body turns while it moves sideways [m/s]."""
+Array = Any
+"""An array over samples."""
+
+
+class Shape(NamedTuple):
+    """A body: its kind, length and width [m], and how far its middle is ahead and to the left of its origin [m]."""
+
+    kind: str
+    length: float
+    width: float
+    ahead: float
+    left: float
+
+    @property
+    def front(self) -> float:
+        """From the origin to the front [m]."""
+        return self.ahead + self.length / 2
+
+    @property
+    def rear(self) -> float:
+        """From the origin to the rear [m]."""
+        return self.ahead - self.length / 2
+
+
+class Motion(NamedTuple):
+    """How a quantity changes since a time [s]: its value at times since then."""
+
+    since: float
+    value: Callable[[Array], Array]
+
+
+@dataclass
+class Running:
+    """An action that has begun, and the time at which it ends [s]."""
+
+    end: float = math.inf
+    is_replaced: bool = False
+
+    def is_done(self, time: float) -> bool:
+        """Whether it has ended."""
+        return self.is_replaced or time >= self.end - 1e-9
+
+
+class Following(NamedTuple):
+    """A distance that an actor keeps along the way from another one [m]."""
+
+    other: Actor
+    distance: float
+
+
+@dataclass
+class Actor:
+    """An entity that moves: where it is now, its motions, and arrays of all samples.
+
+    `place`, `facing` and `speed` are those of its origin, in the plane; `travelled` is its way since the start [m],
+    `standing` for how long it has stood [s].
+    """
+
+    name: str
+    shape: Shape
+    n_samples: int
+    at: Place | None = None
+    speed_now: float = 0.0
+    along: Motion | None = None
+    sideways: Motion | None = None
+    follows: Following | None = None
+    running: dict[str, Running] = field(default_factory=dict)
+    deleted: float = math.inf
+
+    def __post_init__(self) -> None:
+        self.place, self.facing = (np.zeros(self.n_samples, dtype=complex) for _ in range(2))
+        self.speed, self.travelled, self.standing, self.distance, self.left = np.zeros((5, self.n_samples))
+
+    @property
+    def here(self) -> Place:
+        """Where it is now."""
+        if self.at is None:
+            raise unsupported(f"{self.name} has no place in Init")
+        return self.at
+
+    def begin(self, domain: str, duration: float, time: float, value: Callable[[Array], Array]) -> Running:
+        """Begin a motion `along` its way or `sideways` that lasts so long [s], in place of the one before."""
+        running = Running(time + duration)
+        if domain in self.running:
+            self.running[domain].is_replaced = True
+        self.running[domain] = running
+        if domain == "along":
+            self.along, self.follows = Motion(time, value), None
+        else:
+            self.sideways = Motion(time, value)
+        return running
+
+    def end(self, running: Running) -> None:
+        """End an action before its time: the speed and the offset stay as they are."""
+        for domain, own in self.running.items():
+            if own is running and not running.is_replaced:
+                running.is_replaced = True
+                if domain == "along":
+                    self.along = self.follows = None
+                else:
+                    self.sideways = None
+
+    def note(self, sample: int) -> None:
+        """Write where it is now; who has not been put elsewhere faces as it moved."""
+        pose = self.here.pose
+        if not sample or abs(pose.place - self.place[sample]) > 1e-9:
+            self.place[sample], self.facing[sample] = pose
+        self.speed[sample] = self.speed_now
+        self.distance[sample], self.left[sample] = self.here.distance, self.here.left
+
+    def move(self, sample: int, last: int, times: Array) -> None:
+        """Move from a sample to the `last`: the speed is that of the body, along its own direction."""
+        path, now, n = self.here.path, self.here, last - sample
+        later = slice(sample + 1, last + 1)
+        if self.along is None:
+            speed: Array = np.full(n, self.speed_now)
+        else:
+            speed = np.broadcast_to(self.along.value(times[later] - self.along.since), n)
+        before = np.concatenate([[self.speed_now], speed[:-1]])
+        ahead = (before + speed) / 2 * STEP
+        forward, left, turn = ahead, np.full(n, now.left), np.ones(n)
+        if self.sideways is not None:
+            left = np.broadcast_to(self.sideways.value(times[later] - self.sideways.since), n)
+            aside = np.diff(left, prepend=now.left)
+            sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
+            cosine = np.sqrt(1 - np.square(sine))
+            forward, turn = ahead * cosine, np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
+        distance = now.distance + np.cumsum(forward)
+        if isinstance(path, Way) and not path.is_straight:  # on a way that bends, the inner side is shorter
+            for _ in range(2):
+                middle = distance - forward / 2
+                distance = now.distance + np.cumsum(forward / (1 - path.curvature(middle) * left))
+        if self.follows is not None:
+            speed, distance, path, left = self._behind(later, left)
+        pose = path.pose(distance, left)
+        self.place[later], self.facing[later] = pose.place, pose.facing * turn * now.turn
+        self.speed[later], self.distance[later], self.left[later] = speed, distance, left
+        self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
+        moves = speed > 1e-3
+        since = np.maximum.accumulate(np.where(moves, np.arange(1, n + 1), 0))
+        self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (since == 0)
+
+    def _behind(self, later: slice, left: Array) -> tuple[Array, Array, Line, Array]:
+        """Speeds, distances and offsets along a path, of who keeps its distance to another actor."""
+        assert self.follows is not None
+        other, by = self.follows
+        path = self.here.path
+        if not (isinstance(path, Way) and isinstance(other.here.path, Way) and path.chain == other.here.path.chain):
+            raise unsupported(f"LongitudinalDistanceAction: {self.name} and {other.name} are not on the same roads")
+        return other.speed[later], other.distance[later] + by, path, left
+
+    def arrive(self, sample: int) -> None:
+        """Be where it has been at a sample."""
+        here = self.here
+        self.at = here._replace(distance=float(self.distance[sample]), left=float(self.left[sample]))
+        self.speed_now = float(self.speed[sample])
+
+    def pose(self, sample: int) -> Pose:
+        """Its pose at a sample."""
+        return Pose(complex(self.place[sample]), complex(self.facing[sample]))
+
+
+def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
+    """The entities of a file (class ScenarioObject)."""
+    for entity in root.findall("Entities/ScenarioObject"):
+        name = attribute(entity, "name")
+        body = next((each for each in entity if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
+        if body is None:
+            raise unsupported(f"{name} is no Vehicle, Pedestrian or MiscObject")
+        middle, size = part(body, "BoundingBox/Center"), part(body, "BoundingBox/Dimensions")
+        length, width = number(size, "length"), number(size, "width")
+        if not (0 < length <= 100 and 0 < width <= 100):
+            raise unsupported(f"{name} is {length:g} m long and {width:g} m wide", "sizes above 0, up to 100 m")
+        shape = Shape(_kind(body, length), length, width, number(middle, "x"), number(middle, "y", 0.0))
+        yield Actor(name, shape, n_samples)
+
+
+def _kind(body: Element, length: float) -> str:
+    """What sumo-gui draws, and whether it is a person there."""
+    if body.tag == "Pedestrian":
+        height = number(part(body, "BoundingBox/Dimensions"), "height", 2.0)
+        return "child" if height < CHILD else "adult"
+    return {"bicycle": "cyclist", "motorbike": "motorcyclist"}.get(body.get("vehicleCategory", ""), "car")
+
+
+CHILD = 1.4
+"""Height below which a pedestrian is drawn as a child [m]."""

@@ -1,0 +1,244 @@
+"""Files of OpenSCENARIO XML: a concrete one becomes a tree in which every value is a literal."""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
+
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import ParseError, parse
+
+from safevar_sumo.errors import InputError, one_of, unknown_name
+from safevar_sumo.openscenario.expressions import Values, compare, literal
+
+Element: TypeAlias = "ElementTree.Element[str]"
+
+FILE_KEY = "scenario.file"
+"""The key that errors name; the study stands before it."""
+
+
+def unsupported(problem: str, legal: str = "") -> InputError:
+    """The refusal of a file, in a sentence that names the element."""
+    return InputError(FILE_KEY, problem, legal)
+
+
+def root_of(file: str) -> Element:
+    """The root of an XML file, without entities; the caller does not change it."""
+    try:
+        stamp = os.stat(file)
+    except OSError as error:
+        raise unsupported(f"{file!r} cannot be read: {error.strerror}", "the path of a file") from None
+    return _parsed(file, stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=64)
+def _parsed(file: str, modified: int, size: int) -> Element:
+    try:
+        root: Element = parse(file, forbid_dtd=True).getroot()
+        return root
+    except DefusedXmlException as error:
+        problem = f"{file!r} has a document type or entities ({type(error).__name__})"
+        raise unsupported(problem, "XML without them") from None
+    except (ParseError, ValueError, LookupError, OSError) as error:
+        raise unsupported(f"{file!r} is no XML: {error}", "a file of OpenSCENARIO or OpenDRIVE") from None
+
+
+def attribute(element: Element, name: str) -> str:
+    """An attribute that an element must have."""
+    value = element.get(name)
+    if value is None:
+        raise unsupported(f"{element.tag} has no {name}")
+    return value
+
+
+def number(element: Element, name: str, default: float | None = None) -> float:
+    """A number of an element, or the default if the element does not have it."""
+    if default is not None and name not in element.attrib:
+        return default
+    text = attribute(element, name)
+    try:
+        return float(text)
+    except ValueError:
+        raise unsupported(f"{element.tag}: {name} = {text!r}", "a number") from None
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a finite number."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def whole(element: Element, name: str) -> int:
+    """A whole number of an element."""
+    value = number(element, name)
+    if value != round(value):
+        raise unsupported(f"{element.tag}: {name} = {value:g}", "a whole number")
+    return round(value)
+
+
+def part(element: Element, path: str) -> Element:
+    """The element at a path that must be there; with `/*` at its end the first one below."""
+    found = element.find(path)
+    if found is None:
+        raise unsupported(f"{element.tag} has no {path}")
+    return found
+
+
+class Parameter(NamedTuple):
+    """A declared parameter, its value as written, and its constraints: groups of a rule and a limit each."""
+
+    name: str
+    text: str
+    groups: tuple[tuple[tuple[str, str], ...], ...]
+
+
+def declared(element: Element) -> list[Parameter]:
+    """The parameters that an element declares."""
+    return [
+        Parameter(
+            attribute(each, "name"),
+            attribute(each, "value"),
+            tuple(
+                tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
+                for group in each.findall("ConstraintGroup")
+            ),
+        )
+        for each in element.findall("ParameterDeclarations/ParameterDeclaration")
+    ]
+
+
+def values_of(parameters: Sequence[Parameter], given: Values, outer: Values) -> dict[str, str]:
+    """Values by name: those given, otherwise those declared, which may use names that were declared before."""
+    names = [parameter.name for parameter in parameters]
+    for name in given:
+        if name not in names:
+            raise unknown_name(FILE_KEY, f"the file declares no parameter {name}", name, names)
+    values = dict(outer)
+    for parameter in parameters:
+        values[parameter.name] = literal(given.get(parameter.name, parameter.text), values)
+    return values
+
+
+def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
+    """The values that violate a constraint, as `name = value`.
+
+    By the standard (class ParameterDeclaration) one group must hold whole; the files of UN R157 write limits that must
+    all hold as groups of their own. So several groups are joined by "or" if they are all `equalTo`, else by "and".
+    """
+    problems = []
+    for name, _, groups in parameters:
+        results = [
+            all(compare(rule, values[name], literal(limit, values)) for rule, limit in group) for group in groups
+        ]
+        has_choices = all(rule == "equalTo" for group in groups for rule, _ in group)
+        if results and not (any(results) if has_choices else all(results)):
+            problems.append(f"{name} = {values[name]}")
+    return problems
+
+
+class Document(NamedTuple):
+    """A concrete file with every value a literal: its root, its parameters and their values, and the paths of the
+    catalogs and the road that it names.
+    """
+
+    root: Element
+    parameters: list[Parameter]
+    values: dict[str, str]
+    catalogs: list[str]
+    road: str
+
+
+def read(file: str, given: Mapping[str, str]) -> Document:
+    """Read a concrete file with some of its parameters set.
+
+    Raises
+    ------
+    InputError
+        If the file is no concrete one, or something that it names is not there.
+    """
+    root = _copy(root_of(file))
+    header = root.find("FileHeader")
+    if root.tag != "OpenSCENARIO" or header is None or header.get("revMajor") != "1":
+        raise unsupported(f"{file!r} is no OpenSCENARIO XML 1.x", "a file with FileHeader revMajor = 1")
+    if root.find("Storyboard") is None:
+        raise unsupported(f"{file!r} has no Storyboard", "a scenario, or a file of parameter values")
+    parameters = declared(root)
+    values = values_of(parameters, given, {})
+    folder, folders = os.path.dirname(file), []
+    for each in root.findall("CatalogLocations/*/Directory"):
+        folders.append(beside(folder, literal(attribute(each, "path"), values)))
+    catalogs: list[str] = []
+    _resolve(root, values, tuple(folders), catalogs)
+    logic = root.find("RoadNetwork/LogicFile")
+    if logic is None:
+        raise unsupported(f"{file!r} names no road", "RoadNetwork/LogicFile")
+    road = beside(folder, attribute(logic, "filepath"))
+    if not os.path.isfile(road):
+        raise unsupported(
+            f"the road {road!r} is not there", "the path of an OpenDRIVE file, from the file that names it"
+        )
+    return Document(root, parameters, values, list(dict.fromkeys(catalogs)), road)
+
+
+def beside(folder: str, path: str) -> str:
+    """A path that counts from a folder; paths of Windows have slashes, too."""
+    return os.path.normpath(os.path.join(folder, path.replace("\\", "/")))
+
+
+def _copy(element: Element) -> Element:
+    """A copy of a tree, without comments and declarations of parameters that are read from the original."""
+    return copy.deepcopy(element)
+
+
+def _resolve(element: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]) -> None:
+    """Replace values and references to catalogs below an element; `catalogs` collects the files that are read."""
+    for key, text in element.attrib.items():
+        if "$" in text:
+            element.set(key, literal(text, values))
+    for place, child in enumerate(list(element)):
+        if child.tag == "ParameterDeclarations":
+            continue
+        if child.tag == "CatalogReference":
+            element[place] = _referenced(child, values, folders, catalogs)
+        else:
+            own = declared(child)
+            _resolve(child, values_of(own, {}, values) if own else values, folders, catalogs)
+
+
+def _referenced(child: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]) -> Element:
+    """The entry of a catalog that a reference names, with the values that it assigns."""
+    catalog, name = (literal(attribute(child, key), values) for key in ("catalogName", "entryName"))
+    file, found = _entry(catalog, name, folders)
+    catalogs.append(file)
+    given = {
+        attribute(each, "parameterRef").lstrip("$"): literal(attribute(each, "value"), values)
+        for each in child.iter("ParameterAssignment")
+    }
+    entry = _copy(found)
+    _resolve(entry, values_of(declared(found), given, values), folders, catalogs)
+    return entry
+
+
+def _entry(catalog: str, entry: str, folders: tuple[str, ...]) -> tuple[str, Element]:
+    """The file of a catalog, and its entry of that name."""
+    for folder in folders:
+        files = (
+            [os.path.join(folder, name) for name in sorted(os.listdir(folder))] if os.path.isdir(folder) else [folder]
+        )
+        for file in files:
+            if not file.endswith(".xosc") or not os.path.isfile(file):
+                continue
+            found = root_of(file).find("Catalog")
+            if found is not None and found.get("name") == catalog:
+                entries = {each.get("name", ""): each for each in found}
+                if entry not in entries:
+                    raise unsupported(f"the catalog {catalog} has no {entry}", one_of(entries))
+                return file, entries[entry]
+    raise unsupported(f"there is no catalog {catalog} in {', '.join(folders) or 'CatalogLocations'}", "a file with it")

@@ -1,0 +1,189 @@
+"""Files of parameter values (class ParameterValueDistribution): which combinations of values a logical file has."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.openscenario.document import (
+    Element,
+    attribute,
+    beside,
+    declared,
+    is_number,
+    number,
+    part,
+    root_of,
+    unsupported,
+    values_of,
+    violated,
+)
+from safevar_sumo.openscenario.expressions import literal
+
+FloatArray = Any
+"""An array of numbers."""
+
+MOST_STEPS = 100_000
+"""Largest number of values of a range."""
+
+
+class Choice(NamedTuple):
+    """Values that parameters take together, one set of them at a time; `ends` are those of a range."""
+
+    names: tuple[str, ...]
+    sets: tuple[tuple[str, ...], ...]
+    ends: tuple[float, float] | None = None
+
+
+class Source(NamedTuple):
+    """What a file offers: the concrete file, its parameters with their values, and the choices of a logical one."""
+
+    concrete: str
+    values: dict[str, str]
+    choices: list[Choice]
+
+    def combinations(self, given: Mapping[str, str]) -> Iterator[dict[str, str]]:
+        """All combinations of the choices, without those that the file's constraints exclude."""
+        declarations = declared(root_of(self.concrete))
+        has_constraints = any(parameter.groups for parameter in declarations)
+        for sets in product(*(choice.sets for choice in self.choices)):
+            values = {
+                name: value
+                for choice, own in zip(self.choices, sets, strict=True)
+                for name, value in zip(choice.names, own, strict=True)
+            }
+            if not (has_constraints and violated(declarations, values_of(declarations, {**given, **values}, {}))):
+                yield values
+
+    def without(self, names: Mapping[str, object]) -> Source:
+        """The file with other choices than those of these parameters, which something else sets."""
+        choices = []
+        for choice in self.choices:
+            kept = [place for place, name in enumerate(choice.names) if name not in names]
+            sets = tuple(dict.fromkeys(tuple(own[place] for place in kept) for own in choice.sets))
+            if kept:
+                choices.append(choice._replace(names=tuple(choice.names[place] for place in kept), sets=sets))
+        return self._replace(choices=choices)
+
+    def range_of(self, name: str) -> tuple[float, float] | None:
+        """The ends of a parameter's range, None without one."""
+        return next((choice.ends for choice in self.choices if choice.names == (name,)), None)
+
+
+def open_file(file: str) -> Source:
+    """A concrete or a logical file.
+
+    Raises
+    ------
+    InputError
+        If it is neither, or its values are no deterministic ones.
+    """
+    root, choices, concrete = root_of(file), [], file
+    distribution = root.find("ParameterValueDistribution")
+    if distribution is not None:
+        if distribution.find("Deterministic") is None:
+            raise unsupported("Stochastic distributions are not supported", "Deterministic ones, such as a range")
+        choices = [_choice(each) for each in part(distribution, "Deterministic")]
+        concrete = beside(os.path.dirname(file), attribute(part(distribution, "ScenarioFile"), "filepath"))
+    declarations = declared(root_of(concrete))
+    given = {name: choice.sets[0][place] for choice in choices for place, name in enumerate(choice.names)}
+    values_of(declarations, given, {})  # refuses names that the file does not declare
+    return Source(concrete, values_of(declarations, {}, {}), choices)
+
+
+def _choice(each: Element) -> Choice:
+    """A row of class Deterministic."""
+    content = part(each, "*")
+    match content.tag:
+        case "DistributionSet":
+            return _filled(Choice((_name(each),), tuple((attribute(one, "value"),) for one in content)))
+        case "DistributionRange":
+            limits, step = part(content, "Range"), number(content, "stepWidth")
+            lower, upper = number(limits, "lowerLimit"), number(limits, "upperLimit")
+            if not (step > 0 and lower <= upper and (upper - lower) / step < MOST_STEPS):
+                raise unsupported(f"{_name(each)}: a range from {lower:g} to {upper:g} by {step:g}")
+            count = math.floor((upper - lower) / step + 1e-9) + 1
+            values = (round(lower + k * step, 9) for k in range(count))
+            return Choice((_name(each),), tuple((repr(value),) for value in values), (lower, upper))
+        case "ValueSetDistribution":
+            sets = [{_reference(one): attribute(one, "value") for one in own} for own in content]
+            names = tuple(sets[0]) if sets else ()
+            if any(own.keys() != {*names} for own in sets):
+                raise unsupported("ValueSetDistribution: its sets name different parameters")
+            return _filled(Choice(names, tuple(tuple(own[name] for name in names) for own in sets)))
+    raise unsupported(f"{content.tag} is not supported")
+
+
+def _name(element: Element) -> str:
+    return attribute(element, "parameterName").lstrip("$")
+
+
+def _reference(element: Element) -> str:
+    return attribute(element, "parameterRef").lstrip("$")
+
+
+def _filled(choice: Choice) -> Choice:
+    if not (choice.names and choice.sets):
+        raise unsupported("a distribution without values is not supported")
+    return choice
+
+
+def originals(source: Source) -> dict[str, float]:
+    """The numbers among the parameters, by name: what a search begins with."""
+    return {name: float(value) for name, value in source.values.items() if is_number(value)}
+
+
+class Bound(NamedTuple):
+    """A linear constraint: the sum of `weights` times values is `at_least` or `at_most` (the `kind`) a limit."""
+
+    weights: list[float]
+    kind: str
+    limit: float
+    text: str
+
+
+KINDS = {"greaterThan": "at_least", "greaterOrEqual": "at_least", "lessThan": "at_most", "lessOrEqual": "at_most"}
+"""Bounds by rules: a search does not tell the two apart."""
+
+
+def constraints_of(
+    file: str, given: Mapping[str, str], names: Sequence[str], low: FloatArray, high: FloatArray
+) -> list[Bound]:
+    """The constraints of a file on the parameters `names` between `low` and `high`, at `given` values of others.
+
+    Raises
+    ------
+    InputError
+        If a constraint is not linear in them.
+    """
+    declarations, bounds = declared(root_of(file)), []
+
+    def difference(name: str, limit: str, at: FloatArray) -> float:
+        own = {key: repr(float(value)) for key, value in zip(names, at, strict=True)}
+        values = values_of(declarations, {**given, **own}, {})
+        return float(values[name]) - float(literal(limit, values))
+
+    middle, half = (low + high) / 2, (high - low) / 2
+    for name, _, groups in declarations:
+        for rule, limit in (one for group in groups for one in group):
+            if rule not in KINDS:
+                continue
+            base = difference(name, limit, middle)
+            steps = np.diag(half)
+            slopes = np.array([difference(name, limit, middle + step) - base for step in steps]) / half
+            if not np.abs(slopes * half).sum() > 1e-12:
+                continue
+            corners = [low, high, middle - half / 3]
+            far = [difference(name, limit, corner) - base - slopes @ (corner - middle) for corner in corners]
+            if np.abs(far).max() > 1e-6 * np.abs(slopes * half).sum():
+                raise unsupported(
+                    f"the constraint of {name} is not linear in {', '.join(names)}", "other parameters to search"
+                )
+            text = f"{name} {rule} {limit}"
+            bounds.append(Bound(slopes.tolist(), KINDS[rule], float(slopes @ middle - base), text))
+    return bounds

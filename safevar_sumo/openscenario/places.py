@@ -1,0 +1,343 @@
+"""Positions, routes and trajectories: each is a distance along a line in the plane, and an offset to its left."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
+from safevar_sumo.openscenario.road import Line, Network, Piece, Pose, Road, unit
+
+MAX_DETOUR = 6
+"""Roads between two waypoints of a route at most."""
+AHEAD = -1e-9
+"""Cosine of a direction relative to a road from which on it leads along the road [-]."""
+
+
+class Crossing(NamedTuple):
+    """A place on a road: the road, whether it is driven along its reference line, and s and t there [m]."""
+
+    road: Road
+    is_forward: bool
+    s: float
+    t: float
+
+
+@dataclass(frozen=True)
+class Way(Line):
+    """Roads driven one after another, each along its reference line or against it."""
+
+    chain: tuple[tuple[str, bool], ...] = ()
+    network: Network | None = None
+
+    @classmethod
+    def of(cls, network: Network, chain: tuple[tuple[str, bool], ...]) -> Way:
+        """The way along a chain of roads, each with its direction."""
+        pieces: list[Piece] = []
+        for name, is_forward in chain:
+            own = network.road(name).line.pieces
+            pieces += own if is_forward else [piece.reversed() for piece in reversed(own)]
+        return cls(pieces, (), chain, network)
+
+    def road_at(self, distance: float, left: float = 0.0) -> Crossing:
+        """The road at a distance, and the place on it."""
+        assert self.network is not None
+        road, is_forward = self.network.road(self.chain[-1][0]), self.chain[-1][1]
+        for name, direction in self.chain:
+            road, is_forward = self.network.road(name), direction
+            if distance <= road.length + 1e-9:
+                break
+            distance -= road.length
+        sign = 1 if is_forward else -1
+        return Crossing(road, is_forward, distance if is_forward else road.length - distance, sign * left)
+
+    def distance_to(self, name: str, s: float) -> float | None:
+        """The distance at which the way has s on a road, None if it does not lead along that road."""
+        assert self.network is not None
+        before = 0.0
+        for road, is_forward in self.chain:
+            length = self.network.road(road).length
+            if road == name:
+                return before + (s if is_forward else length - s)
+            before += length
+        return None
+
+    def lane_left(self, lane: int, distance: float) -> float:
+        """How far a lane's middle is to the left at a distance [m]."""
+        here = self.road_at(distance)
+        return here.road.lane_t(lane, here.s) * (1 if here.is_forward else -1)
+
+    def lane_at(self, distance: float, left: float) -> int:
+        """The lane at a place."""
+        here = self.road_at(distance, left)
+        return here.road.lane_at(here.s, here.t)
+
+
+class Place(NamedTuple):
+    """A distance along a line and an offset to its left [m]; `turn` is the direction of a body relative to it."""
+
+    path: Line
+    distance: float
+    left: float
+    turn: complex = 1.0
+
+    @property
+    def pose(self) -> Pose:
+        """The place in the plane."""
+        return self.path.pose(self.distance, self.left).turned(self.turn)
+
+    @classmethod
+    def free(cls, pose: Pose) -> Place:
+        """A place that is on no road."""
+        return cls(Line([Piece(pose, 1.0)]), 0.0, 0.0)
+
+    def way_to(self, goal: Place) -> float:
+        """The distance that an actor drives along its path to a position [m]."""
+        path = self.path
+        if isinstance(path, Way) and isinstance(goal.path, Way):
+            there = goal.path.road_at(goal.distance)
+            distance = path.distance_to(there.road.id, there.s)
+            if distance is not None:
+                return distance - self.distance
+        elif path == goal.path:
+            return goal.distance - self.distance
+        if not path.is_straight:
+            raise unsupported("a position that is not on its actor's path, which bends")
+        here = path.pose(self.distance)
+        return float(((goal.pose.place - here.place) * here.facing.conjugate()).real)
+
+
+Entity = Callable[[str], Place]
+"""The place of an entity by its name."""
+
+
+def oriented(orientation: Element | None, base: complex, otherwise: complex) -> complex:
+    """The direction of an Orientation (class Orientation): relative to `base`, or absolute, as without a type."""
+    if orientation is None:
+        return otherwise
+    turn = unit(number(orientation, "h", 0.0))
+    return base * turn if orientation.get("type") == "relative" else turn
+
+
+def on_road(road: Road, network: Network, s: float, t: float, facing: Element | None, *, against: bool) -> Place:
+    """A place on a road, which faces along the reference line, `against` it, or as the orientation says."""
+    if not -1e-9 <= s <= road.length + 1e-9:
+        raise unsupported(f"s = {s:.1f} m is not on road {road.id}, which is {road.length:.0f} m long")
+    along = road.line.pose(s).facing
+    turn = oriented(facing, along, -along if against else along) / along
+    is_forward = turn.real >= AHEAD
+    way = Way.of(network, ((road.id, is_forward),))
+    return Place(way, s, t, turn) if is_forward else Place(way, road.length - s, -t, -turn)
+
+
+def place_of(position: Element, network: Network, entity: Entity) -> Place:
+    """The place that the child of a Position names (class Position); `entity` returns that of an entity."""
+    if position.tag not in POSITIONS:
+        raise unsupported(f"{position.tag} is not supported")
+    return POSITIONS[position.tag](position, network, entity)
+
+
+def world_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class WorldPosition."""
+    return Place.free(Pose.at(number(position, "x"), number(position, "y"), number(position, "h", 0.0)))
+
+
+def lane_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class LanePosition: the offset counts along t, of lanes to the left of the reference line, too."""
+    road, lane, s = network.road(attribute(position, "roadId")), whole(position, "laneId"), number(position, "s")
+    return _in_lane(position, road, network, lane, s)
+
+
+def _in_lane(position: Element, road: Road, network: Network, lane: int, s: float) -> Place:
+    t = road.lane_t(lane, s) + number(position, "offset", 0.0)
+    against = (lane > 0) != road.is_left_hand
+    return on_road(road, network, s, t, position.find("Orientation"), against=against)
+
+
+def road_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class RoadPosition."""
+    road = network.road(attribute(position, "roadId"))
+    s, t = number(position, "s"), number(position, "t")
+    return on_road(road, network, s, t, position.find("Orientation"), against=False)
+
+
+def _of_reference(position: Element, entity: Entity) -> Crossing:
+    """Where the referenced entity is on its road."""
+    place = entity(attribute(position, "entityRef"))
+    if not isinstance(place.path, Way):
+        raise unsupported(f"{position.tag} refers to an entity that is not on a road")
+    return place.path.road_at(place.distance, place.left)
+
+
+def relative_road_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class RelativeRoadPosition."""
+    here = _of_reference(position, entity)
+    s, t = here.s + number(position, "ds"), here.t + number(position, "dt")
+    return on_road(here.road, network, s, t, position.find("Orientation"), against=False)
+
+
+def relative_lane_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class RelativeLanePosition: dLane grows with t, and no lane has the number 0."""
+    here = _of_reference(position, entity)
+    s = here.s + number(position, "ds", 0.0) + number(position, "dsLane", 0.0)
+    lane = neighbour(here.road.lane_at(here.s, here.t), whole(position, "dLane"))
+    return _in_lane(position, here.road, network, lane, s)
+
+
+def relative_world_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class RelativeWorldPosition: along the axes of the world."""
+    pose = entity(attribute(position, "entityRef")).pose
+    place = pose.place + complex(number(position, "dx"), number(position, "dy"))
+    return Place.free(Pose(place, oriented(position.find("Orientation"), pose.facing, pose.facing)))
+
+
+def relative_object_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class RelativeObjectPosition: along the axes of the entity."""
+    pose = entity(attribute(position, "entityRef")).pose
+    moved = pose.moved(number(position, "dx"), number(position, "dy"))
+    return Place.free(moved._replace(facing=oriented(position.find("Orientation"), pose.facing, pose.facing)))
+
+
+def trajectory_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class TrajectoryPosition."""
+    line = line_of(part(position, "TrajectoryRef/Trajectory"), network, entity)
+    return _turned(Place(line, number(position, "s"), number(position, "t", 0.0)), position.find("Orientation"))
+
+
+def route_position(position: Element, network: Network, entity: Entity) -> Place:
+    """Class RoutePosition: s along the route, and t or the lane of the road there."""
+    way = way_of(part(position, "RouteRef/Route"), network)
+    where = part(position, "InRoutePosition/*")
+    distance = number(where, "pathS")
+    sign = 1 if way.road_at(distance).is_forward else -1
+    match where.tag:
+        case "FromRoadCoordinates":
+            left = sign * number(where, "t")
+        case "FromLaneCoordinates":
+            left = way.lane_left(whole(where, "laneId"), distance) + sign * number(where, "laneOffset", 0.0)
+        case _:
+            raise unsupported(f"{where.tag} is not supported")
+    return _turned(Place(way, distance, left), position.find("Orientation"))
+
+
+def _turned(place: Place, orientation: Element | None) -> Place:
+    """A place on a line with an orientation, which counts from the line."""
+    return place if orientation is None else place._replace(turn=unit(number(orientation, "h", 0.0)))
+
+
+POSITIONS: dict[str, Callable[[Element, Network, Entity], Place]] = {
+    "WorldPosition": world_position,
+    "LanePosition": lane_position,
+    "RoadPosition": road_position,
+    "RelativeRoadPosition": relative_road_position,
+    "RelativeLanePosition": relative_lane_position,
+    "RelativeWorldPosition": relative_world_position,
+    "RelativeObjectPosition": relative_object_position,
+    "TrajectoryPosition": trajectory_position,
+    "RoutePosition": route_position,
+}
+"""Positions that are supported, by the standard's names."""
+
+
+def neighbour(lane: int, by: int) -> int:
+    """The lane that is `by` lanes to the left, where t grows; there is no lane 0."""
+    found = lane + by
+    return found + (1 if by > 0 else -1) if lane * found <= 0 else found
+
+
+def _nobody(name: str) -> Place:
+    raise unsupported(f"a route refers to the entity {name}")
+
+
+def way_of(route: Element, network: Network) -> Way:
+    """The roads of a route (class Route): the shortest chain from waypoint to waypoint."""
+    places = [place_of(part(point, "Position/*"), network, _nobody) for point in route.findall("Waypoint")]
+    ways = tuple(place.path.chain[0] for place in places if isinstance(place.path, Way))
+    if len(ways) < len(places) or not ways:
+        raise unsupported("a Route has a waypoint that is not on a road")
+    options = [ways[:1]]
+    if len(ways) > 1:  # in which direction the first road is driven
+        name = ways[0][0]
+        options = [((name, True),), ((name, False),)]
+        if ways[1][0] == name:
+            first, second = (_s_of(place) for place in places[:2])
+            options = [((name, second >= first),)]
+    for end, _ in ways[1:]:
+        options = [_extended(network, options, end)]
+    return Way.of(network, tuple(options[0]))
+
+
+def _s_of(place: Place) -> float:
+    assert isinstance(place.path, Way)
+    return place.path.road_at(place.distance).s
+
+
+Chain = tuple[tuple[str, bool], ...]
+
+
+def _extended(network: Network, options: Sequence[Chain], end: str) -> Chain:
+    """The first of some chains of roads that leads to the road with the id `end`, extended by the fewest roads."""
+    queue, most = [*options], len(options[0]) + MAX_DETOUR
+    while queue:
+        option = queue.pop(0)
+        if option[-1][0] == end:
+            return option
+        if len(option) <= most:
+            queue += [(*option, way) for way in network.ways(*option[-1])]
+    raise unsupported(f"no route leads from road {options[0][-1][0]} to road {end}")
+
+
+def line_of(trajectory: Element, network: Network, entity: Entity, start: Pose | None = None) -> Line:
+    """The line of a Trajectory (class Shape); `start` is where its actor is."""
+    shape = part(trajectory, "Shape/*")
+    match shape.tag:
+        case "Polyline":
+            return _polyline(shape, network, entity)
+        case "ClothoidSpline":
+            return Line(_clothoids(shape, network, entity, start))
+        case "Clothoid":
+            pose, length = place_of(part(shape, "Position/*"), network, entity).pose, number(shape, "length")
+            first = number(shape, "curvature")
+            slope = number(shape, "curvaturePrime", number(shape, "curvatureDot", 0.0))
+            return Line([Piece(pose, length, first, first + slope * length)])
+    raise unsupported(f"the trajectory's {shape.tag} is not supported; supported: Polyline, Clothoid, ClothoidSpline")
+
+
+def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
+    """Class Polyline: straight from vertex to vertex."""
+    vertices = shape.findall("Vertex")
+    places = [place_of(part(vertex, "Position/*"), network, entity).pose.place for vertex in vertices]
+    pieces = [
+        Piece(Pose(a, (b - a) / abs(b - a)), abs(b - a))
+        for a, b in pairwise(places)
+        if not cmath.isclose(a, b, abs_tol=1e-9)
+    ]
+    if not pieces:
+        raise unsupported("a Polyline whose vertices are all at one place")
+    times = [number(vertex, "time") for vertex in vertices if "time" in vertex.attrib]
+    return Line(pieces, tuple(times) if len(times) == len(vertices) == len(pieces) + 1 else ())
+
+
+def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | None) -> list[Piece]:
+    """Class ClothoidSpline: one segment after another, from where its actor is unless a start is given."""
+    pieces, pose = [], start
+    for segment in shape.findall("ClothoidSplineSegment"):
+        begin = segment.find("PositionStart")
+        if begin is not None:
+            pose = place_of(part(begin, "*"), network, entity).pose
+        if pose is None:
+            raise unsupported("a ClothoidSpline without a start in the plane, which no actor follows")
+        curvatures = (number(segment, name) for name in ("curvatureStart", "curvatureEnd"))
+        piece = Piece(pose, number(segment, "length"), *curvatures)
+        pieces.append(piece)
+        pose = piece.pose(piece.length)
+    return pieces
+
+
+def turn_of(facing: complex, other: complex) -> float:
+    """The angle between two directions [degrees]."""
+    return abs(math.degrees(cmath.phase(facing / other)))

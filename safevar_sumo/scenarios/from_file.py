@@ -1,0 +1,193 @@
+"""A scenario that a file of OpenSCENARIO describes; the vehicle under test is its Ego."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.openscenario import STEP, Moved, Played, play
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios.tracks import Track, TrackScenario
+from safevar_sumo.study import FreeParameter
+
+WIDEST = 1e9
+"""Largest size of a parameter of a file, which says itself what it allows."""
+DIGITS = 9
+"""Decimals of the places in tracks [m]: the last bits of a sine differ between machines."""
+
+
+class _Scene(NamedTuple):
+    """A played scene in coordinates of Ego's lane, and its length [s]."""
+
+    played: Played
+    bodies: dict[str, Moved]
+
+
+@lru_cache(maxsize=20_000)
+def _scene(file: str, stamp: tuple[int, ...], ego: str, values: tuple[tuple[str, str], ...]) -> _Scene:
+    played = play(file, dict(values), ego)
+    start = played.start
+    return _Scene(
+        played,
+        {
+            one.name: one._replace(
+                place=np.round((one.place - start.place) / start.facing, DIGITS),
+                facing=np.round(one.facing / start.facing, DIGITS + 3),
+            )
+            for one in played.others
+        },
+    )
+
+
+class OpenScenario(TrackScenario):
+    """A file of OpenSCENARIO XML with values of its parameters: what moves in it, around its Ego.
+
+    Parameters
+    ----------
+    file
+        Path of a concrete file.
+    ego
+        The name of the vehicle under test in it.
+    values
+        Values of the file's parameters by name, numbers or texts, or arrays of N numbers.
+    """
+
+    def __init__(self, file: str, ego: str = "Ego", **values: Any) -> None:
+        self.file, self.ego, self.values = os.path.abspath(file), ego, values
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, OpenScenario) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        return self.file, self.ego, repr(self.values)
+
+    def free(self) -> Mapping[str, FreeParameter]:
+        """Every number among the file's parameters may be searched; a file states no units."""
+        return {
+            name: FreeParameter(lower=-WIDEST, upper=WIDEST, unit="", meaning=name)
+            for name in self._scenes[0].played.numbers
+        }
+
+    def at(self, values: Mapping[str, Any]) -> OpenScenario:
+        """The file at other values of its parameters."""
+        return OpenScenario(self.file, self.ego, **{**self.values, **values})
+
+    @property
+    def _scenes(self) -> list[_Scene]:
+        """The scenes of all encounters."""
+        found = self.__dict__.get("_found")
+        if found is None:
+            found = self.__dict__["_found"] = [*self._played()]
+        return found
+
+    def _played(self) -> Sequence[_Scene]:
+        n = max((np.size(value) for value in self.values.values()), default=1)
+        columns = {
+            name: [value] * n if isinstance(value, str) or np.ndim(value) == 0 else [*value]
+            for name, value in self.values.items()
+        }
+        return [
+            _scene(
+                self.file, self._stamp, self.ego, tuple((name, text_of(column[k])) for name, column in columns.items())
+            )
+            for k in range(n)
+        ]
+
+    @property
+    def _stamp(self) -> tuple[int, ...]:
+        """When the file was changed."""
+        try:
+            return (os.stat(self.file).st_mtime_ns,)
+        except OSError:
+            raise InputError("scenario.file", f"there is no file {self.file!r}", "the path of a file") from None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_found"}
+
+    def _of_scenes(self, values: Sequence[float]) -> Any:
+        """A number, or an array for N encounters."""
+        is_searched = any(np.ndim(value) for value in self.values.values() if not isinstance(value, str))
+        return np.array(values) if is_searched else values[0]
+
+    @property
+    def duration(self) -> Any:
+        """Length of a run [s]."""
+        return self._of_scenes([scene.played.duration for scene in self._scenes])
+
+    @property
+    def test_speed(self) -> Any:
+        """The speed that Ego holds, and the vehicle under test until its driving system acts [m/s]."""
+        return self._of_scenes([scene.played.speed for scene in self._scenes])
+
+    @property
+    def start_speed(self) -> Any:
+        """The same [m/s]."""
+        return self.test_speed
+
+    @property
+    def depends_until(self) -> Any:
+        """The time until which motions depend on an Ego that holds its speed [s]."""
+        return self._of_scenes([scene.played.depends_until for scene in self._scenes])
+
+    @property
+    def vut_length(self) -> float:
+        """Length of Ego [m]."""
+        return self._scenes[0].played.ego.length
+
+    @property
+    def vut_width(self) -> float:
+        """Width of Ego [m]."""
+        return self._scenes[0].played.ego.width
+
+    def remarks(self) -> list[str]:
+        """What of the file has no effect here, or never happens."""
+        return self._scenes[0].played.remarks
+
+    def tracks(self, times: FloatArray) -> list[Track]:
+        """All entities but Ego; beyond the end of the scene they go on as they move there."""
+        samples = times[:, 0] / STEP
+        return [
+            self._track(name, [scene.bodies[name] for scene in self._scenes], samples)
+            for name in self._scenes[0].bodies
+        ]
+
+    def _track(self, name: str, bodies: Sequence[Moved], samples: FloatArray) -> Track:
+        if len({(body.shape.length, body.shape.width) for body in bodies}) > 1:
+            problem = f"the body of {name} depends on a searched parameter"
+            raise InputError("scenario.search", problem, "values of it in the matrix")
+        place, facing, speed = (
+            np.stack([_sampled(getattr(body, column), samples) for body in bodies], axis=1)
+            for column in ("place", "facing", "speed")
+        )
+        beyond = np.stack([np.maximum(samples - (len(body.speed) - 1), 0.0) for body in bodies], axis=1)
+        facing = facing / np.abs(facing)
+        place = place + beyond * STEP * speed * facing
+        shape = bodies[0].shape
+        return Track(
+            name, shape.kind, shape.length, shape.width, place.real, place.imag, facing.real, facing.imag, speed
+        )
+
+
+def _sampled(column: Any, samples: FloatArray) -> Any:
+    """A column of samples `STEP` apart at others, linear in between."""
+    inside = np.minimum(samples, len(column) - 1)
+    below = np.minimum(np.floor(inside + 1e-6).astype(int), len(column) - 1)
+    share = np.maximum(inside - below, 0.0)
+    share[share < 1e-6] = 0.0
+    return column[below] + share * (column[np.minimum(below + 1, len(column) - 1)] - column[below])
+
+
+def text_of(value: Any) -> str:
+    """A value as a file has it."""
+    if isinstance(value, bool | np.bool_):
+        return str(bool(value)).lower()
+    return value if isinstance(value, str) else repr(int(value) if float(value).is_integer() else float(value))

@@ -1,0 +1,174 @@
+"""`[scenario]` with a `file` of OpenSCENARIO: it becomes the scenario `openscenario`, its domains, and a matrix."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.openscenario import constraints_of, open_file, read
+from safevar_sumo.openscenario.logical import Source, originals
+from safevar_sumo.study.schema import Parameters
+
+MODEL = "openscenario"
+"""The scenario that plays a file."""
+MOST_POINTS = 2000
+"""Largest number of combinations of a file's values in a matrix."""
+WEATHER = ("road_friction", "visibility", "recognition_delay")
+"""Parameters of the weather, which a study may search as well."""
+Raw = Mapping[str, Any]
+
+
+def path_of(name: str, places: Sequence[str], source: object) -> str:
+    """The path of a file that a study names, beside the study."""
+    for place in places or (os.getcwd(),):
+        if (path := Path(place, name)).is_file():
+            return os.path.abspath(path)
+    raise InputError(source, f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)")
+
+
+def files_of(scenario: Parameters, places: Sequence[str], source: object) -> dict[str, str]:
+    """The paths of all files that a scenario from a file depends on, by themselves."""
+    file = scenario.get("file")
+    if not isinstance(file, str):
+        return {}
+    path = path_of(file, places, source)
+    given = {name: str(value) for name, value in scenario.items() if name not in ("file", "ego")}
+    document = read(path, given)
+    return {name: name for name in (path, *document.catalogs, document.road)}
+
+
+def with_file(source: object, tables: Raw, places: Sequence[str]) -> Parameters:
+    """The tables of a study whose scenario names a `file`, with all that the file says in its place.
+
+    A range that is searched becomes its domain; what is not searched and has several values becomes points of the
+    matrix, without those that the file's constraints exclude.
+    """
+    scenario = tables.get("scenario")
+    if not isinstance(scenario, dict) or "file" not in scenario:
+        return dict(tables)
+    for key in ("model", "parameters", "files"):
+        if scenario.get(key):
+            raise InputError(
+                source, f"scenario.{key} beside scenario.file", "one of the two; values stand in [scenario.values]"
+            )
+    name, values, search = scenario["file"], scenario.get("values", {}), scenario.get("search", {})
+    for key, value, kind in (("file", name, str), ("values", values, dict), ("search", search, dict)):
+        if not isinstance(value, kind):
+            raise InputError(source, f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
+    try:
+        return _expanded(source, tables, open_file(path_of(name, places, source)), places)
+    except InputError as error:
+        raise InputError(source, f"scenario.file = {name!r}: {error.problem}", error.legal) from None
+
+
+def _expanded(source: object, tables: Raw, offered: Source, places: Sequence[str]) -> Parameters:
+    scenario: Parameters = tables["scenario"]
+    values, search = scenario.get("values", {}), scenario.get("search", {})
+    for name in (*values, *(name for name in search if name not in WEATHER)):
+        if name not in offered.values:
+            raise unknown_name("scenario", f"the file declares no parameter {name}", name, offered.values)
+    domains = {name: table if name in WEATHER else _domain(name, table, offered) for name, table in search.items()}
+    fixed = {name: value if isinstance(value, str) else _plain(value) for name, value in values.items()}
+    rest = offered.without({**values, **search})
+    parameters = {"file": _relative(offered.concrete, places), **fixed}
+    if "ego" in scenario:
+        parameters["ego"] = scenario["ego"]
+    kept = {key: value for key, value in scenario.items() if key not in ("file", "ego", "values")}
+    result = {**tables, "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains}}
+    matrix = tables.get("matrix")
+    has_tests = isinstance(matrix, dict) and bool(matrix.get("tests"))
+    points = [{}] if has_tests else _points(rest, fixed, domains)
+    if len(points) == 1:
+        parameters.update(points[0])
+    else:
+        tests = [
+            {"name": Path(scenario["file"]).stem, "over": {name: [value] for name, value in point.items()}}
+            for point in points
+        ]
+        result["matrix"] = {**(matrix or {}), "tests": tests}
+    if constraints := _constraints(offered, fixed, domains, points):
+        result["constraints"] = [*tables.get("constraints", []), *constraints]
+    return result
+
+
+def _domain(name: str, table: object, offered: Source) -> Parameters:
+    """The domain of a searched parameter: what the study leaves out comes from the file."""
+    if not isinstance(table, dict):
+        raise InputError("scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty")
+    numbers, ends = originals(offered), offered.range_of(name)
+    if name not in numbers:
+        raise InputError("scenario", f"{name} = {offered.values[name]!r} is no number", "a number to search")
+    if ends is None and not {"lower", "upper"} <= table.keys():
+        raise InputError("scenario", f"{name} has no range in the file", "lower and upper in [scenario.search]")
+    lower, upper = ends or (-np.inf, np.inf)
+    domain = {"unit": "-", "original": numbers[name], "meaning": name, "lower": lower, "upper": upper, **table}
+    if all(isinstance(domain[key], int | float) for key in ("lower", "upper", "original")):
+        if domain["lower"] < lower or domain["upper"] > upper:
+            problem = f"scenario.search.{name}: {domain['lower']:g} to {domain['upper']:g}"
+            raise InputError("scenario", problem, f"a part of the file's range, {lower:g} to {upper:g}")
+        if not domain["lower"] <= domain["original"] <= domain["upper"]:
+            problem = f"scenario.search.{name}: the file's value {domain['original']:g} is not in its range"
+            raise InputError("scenario", problem, f"original = a value from {domain['lower']:g} to {domain['upper']:g}")
+    return domain
+
+
+def _points(rest: Source, fixed: Parameters, domains: Parameters) -> list[Parameters]:
+    """The combinations of all values that are not searched, at the original values of those that are."""
+    total = int(np.prod([float(len(choice.sets)) for choice in rest.choices])) if rest.choices else 1
+    if total > 50 * MOST_POINTS:
+        raise _too_many(rest, total)
+    given = {name: str(value) for name, value in fixed.items()}
+    own = {name: repr(domain["original"]) for name, domain in domains.items() if name in rest.values}
+    points = []
+    for combination in rest.combinations({**given, **own}):
+        points.append({name: _plain(value) for name, value in combination.items()})
+        if len(points) > MOST_POINTS:
+            raise _too_many(rest, total)
+    if not points:
+        raise InputError("scenario", "the file's constraints exclude every combination of its values")
+    return points
+
+
+def _too_many(rest: Source, total: int) -> InputError:
+    sizes = ", ".join(f"{' and '.join(choice.names)} ({len(choice.sets)})" for choice in rest.choices)
+    legal = "parameters under [scenario.search] or [scenario.values], so that fewer are left"
+    return InputError("scenario", f"{total:,} combinations of {sizes}; at most {MOST_POINTS:,}", legal)
+
+
+def _plain(value: Any) -> Any:
+    """A value as a number if it is one."""
+    if isinstance(value, str):
+        try:
+            number = float(value)
+        except ValueError:
+            return value
+        return int(number) if number.is_integer() and "." not in value else number
+    return value
+
+
+def _relative(path: str, places: Sequence[str]) -> str:
+    """A path as it is from the folder of the study."""
+    return os.path.relpath(path, places[0]) if places and path.startswith(places[0] + os.sep) else path
+
+
+def _constraints(
+    offered: Source, fixed: Parameters, domains: Parameters, points: Sequence[Parameters]
+) -> list[Parameters]:
+    """The file's constraints on what is searched, which must be linear there, at all points."""
+    names = [name for name in domains if name in offered.values]
+    if not names:
+        return []
+    low, high = (np.array([float(domains[name][end]) for name in names]) for end in ("lower", "upper"))
+    found: dict[str, Parameters] = {}
+    for point in points:
+        given = {name: str(value) for name, value in {**fixed, **point}.items()}
+        for bound in constraints_of(offered.concrete, given, names, low, high):
+            weights = {name: weight for name, weight in zip(names, bound.weights, strict=True) if weight}
+            table = {"sum": weights, bound.kind: bound.limit, "unit": "-", "meaning": bound.text}
+            found[repr(table)] = table
+    return [*found.values()]
