@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from difflib import get_close_matches
 from numbers import Integral
 
@@ -14,6 +16,25 @@ MAX_BATCH = 10_000
 """Largest number of settings in a batch that a user may ask for."""
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
+
+
+_subject: ContextVar[str] = ContextVar("subject", default="study")
+"""What the code that runs now is about: a study, a file or a command's argument, as errors name it."""
+
+
+def subject() -> str:
+    """The study, file or argument that the code that runs now is about."""
+    return _subject.get()
+
+
+@contextmanager
+def about(source: object) -> Iterator[None]:
+    """Within the block, errors without a source of their own are about this one."""
+    token = _subject.set(str(source))
+    try:
+        yield
+    finally:
+        _subject.reset(token)
 
 
 class SafevarError(Exception):
@@ -28,7 +49,7 @@ class InputError(SafevarError):
     Parameters
     ----------
     source
-        Where the value comes from: a file, a flag or a command's argument.
+        Where the value comes from: a file, a flag or a command's argument; "" for what the code that runs now is about.
     problem
         The key and the value, and what is wrong with them.
     legal
@@ -38,8 +59,8 @@ class InputError(SafevarError):
     exit_code = 2
 
     def __init__(self, source: object, problem: str, legal: str = "") -> None:
-        self.source, self.problem, self.legal = source, problem, legal
-        super().__init__(source, problem, legal)
+        self.source, self.problem, self.legal = source or subject(), problem, legal
+        super().__init__(self.source, problem, legal)
 
     def __str__(self) -> str:
         message = f"{self.source}: {self.problem}"

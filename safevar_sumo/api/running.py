@@ -9,7 +9,7 @@ from pathlib import Path
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, problem_of, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import MAX_BATCH, InputError, check_whole, warn
+from safevar_sumo.errors import MAX_BATCH, InputError, about, check_whole, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
@@ -109,5 +109,6 @@ def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
     for name in loaded_study.search.labels:
         algorithm = algorithm_of(name, loaded_study)
         if isinstance(algorithm, PymooAlgorithm):
-            algorithm.try_out(problem, loaded_study.source)
+            with about(loaded_study.source):
+                algorithm.try_out(problem)
     return loaded_study, system

@@ -9,14 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.errors import InputError, about, unknown_name
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import Failure, Journal, failures_of, run_name
 from safevar_sumo.search import ALGORITHMS, DESCRIPTIONS, PYMOO_ALGORITHMS, Algorithm, Problem, Search, pymoo_algorithm
 from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
 from safevar_sumo.sumo.system import System
-from safevar_sumo.vehicles import region_of
 
 
 class RunKey(NamedTuple):
@@ -55,30 +54,31 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     InputError
         If no algorithm has this label, or the algorithm does not meet its contract or does not take its parameters.
     """
-    source, search = study.source, study.search
-    name, key = search.labels.get(label, label), f"search.{label}"
-    parameters_of = {label_of(table): parameters for table, parameters in search.parameters.items()}
-    if len(search.labels) < len(search.algorithms):
-        raise InputError(
-            source,
-            f"search.algorithms = {search.algorithms}: two have the same name",
-            "algorithms with different names",
-        )
-    for table in search.parameters:
-        if not (table in PYMOO_ALGORITHMS or table in ALGORITHMS or label_of(table) in search.labels):
-            legal = dict.fromkeys((*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels))
-            problem = f"search.{table}: there is no such key and no such algorithm"
-            raise unknown_name(source, problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal)
-    lookup = Lookup.of(study)
-    if PYMOO + name in PYMOO_ALGORITHMS:
-        raise InputError(source, f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
-    if name.startswith(PYMOO):
-        member, key = Member(pymoo_algorithm(name, source)), f"search.{name!r}"
-    else:
-        member = lookup.class_of({**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm)
-    parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
-    algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
-    return algorithm
+    with about(study.source):
+        search = study.search
+        name, key = search.labels.get(label, label), f"search.{label}"
+        parameters_of = {label_of(table): parameters for table, parameters in search.parameters.items()}
+        if len(search.labels) < len(search.algorithms):
+            raise InputError(
+                "",
+                f"search.algorithms = {search.algorithms}: two have the same name",
+                "algorithms with different names",
+            )
+        for table in search.parameters:
+            if not (table in PYMOO_ALGORITHMS or table in ALGORITHMS or label_of(table) in search.labels):
+                legal = dict.fromkeys((*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels))
+                problem = f"search.{table}: there is no such key and no such algorithm"
+                raise unknown_name("", problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal)
+        lookup = Lookup.of(study)
+        if PYMOO + name in PYMOO_ALGORITHMS:
+            raise InputError("", f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
+        if name.startswith(PYMOO):
+            member, key = Member(pymoo_algorithm(name)), f"search.{name!r}"
+        else:
+            member = lookup.class_of({**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm)
+        parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
+        algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key)
+        return algorithm
 
 
 def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
@@ -89,7 +89,7 @@ def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
         evaluations=study.search.evaluations,
         population=study.search.population,
         scoring=system.measuring.scoring,
-        region=region_of(study),
+        region=system.region,
     )
 
 

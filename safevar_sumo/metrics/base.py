@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
-STUDY_SOURCE = "study"
-"""Source of errors about a study's table [metrics], in functions that do not know the study's file."""
 
 
 def sampling_stride(step: float, interval: float | None) -> int:
@@ -36,9 +34,7 @@ def sampling_stride(step: float, interval: float | None) -> int:
     steps = round(interval / step)
     if steps < 1 or abs(steps * step - interval) > TIME_TOLERANCE:
         raise InputError(
-            STUDY_SOURCE,
-            f"metrics.sampling_interval = {interval}",
-            f"a whole multiple of the simulation's step, {step:g} s",
+            "", f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s"
         )
     return steps
 

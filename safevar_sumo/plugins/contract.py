@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError, describe_error
+from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError, about, describe_error
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
@@ -36,9 +36,12 @@ _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 
 @contextmanager
 def user_errors(source: str) -> Iterator[None]:
-    """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError` about the study `source`."""
+    """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError`; errors are about the study
+    `source`.
+    """
     try:
-        yield
+        with about(source):
+            yield
     except (UserCodeError, SimulationError, EnvironmentFault, KeyboardInterrupt):
         raise
     except BaseException as error:

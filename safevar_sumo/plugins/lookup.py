@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError, UserCodeError, describe_error, did_you_mean, one_of
+from safevar_sumo.errors import InputError, UserCodeError, describe_error, did_you_mean, one_of, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins.contract import UserCode, checked_class, contract_of, user_error_of, user_errors, violation
 from safevar_sumo.plugins.files import is_user_file
@@ -43,20 +43,17 @@ _user_modules: set[str] = set()
 class Lookup(NamedTuple):
     """Looks up the names of a study.
 
-    `source` is the study, as errors name it; `folders`, searched first, are those of the study's file and of the files
+    `folders`, searched first, are those of the study's file and of the files
     that it extends; `files` are the paths of its data files by the names that it gives them.
     """
 
-    source: str
     folders: Sequence[str] = ()
     files: Mapping[str, str] = MappingProxyType({})
 
     @classmethod
-    def of(cls, study: Study, source: str = "") -> Lookup:
-        """The lookup for a study, which errors name by `source`; raises an InputError if one of its data files is
-        missing.
-        """
-        return cls(source or study.source, study.origin.places, data_files(study))
+    def of(cls, study: Study) -> Lookup:
+        """The lookup for a study; raises an InputError if one of its data files is missing."""
+        return cls(study.origin.places, data_files(study))
 
     def find(self, shipped: Mapping[str, Any], name: str, key: str) -> Member:
         """The object called `name` among the `shipped` ones, or the object that `package.module:Name` names.
@@ -73,14 +70,14 @@ class Lookup(NamedTuple):
         expected = f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
         module_name, colon, attribute = name.partition(":")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
-            raise InputError(self.source, f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
-        code = UserCode(self.source, f"{key} = {name!r}")
+            raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
+        code = UserCode(subject(), f"{key} = {name!r}")
         module = self._import(module_name, code.name)
         try:
             target = getattr(module, attribute)
         except AttributeError:
             problem = f"{code.name} cannot be imported: {file_of_module(module_name)} has no {attribute!r}"
-            raise InputError(self.source, problem, expected) from None
+            raise InputError("", problem, expected) from None
         return Member(target, code._replace(target=target))
 
     def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
@@ -96,7 +93,7 @@ class Lookup(NamedTuple):
         base = base or next((base for base in bases if not violation(member.target, base)), bases[-1])
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
-            raise UserCodeError(self.source, f"{member.code.name} {reason}", expected, member.code.definition())
+            raise UserCodeError("", f"{member.code.name} {reason}", expected, member.code.definition())
         return member._replace(target=checked_class(member.code, base))
 
     def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
@@ -118,25 +115,25 @@ class Lookup(NamedTuple):
         if is_name and value not in self.files and file_beside(value, [*self.folders, os.getcwd()]):
             problem = f"{key} = {value!r}: the study does not name this file"
             table = key.partition(".")[0]
-            raise InputError(self.source, problem, f"files = [{value!r}] in its table [{table}]")
+            raise InputError("", problem, f"files = [{value!r}] in its table [{table}]")
         return self.files.get(value, value) if is_name else value
 
     def _import(self, name: str, key: str) -> ModuleType:
         if name.partition(".")[0] == "__main__":
             problem = f"{key}: other processes cannot import from __main__"
-            raise InputError(self.source, problem, "a module in a file of its own")
+            raise InputError("", problem, "a module in a file of its own")
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
         modules_before, dont_write_bytecode = set(sys.modules), sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         try:
-            with user_errors(self.source), np.errstate():
+            with user_errors(subject()), np.errstate():
                 return importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
             problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
             expected = getattr(error, "legal", "") or f"a module in {' or '.join(folders)}, or an installed one"
-            raise UserCodeError(self.source, f"{key} cannot be imported: {problem}", expected) from error
+            raise UserCodeError("", f"{key} cannot be imported: {problem}", expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             _user_modules.update(sys.modules.keys() - modules_before)
@@ -221,7 +218,7 @@ def _is_of_libraries(entry: str) -> bool:
     return bool(entry) and not is_user_file(os.path.join(entry, ""))
 
 
-def instance_of(member: Member, parameters: Parameters, name: str, key: str, source: str) -> Any:
+def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> Any:
     """An instance of a class.
 
     Parameters
@@ -236,12 +233,12 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str, sou
     InputError
         If the class does not take the parameters.
     """
-    with user_errors(source), np.errstate():
+    with user_errors(subject()), np.errstate():
         if issubclass(member.target, msgspec.Struct):
-            return convert_table(source, parameters, member.target, key)
+            return convert_table(parameters, member.target, key)
         try:
             return member.target(**parameters)
         except TypeError as error:
-            if user_error_of(source, error):
+            if user_error_of(subject(), error):
                 raise
-            raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None
+            raise InputError("", f"{name} does not take {key} = {dict(parameters)}: {error}") from None

@@ -159,7 +159,7 @@ def is_rated(study: Study) -> bool:
     return study.matrix is not None and bool(study.matrix.protocol) and not study.matrix.point
 
 
-def rater_of(study: Study, source: str) -> Rater | None:
+def rater_of(study: Study) -> Rater | None:
     """The rater of a study with a protocol's matrix; None for other studies.
 
     Raises
@@ -172,10 +172,10 @@ def rater_of(study: Study, source: str) -> Rater | None:
     protocol = protocol_of(study.matrix.protocol)
     for test, claims in study.rating.claims.items():
         key = f"rating.claims.{test}"
-        check_name(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
+        check_name("", f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
         legal = [layer.name for layer in protocol.layers_of(test) if not layer.simulated_conditions]
         for claim in claims:
-            check_name(source, f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
+            check_name("", f"{key}: {claim!r} does not count for {test}, or is simulated", claim, legal)
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 
@@ -183,8 +183,8 @@ def darken(weather: Weather) -> Weather:
     """The weather by night: the same road; darkness changes visibility and recognition delay."""
     if weather.light == "night":
         return weather
-    night = weather_of("night", "weather")
-    name = "night" if weather == weather_of("clear", "weather") else f"{weather.name} by night"
+    night = weather_of("night")
+    name = "night" if weather == weather_of("clear") else f"{weather.name} by night"
     return replace(
         weather,
         name=name,

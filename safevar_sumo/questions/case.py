@@ -80,7 +80,7 @@ class Case:
 
     @property
     def weather(self) -> Weather:
-        return weather_of(self.study.weather, self.name)
+        return weather_of(self.study.weather)
 
     @property
     def unsafe(self) -> Unsafe:

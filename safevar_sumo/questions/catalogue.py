@@ -82,7 +82,7 @@ def list_models(kind: str | None = None) -> Answer:
     """
     own = {}
     if kind is not None and ":" in kind:
-        own[kind] = Lookup("list").class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario).target
+        own[kind] = Lookup().class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario).target
         kind = "scenarios"
     effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
     weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)

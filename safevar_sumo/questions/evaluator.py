@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import COMPILING, ask_why_no_verdict, compile_vehicle, evaluate_all
-from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.case import Case
@@ -54,7 +54,9 @@ class Evaluator:
     def __init__(
         self, study: Study, pool: Pool, progress: Progress = show_no_progress, verified: int = VERIFIED_SETTINGS
     ) -> None:
-        self.study, self.region = study, region_of(study)
+        self.study = study
+        with about(study.source):
+            self.region = region_of(study)
         self.characteristics = self.region.characteristics
         self._pool, self.progress, self._verified = pool, progress, verified
         self.simulated = 0

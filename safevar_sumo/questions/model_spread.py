@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, about
 from safevar_sumo.questions.evaluator import Evaluator, Found, side_by_side
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
@@ -176,7 +176,8 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
     for name, value in values.items():
         table, key = locate_parameter(tables, name)
         table[key] = value
-    return convert_table(study.source, tables, Study)
+    with about(study.source):
+        return convert_table(tables, Study)
 
 
 def value_of(study: Study, name: str) -> float:
@@ -187,4 +188,4 @@ def value_of(study: Study, name: str) -> float:
 
 def _as_tables(study: Study) -> Any:
     """The study as plain tables; a weather's name is replaced by the weather's table."""
-    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
+    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather)))

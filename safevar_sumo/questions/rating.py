@@ -256,7 +256,7 @@ def _verdict(
     study: Study, settings: Mapping[str, FloatArray], scores: Points, possible: float, tests: pd.DataFrame
 ) -> str:
     """How many points the variant loses and in which tests; without a variant, the original's points."""
-    weather, road = weather_of(study.weather, f"study {study.name!r}"), ""
+    weather, road = weather_of(study.weather), ""
     if weather.water or weather.road_friction != 1:
         road = (
             f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, about
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import (
@@ -33,7 +33,8 @@ class VariationModel:
     """
 
     def __init__(self, study: Study) -> None:
-        self.region: FeasibleRegion = region_of(study)
+        with about(study.source):
+            self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
         distributions = [study.variation.get(name, Uniform()) for name in self.characteristics.names]
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))

@@ -20,7 +20,7 @@ import pandas as pd
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
@@ -70,7 +70,8 @@ class Packed:
     ) -> None:
         self.packed, self.files, self._places, self._jobs, self._progress = packed, files, places, jobs, progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
-        study = convert_table(MANIFEST, self.manifest["study"], Study, "study")
+        with about(MANIFEST):
+            study = convert_table(self.manifest["study"], Study, "study")
         study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
         self._check_claims(study)
         scoring = msgspec.convert(self.manifest["scoring"], Scoring) if "scoring" in self.manifest else None

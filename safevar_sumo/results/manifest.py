@@ -16,7 +16,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import DESCRIPTION_KEYS, PYMOO, Study, convert_table, tables_of
@@ -255,7 +255,8 @@ def read_manifest(directory: Path) -> JsonObject:
             f"holds results in format {format_number}; this version reads format {FORMAT}",
             f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
         )
-    convert_table(file, manifest, _Manifest)
+    with about(file):
+        convert_table(manifest, _Manifest)
     return dict(manifest)
 
 

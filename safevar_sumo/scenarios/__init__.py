@@ -55,7 +55,7 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     return {} if scenario.brakes_fully else {**scenario.free(), **WEATHER_PARAMETERS}
 
 
-def weather_of(choice: str | Weather, source: object) -> Weather:
+def weather_of(choice: str | Weather) -> Weather:
     """The weather that a study names or defines.
 
     Raises
@@ -66,7 +66,7 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
     if isinstance(choice, Weather):
         return choice
     fields = ", ".join(Weather.__struct_fields__)
-    check_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+    check_name("", f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
     return WEATHERS[choice]
 
 

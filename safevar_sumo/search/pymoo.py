@@ -123,26 +123,26 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         result = every.take([rows[setting.tobytes()] for setting in _settings(optimum, problem)])
         return result.take(problem.scoring.valid(result))
 
-    def try_out(self, problem: Problem, source: str) -> None:
+    def try_out(self, problem: Problem) -> None:
         """Search a formula in place of simulations, if the study gives arguments.
 
         Raises
         ------
         InputError
-            Naming the arguments of the study `source` without which pymoo would not fail.
+            Naming the arguments without which pymoo would not fail.
         """
         given = {name: value for name in self.__struct_fields__ if (value := getattr(self, name)) is not UNSET}
         key = f"search.{self.name!r}"
         size = given.get("pop_size", 0)
         if size > problem.evaluations:
             legal = f"at most the {problem.evaluations} evaluations of a run"
-            raise InputError(source, f"{key}.pop_size = {size}", legal)
+            raise InputError("", f"{key}.pop_size = {size}", legal)
         if not given or not (failure := self._failure(problem)):
             return
         without = {name: msgspec.structs.replace(self, **{name: UNSET}) for name in given}
         blamed = [name for name, other in without.items() if not other._failure(problem)] or list(given)
         named = " and ".join(f"{key}.{name} = {given[name]!r}" for name in blamed)
-        raise InputError(source, f"{named}: pymoo fails: {failure}", "another value, or none")
+        raise InputError("", f"{named}: pymoo fails: {failure}", "another value, or none")
 
     def _failure(self, problem: Problem) -> str:
         """The error with which pymoo fails in a search of a formula, "" if it does not."""
@@ -254,15 +254,15 @@ class _Randomness:
             raise InputError(self._name, describe_error(error), "other arguments or objectives") from error
 
 
-def pymoo_algorithm(name: str, source: str) -> type[PymooAlgorithm]:
-    """The class of an algorithm of pymoo by its name in a study, `source`.
+def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
+    """The class of an algorithm of pymoo by its name in a study.
 
     Raises
     ------
     InputError
         If pymoo is not installed or has no such algorithm.
     """
-    check_name(source, f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
+    check_name("", f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
     fields = []
     for argument, default in _plain_arguments(name).items():
         kind = TYPES.get(argument, type(default))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
+from safevar_sumo.errors import InputError, about, did_you_mean, one_of, unknown_name
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
@@ -100,24 +100,29 @@ def _raw_study(study: StudyLike) -> _RawStudy:
 
 
 def _checked_study(raw: _RawStudy) -> Study:
+    with about(raw.source):
+        return _converted(raw)
+
+
+def _converted(raw: _RawStudy) -> Study:
     if "origin" in raw.tables:
-        raise InputError(raw.source, "origin: there is no such key")
+        raise InputError("", "origin: there is no such key")
     tables = with_file(raw.source, raw.tables, raw.origin.places)
     tables = _with_parameters(_with_parameters(tables, "search", SearchTable), "repair", RepairTable)
     matrix, vehicle = tables.get("matrix"), tables.get("vehicle")
     if isinstance(matrix, dict) and matrix.get("tests") == [] and not matrix.get("protocol"):
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
-        raise _without_characteristics(raw.source, vehicle["model"])
-    study = convert_table(raw.source, tables, Study)
+        raise _without_characteristics(vehicle["model"])
+    study = convert_table(tables, Study)
     if study.rating.claims and not (study.matrix and study.matrix.protocol):
-        raise InputError(raw.source, "rating.claims: the study is not rated", "matrix.protocol, or no claims")
+        raise InputError("", "rating.claims: the study is not rated", "matrix.protocol, or no claims")
     for name in study.spread:
-        locate_parameter(msgspec.to_builtins(study), name, raw.source)
+        locate_parameter(msgspec.to_builtins(study), name)
     return msgspec.structs.replace(study, origin=raw.origin)
 
 
-def _without_characteristics(source: object, model: object) -> InputError:
+def _without_characteristics(model: object) -> InputError:
     """The error for a vehicle without characteristics: another model does not inherit those of the study's base."""
     texts = (study_path(name).read_text(encoding="utf-8") for name in study_names())
     models = {
@@ -125,7 +130,7 @@ def _without_characteristics(source: object, model: object) -> InputError:
     }
     problem = f"vehicle.model = {model!r} has no characteristics: vehicle.characteristics is missing"
     legal = f"[vehicle.characteristics] of that model; of a shipped study that is extended, those of {one_of(models)}"
-    return InputError(source, f"{problem}{did_you_mean(model, models)}", legal)
+    return InputError("", f"{problem}{did_you_mean(model, models)}", legal)
 
 
 def _with_parameters(tables: Parameters, name: str, record: type[SearchTable | RepairTable]) -> Parameters:

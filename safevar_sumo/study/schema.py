@@ -360,7 +360,7 @@ def _without_defaults(value: Any) -> Any:
     return table
 
 
-def locate_parameter(tables: Any, name: str, source: object = "study") -> tuple[Any, int | str]:
+def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
     """The table or list that holds a parameter of a study, and the parameter's key or index in it.
 
     Raises
@@ -380,7 +380,7 @@ def locate_parameter(tables: Any, name: str, source: object = "study") -> tuple[
         key_or_index = last
     if not (is_number and name.startswith(SPREAD_TABLES)):
         expected = f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in SPREAD_TABLES)}"
-        raise InputError(source, f"spread.{name!r} is no parameter of the study", expected)
+        raise InputError("", f"spread.{name!r} is no parameter of the study", expected)
     return table, key_or_index
 
 

@@ -31,7 +31,7 @@ WORDS = {
 """What msgspec expects, in words."""
 
 
-def convert_table(source: object, raw: Any, table: type[T], prefix: str = "") -> T:
+def convert_table(raw: Any, table: type[T], prefix: str = "") -> T:
     """Convert a table to a record.
 
     Raises
@@ -41,19 +41,17 @@ def convert_table(source: object, raw: Any, table: type[T], prefix: str = "") ->
     """
     try:
         for path, number in _infinite_numbers(raw, [prefix] if prefix else []):
-            raise InputError(source, f"{path} = {number}", "a finite number")
+            raise InputError("", f"{path} = {number}", "a finite number")
         return msgspec.convert(raw, table)
     except msgspec.ValidationError as error:
-        raise _mistake(source, raw, table, prefix, str(error)) from None
-    except InputError as error:
-        raise InputError(source, error.problem, error.legal) from None
+        raise _mistake(raw, table, prefix, str(error)) from None
 
 
 NO_KEY = "origin"
 """Field of a study that no file may have."""
 
 
-def _mistake(source: object, raw: Any, table: Any, prefix: str, message: str) -> InputError:
+def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     """The error for a message of msgspec, which ends with the place of the mistake."""
     problem, _, location = message.partition(" - at `$")
     path, value, kinds, siblings = [prefix] if prefix else [], raw, [table], ()
@@ -66,28 +64,28 @@ def _mistake(source: object, raw: Any, table: Any, prefix: str, message: str) ->
     kind = _meant(kinds[-1], value)
     text, quoted = _path_text(path), _short_text(value)
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
-        return _unknown_key(source, _path_text([*path, field[1]]), field[1], kind, table)
+        return _unknown_key(_path_text([*path, field[1]]), field[1], kind, table)
     if field := re.match(r"Object missing required field `(.*)`", problem):
         hint = did_you_mean(path[-1], {*siblings} - {path[-1]}) if path else ""  # a mistyped table is a new one
-        return InputError(source, f"{text}: {field[1]} is missing{hint}".removeprefix(": "))
+        return InputError("", f"{text}: {field[1]} is missing{hint}".removeprefix(": "))
     if problem.startswith("Invalid enum value"):
-        return unknown_name(source, f"{text} = {quoted}", value, filter(None, get_args(kind)))
+        return unknown_name("", f"{text} = {quoted}", value, filter(None, get_args(kind)))
     if problem.startswith("Invalid value"):  # of the key that tells which table is meant
         tags = [one.__struct_config__.tag for one in get_args(kinds[-2])]
-        return unknown_name(source, f"{text} = {quoted}", value, tags)
+        return unknown_name("", f"{text} = {quoted}", value, tags)
     if expected := re.match(r"Expected (.*?)(, got `?\w+`?)?$", problem):
         if expected[1] == "`object`" and _is_record(kind):
-            return InputError(source, f"{text} = {quoted}", f"a table of {', '.join(kind.__struct_fields__)}")
+            return InputError("", f"{text} = {quoted}", f"a table of {', '.join(kind.__struct_fields__)}")
         for meta in getattr(kinds[-1], "__metadata__", ()):
             if meta.pattern and meta.description:
-                return InputError(source, f"{text} = {quoted}", meta.description)
+                return InputError("", f"{text} = {quoted}", meta.description)
         legal = re.sub(r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected[1])
-        return InputError(source, f"{text} = {quoted}", legal.replace("`", "").replace(" | ", " or "))
+        return InputError("", f"{text} = {quoted}", legal.replace("`", "").replace(" | ", " or "))
     problem, _, legal = problem.partition("\n")  # of a `__post_init__`
-    return InputError(source, f"{text}: {problem}".removeprefix(": "), legal)
+    return InputError("", f"{text}: {problem}".removeprefix(": "), legal)
 
 
-def _unknown_key(source: object, path: str, key: str, kind: Any, table: Any) -> InputError:
+def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     """The error for an unknown key, with the nearest key of its own table, or of another table in the whole one."""
     own = [name for name in kind.__struct_fields__ if name != NO_KEY]
     places = {
@@ -98,7 +96,7 @@ def _unknown_key(source: object, path: str, key: str, kind: Any, table: Any) -> 
     } | {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
-    return InputError(source, f"{path}: there is no such key{hint}", one_of(own))
+    return InputError("", f"{path}: there is no such key{hint}", one_of(own))
 
 
 def _meant(kind: Any, value: Any) -> Any:

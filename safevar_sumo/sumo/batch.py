@@ -14,7 +14,6 @@ import numpy.typing as npt
 from safevar_sumo.ads import Ads, FullBrake
 from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, open_rows, user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.protocol.driving_robot import DrivingRobot
@@ -33,7 +32,6 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, Scenario, Scene, TrackScenario, WorldScenario
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
-from safevar_sumo.sumo.cast_check import CAST_KEY
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
@@ -59,16 +57,11 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
     is_invalid = runs.outcome == Outcome.INVALID_TEST
     metrics = dict[str, FloatArray]()
     with user_errors(system.source):
-        try:
-            for name, measure in system.measuring.measures.items():
-                if measure.of == "settings":
-                    metrics[name] = measure.function(settings, system.characteristics)
-                else:
-                    metrics[name] = np.where(is_invalid, np.nan, measure.function(runs, system.metrics_table))
-        except InputError as error:
-            if error.source == STUDY_SOURCE:
-                raise InputError(system.source, error.problem, error.legal) from None
-            raise
+        for name, measure in system.measuring.measures.items():
+            if measure.of == "settings":
+                metrics[name] = measure.function(settings, system.characteristics)
+            else:
+                metrics[name] = np.where(is_invalid, np.nan, measure.function(runs, system.metrics_table))
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
@@ -156,12 +149,7 @@ def stage_of(system: System, settings: FloatArray) -> Stage | None:
     step = system.scenes.step_of(scenarios[0])
     duration = max(float(np.max(scenario.duration)) for scenario in scenarios)
     n_samples = round(duration / step) + 1
-    try:
-        return Stage(scenarios, n * len(scenarios), size, n_samples=n_samples, step=step)
-    except InputError as error:
-        if error.source != CAST_KEY:
-            raise
-        raise InputError(system.source, f"{error.source}: {error.problem}", error.legal) from None
+    return Stage(scenarios, n * len(scenarios), size, n_samples=n_samples, step=step)
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:

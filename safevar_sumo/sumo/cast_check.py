@@ -32,7 +32,9 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
     """
     for name, count in Counter(track.name for track in cast).items():
         if count > 1:
-            raise InputError(CAST_KEY, f"at 0 s {count} actors are called {name!r}", "another name for each actor")
+            raise InputError(
+                "", f"{CAST_KEY}: at 0 s {count} actors are called {name!r}", "another name for each actor"
+            )
     for track in cast:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
             shape = (1, *np.shape(value))[-2:]  # a number, or one row for all samples
@@ -40,7 +42,9 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
                 end = f" ends at {(shape[0] - 1) * step:g} s and" if np.ndim(value) == 2 else ""
                 problem = f"actor {track.name!r}: {name}{end} has the shape {np.shape(value)}"
                 samples = f"({n_samples}, 1), a value for each time up to {(n_samples - 1) * step:g} s"
-                raise InputError(CAST_KEY, problem, f"a number, or an array of the shape of `times`, {samples}")
+                raise InputError(
+                    "", f"{CAST_KEY}: {problem}", f"a number, or an array of the shape of `times`, {samples}"
+                )
 
 
 def check_motion(track: Track, step: float) -> None:
@@ -72,7 +76,7 @@ def _refuse(track: Track, step: float, wrong: BoolArray, values: FloatArray, pro
     if wrong.any():
         sample, column = np.argwhere(wrong)[0].tolist()
         text = problem.format(float(values[sample, column]))
-        raise InputError(CAST_KEY, f"at {sample * step:g} s actor {track.name!r} {text}", expected)
+        raise InputError("", f"{CAST_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected)
 
 
 def check_start(cast: Sequence[Track], own: Body) -> None:
@@ -90,7 +94,7 @@ def check_start(cast: Sequence[Track], own: Body) -> None:
         pair = (Body._make(np.broadcast_to(column, (n, *column.shape[1:])) for column in one) for one in (body, other))
         if (depth := find_overlaps(*pair).max()) > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {other_name}"
-            raise InputError(CAST_KEY, problem, "bodies that do not overlap at the start")
+            raise InputError("", f"{CAST_KEY}: {problem}", "bodies that do not overlap at the start")
 
 
 def _first(track: Track) -> Body:

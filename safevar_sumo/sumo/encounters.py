@@ -23,7 +23,7 @@ from safevar_sumo.sumo.network import stage_networks
 from safevar_sumo.sumo.recording import Recording
 
 
-def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
+def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     """Refuse a searched parameter that a scenario of the study does not have or in which weathers of its matrix differ,
     a domain that is wider than the scenario's, and domains in which an encounter is impossible.
     """
@@ -31,18 +31,18 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
         legal = searchable_in(point.scenario)
         for name, domain in study.scenario.search.items():
             key = f"scenario.search.{name}"
-            check_name(source, f"{key}: {type(point.scenario).__name__} has no such parameter to search", name, legal)
+            check_name("", f"{key}: {type(point.scenario).__name__} has no such parameter to search", name, legal)
             widest = legal[name]
             if widest.unit and domain.unit != widest.unit:
-                raise InputError(source, f"{key}.unit = {domain.unit!r}", repr(widest.unit))
+                raise InputError("", f"{key}.unit = {domain.unit!r}", repr(widest.unit))
             if domain.lower < widest.lower or domain.upper > widest.upper:
                 problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
                 part = f"[{widest.lower:g}, {widest.upper:g}]{unit_text(widest.unit)}"
-                raise InputError(source, problem, f"a part of {part}")
+                raise InputError("", problem, f"a part of {part}")
             first, other = points[0].weather, point.weather
             if name in WEATHER_PARAMETERS and getattr(first, name) != getattr(other, name):
                 problem = f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
-                raise InputError(source, problem, "a domain, or values in the weathers")
+                raise InputError("", problem, "a domain, or values in the weathers")
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
     for point in points:
@@ -53,7 +53,7 @@ def check_domains(study: Study, points: tuple[Point, ...], source: str) -> None:
                 if isinstance(scenario, TrackScenario):
                     scenario.tracks(np.zeros((1, 1)))
         except InputError as error:
-            raise InputError(source, f"scenario.search: {error.problem}", error.legal or "narrower domains") from None
+            raise InputError("", f"scenario.search: {error.problem}", error.legal or "narrower domains") from None
 
 
 def encounter(point: Point, values: Mapping[str, Any]) -> Point:

@@ -68,9 +68,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         if member.code is not None:
             measure = own[name] = checked_measure(member.code)
             if measure.name in taken:
-                raise InputError(
-                    lookup.source, f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name"
-                )
+                raise InputError("", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name")
             own[measure.name] = measure
             taken.add(measure.name)
         if measure.function is not None:
@@ -80,13 +78,13 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     for name in study.metrics.also:
         if name in METRICS:
             problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
-            raise InputError(lookup.source, problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
+            raise InputError("", problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
         if look_up(name, "metrics.also", shipped).of == "settings":
-            raise InputError(lookup.source, f"metrics.also = {name!r} measures settings", "a measure of runs")
+            raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
     objectives = [look_up(name, OBJECTIVES_KEY, {**shipped, **OBJECTIVES}).facts for name in study.search.objectives]
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"
-        raise InputError(lookup.source, problem, one_of([*shipped, *OBJECTIVES]))
+        raise InputError("", problem, one_of([*shipped, *OBJECTIVES]))
     metrics = tuple(measure.facts for measure in measures.values() if measure.of == "runs")
     return Measuring(measures, Scoring(metrics=metrics, objectives=tuple(objectives)))

@@ -67,19 +67,19 @@ class Network(NamedTuple):
         return self.roads_file.endswith(NETWORK_ENDING)
 
 
-def open_network(network: str, source: str = NETWORK_KEY) -> Network:
+def open_network(network: str) -> Network:
     """A network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside its traffic.
 
     Raises
     ------
     InputError
-        If the network does not exist, a file is missing, or it is unclear which files to use; `source` names the key.
+        If the network does not exist, a file is missing, or it is unclear which files to use.
     """
     path = NETWORKS / network if is_shipped(network) else Path(network)
     if not is_network(path):
         names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
         raise InputError(
-            source,
+            "",
             f"there is no network {network!r}{did_you_mean(network, names)}",
             f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
         )

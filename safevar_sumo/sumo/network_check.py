@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, about, subject
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import ensure_cached, parse_seconds, parse_xml
 from safevar_sumo.sumo.engine import STEP_LENGTH, as_arguments, open_world, own_options
 from safevar_sumo.sumo.network import (
+    NETWORK_KEY,
     OPTIONS_FILE,
     TRAFFIC_FILE,
     Network,
@@ -66,8 +67,8 @@ LEGAL_VUT = f"type {VUT!r}, a vType of its own, which each setting changes; depa
 LEGAL_ROAD = "a level road of friction 1: the scenario's `grade` sets a slope, the weather's `road_friction` a friction"
 
 
-def check_network(name: str, source: str) -> None:
-    """Refuse a network that cannot be simulated correctly; `source` is the study.
+def check_network(name: str) -> None:
+    """Refuse a network that cannot be simulated correctly.
 
     Raises
     ------
@@ -76,7 +77,8 @@ def check_network(name: str, source: str) -> None:
     EnvironmentFault
         If netconvert fails for reasons outside the network.
     """
-    network = open_network(name, source)
+    with about(f"{subject()}: {NETWORK_KEY}"):
+        network = open_network(name)
     if not is_shipped(name):
         _check_files(network)
 

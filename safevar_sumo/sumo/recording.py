@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import msgpack, to_builtins
 
+from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
@@ -100,11 +101,12 @@ class Recording:
 
 class Scenes:
     """The scenes of a study, each recorded when it is first needed, with the study's time step [s] (None: that of the
-    network); errors name the study by `source`.
+    network).
     """
 
-    def __init__(self, step_length: float | None = None, source: str = "study") -> None:
-        self.step, self._source = step_length, source
+    def __init__(self, step_length: float | None = None) -> None:
+        self.step = step_length
+        self._source = subject()
         self._recorded: dict[WorldScenario, Recording | str] = {}
 
     def step_of(self, scenario: Scenario) -> float:

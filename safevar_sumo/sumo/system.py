@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
-from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.errors import InputError, about, check_name, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
@@ -34,12 +34,12 @@ from safevar_sumo.scenarios import (
 )
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
-from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
-from safevar_sumo.sumo.network import NETWORK_KEY, copied_network, is_network, is_shipped, stage_networks
+from safevar_sumo.sumo.network import copied_network, is_network, is_shipped, stage_networks
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
@@ -194,15 +194,15 @@ def assemble(study: Study, source: str = "") -> System:
     """
     source = source or study.source
     with user_errors(source), _ONE_AT_A_TIME:
-        return _assemble(study, source)
+        return _assemble(study)
 
 
-def _assemble(study: Study, source: str) -> System:
+def _assemble(study: Study) -> System:
     unload_user_modules()  # so that each system has the code as it is now, and no state of another one
-    vehicle, ads, scenario, weather = models_of(study, source)
+    vehicle, ads, scenario, weather = models_of(study)
     is_shipped_vehicle = study.vehicle.model in VEHICLES
-    check_units(study, vehicle, source)
-    check_plausible(study, vehicle, source)
+    check_units(study, vehicle)
+    check_plausible(study, vehicle)
     if isinstance(ads, TraciController) and not is_shipped_vehicle and type(vehicle).sensors is Vehicle.sensors:
         problem = (
             f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of TraCI bypasses sense"
@@ -210,11 +210,11 @@ def _assemble(study: Study, source: str) -> System:
         expected = (
             "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None"
         )
-        raise InputError(source, problem, expected)
-    rater = rater_of(study, source)
-    matrix = _matrix_points(expand_protocol(study, weather), source)
+        raise InputError("", problem, expected)
+    rater = rater_of(study)
+    matrix = _matrix_points(expand_protocol(study, weather))
     has_stops = any(one.brakes_fully for one in (scenario, *(point.scenario for point in matrix)))
-    measuring = measuring_of(study, Lookup.of(study, source), has_stops=has_stops)
+    measuring = measuring_of(study, Lookup.of(study), has_stops=has_stops)
     metrics = [metric.name for metric in measuring.scoring.metrics]
     tables_of_metrics = {
         "published": study.published,
@@ -223,19 +223,19 @@ def _assemble(study: Study, source: str) -> System:
     }
     for key, table in tables_of_metrics.items():
         for name in table:
-            check_name(source, f"{key}.{name} is no metric", name, metrics)
+            check_name("", f"{key}.{name} is no metric", name, metrics)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
-        check_network(network, f"{source}: {NETWORK_KEY}")
+        check_network(network)
     if not study.scenario.search:
         for one in (point.scenario for point in matrix or (Point(scenario, weather),)):
             one.check()
     if study.scenario.search:
         points = matrix or (Point(scenario, weather),)
-        check_domains(study, points, source)
+        check_domains(study, points)
         original = {name: domain.original for name, domain in study.scenario.search.items()}
         scenario, weather, *_ = encounter(points[0], original)
         matrix = tuple(encounter(point, original) for point in matrix)
-    region, scenes = region_of(study, source), Scenes(study.step_length, source)
+    region, scenes = region_of(study), Scenes(study.step_length)
     if study.scenario.search:
         measuring = _with_safe_original(study, measuring, scenes, scenario)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
@@ -251,7 +251,7 @@ def _assemble(study: Study, source: str) -> System:
         nominal=nominal,
         measuring=measuring,
         region=region,
-        source=source,
+        source=subject(),
         scenes=scenes,
         matrix=matrix,
         rater=rater,
@@ -283,26 +283,27 @@ def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scen
     return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
 
 
-def models_of(study: Study, source: str) -> tuple[Vehicle, Ads, Scenario, Weather]:
+def models_of(study: Study) -> tuple[Vehicle, Ads, Scenario, Weather]:
     """The study's models with their parameters; raises the errors of `assemble`."""
-    lookup = Lookup.of(study, source)
+    lookup = Lookup.of(study)
     vehicle, ads = _create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup)
-    return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather, source)
+    return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather)
 
 
 def create_shipped_models(study: Study) -> None:
     """Create the shipped models of a study, which refuse parameters that they do not have; raises InputError."""
-    lookup = Lookup.of(study, study.source)
-    for kind, shipped, table in (
-        ("vehicle", VEHICLES, study.vehicle),
-        ("ads", ADS, study.ads),
-        ("scenario", SCENARIOS, study.scenario),
-    ):
-        if table.model in shipped and not getattr(table, "kind", ""):
-            _, create = _class_and_creator(kind, shipped, table, lookup)
-            create()
-    if not user_code_names(study):
-        _matrix_points(study, study.source)
+    with about(study.source):
+        lookup = Lookup.of(study)
+        for kind, shipped, table in (
+            ("vehicle", VEHICLES, study.vehicle),
+            ("ads", ADS, study.ads),
+            ("scenario", SCENARIOS, study.scenario),
+        ):
+            if table.model in shipped and not getattr(table, "kind", ""):
+                _, create = _class_and_creator(kind, shipped, table, lookup)
+                create()
+        if not user_code_names(study):
+            _matrix_points(study)
 
 
 def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
@@ -317,40 +318,45 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
             inspect.signature(step).bind(*[None] * (2 + is_class), **({} if is_class else parameters))
         except (TypeError, ValueError) as error:
             problem = f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
-            raise InputError(lookup.source, problem, CONTROLLER_FORMS) from None
+            raise InputError("", problem, CONTROLLER_FORMS) from None
         create: Callable[[], Controller]
         if is_class:
-            create = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
+            create = partial(instance_of, member, parameters, name, "ads.parameters")
             create()  # so that wrong parameters raise errors here
         else:
             create = partial(partial, controller, **parameters)  # the function with its parameters
-    return TraciController(create, lookup.source)
+    return TraciController(create)
 
 
-def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
+def _matrix_points(study: Study) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
-    points = []
+    points: list[Point] = []
     for test in () if study.matrix is None else study.matrix.tests:
-        lookup = Lookup.of(study, f"{source}: test {test.name!r}")
-        model, shared = test.model or study.scenario.model, dict(test.parameters)
-        if model == study.scenario.model:
-            shared = {**study.scenario.parameters, **shared}
-        for values in product(*test.over.values()):
-            over = dict(zip(test.over, values, strict=True))
-            scenario = _create_scenario(ModelTable(model=model, parameters={**shared, **over}), lookup)
-            for weather in (weather_of(choice, lookup.source) for choice in test.weathers or [study.weather]):
-                name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
-                parameters = {"test": test.name, **over, "weather": weather.name}
-                points.append(Point(scenario, weather, name, tuple(parameters.items())))
+        with about(f"{subject()}: test {test.name!r}"):
+            points += _points_of(test, study)
     for name, count in Counter(point.name for point in points).items():
         if count > 1:
             legal = "unique names of tests, and each value once"
-            raise InputError(source, f"matrix.tests: {count} points are {name!r}", legal)
+            raise InputError("", f"matrix.tests: {count} points are {name!r}", legal)
     if study.matrix is None or not study.matrix.point:
         return tuple(points)
     by_name = {point.name: point for point in points}
-    check_name(source, f"matrix.point = {study.matrix.point!r}", study.matrix.point, by_name)
+    check_name("", f"matrix.point = {study.matrix.point!r}", study.matrix.point, by_name)
     return (by_name[study.matrix.point],)
+
+
+def _points_of(test: MatrixTest, study: Study) -> Iterator[Point]:
+    """The points of a test of the study's matrix."""
+    model = test.model or study.scenario.model
+    shared = study.scenario.parameters if model == study.scenario.model else {}
+    for values in product(*test.over.values()):
+        over = dict(zip(test.over, values, strict=True))
+        table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
+        scenario = _create_scenario(table, Lookup.of(study))
+        for weather in map(weather_of, test.weathers or [study.weather]):
+            name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
+            parameters = {"test": test.name, **over, "weather": weather.name}
+            yield Point(scenario, weather, name, tuple(parameters.items()))
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
@@ -378,7 +384,7 @@ def _class_and_creator(
     member = lookup.class_of(shipped, table.model, f"{kind}.model", *bases, otherwise=traci)
     parameters = lookup.with_paths(member, table.parameters, f"{kind}.parameters")
     name = f"{kind}.model = {table.model!r}"
-    return member, partial(instance_of, member, parameters, name, f"{kind}.parameters", lookup.source)
+    return member, partial(instance_of, member, parameters, name, f"{kind}.parameters")
 
 
 def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
@@ -404,8 +410,8 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "fmu":
         path = file_beside(table.model, lookup.folders)
         if not path:
-            raise InputError(lookup.source, f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
-        code = UserCode(lookup.source, f"ads.model = {table.model!r}")
+            raise InputError("", f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
+        code = UserCode(subject(), f"ads.model = {table.model!r}")
         fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
         fleet.max_vehicles = MAX_INSTANCES
         return fleet

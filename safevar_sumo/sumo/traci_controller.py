@@ -19,6 +19,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.ads.base import Trim, pedals_for, trim_at
+from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_error_of, user_errors
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
@@ -38,8 +39,9 @@ class TraciController(Ads):
         Creates a vehicle's controller.
     """
 
-    def __init__(self, create: Callable[[], Controller], source: str) -> None:
-        self._create, self._source = create, source
+    def __init__(self, create: Callable[[], Controller]) -> None:
+        self._create = create
+        self._source = subject()
         self._world: Any = None
         self._sensors: Any = None
 

@@ -17,7 +17,7 @@ MIN_HEADWAY = 0.5
 """Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
 
 
-def check_units(study: Study, vehicle: Vehicle, source: str) -> None:
+def check_units(study: Study, vehicle: Vehicle) -> None:
     """Refuse characteristics that the vehicle does not have, in other units, or missing."""
     table, units = study.vehicle.characteristics, vehicle.UNITS
     if (
@@ -29,31 +29,31 @@ def check_units(study: Study, vehicle: Vehicle, source: str) -> None:
             f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway of SUMO's driver"
         )
         legal = f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is vehicle.characteristics.actuatorLag"
-        raise InputError(source, problem, legal)
+        raise InputError("", problem, legal)
     for name, entry in table.items():
         key = f"vehicle.characteristics.{name}"
         if name in RESULT_COLUMNS:
-            raise InputError(source, f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
-        check_name(source, f"{key}: {study.vehicle.model} has no such characteristic", name, units)
+            raise InputError("", f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
+        check_name("", f"{key}: {study.vehicle.model} has no such characteristic", name, units)
         if entry.unit != units[name]:
-            raise InputError(source, f"{key}.unit = {entry.unit!r}", repr(units[name]))
+            raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
     for name in units:
         if name not in table:
-            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
+            raise InputError("", f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
-def check_plausible(study: Study, vehicle: Vehicle, source: str) -> None:
+def check_plausible(study: Study, vehicle: Vehicle) -> None:
     """Refuse values of characteristics and parameters that the vehicle calls implausible, as in another unit."""
     try:
         ranges = msgspec.convert(vehicle.PLAUSIBLE, dict[str, Plausible])
     except msgspec.ValidationError as error:
         problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}"
-        raise InputError(source, problem, "(lowest, highest) or (lowest, highest, unit) by name") from None
+        raise InputError("", problem, "(lowest, highest) or (lowest, highest, unit) by name") from None
     for name, (lowest, highest, own_unit) in ranges.items():
         entry = study.vehicle.characteristics.get(name)
         if entry is None and not hasattr(vehicle, name):
             problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}"
-            raise InputError(source, problem, "names of characteristics and of parameters")
+            raise InputError("", problem, "names of characteristics and of parameters")
         values: list[tuple[str, Any]] = [(f"parameters.{name}", getattr(vehicle, name, None))]
         if entry is not None:
             ends = ("original", "lower", "upper")
@@ -64,4 +64,4 @@ def check_plausible(study: Study, vehicle: Vehicle, source: str) -> None:
             if not (is_number and lowest <= value <= highest):
                 legal = f"a plausible value, {lowest:g} to {highest:g}{unit}"
                 text = f"{value:g}{unit}" if is_number else repr(value)
-                raise InputError(source, f"vehicle.{key} = {text}", legal)
+                raise InputError("", f"vehicle.{key} = {text}", legal)

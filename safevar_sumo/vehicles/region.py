@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, subject
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
@@ -143,7 +143,7 @@ class FeasibleRegion:
         return self.feasible(self.characteristics.filter(settings) if filtered else settings)
 
 
-def region_of(study: Study, source: str = "") -> FeasibleRegion:
+def region_of(study: Study) -> FeasibleRegion:
     """The feasible region of a study.
 
     Raises
@@ -151,19 +151,19 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     InputError
         If the original vehicle or nearly every other setting is infeasible.
     """
-    source, characteristics = source or study.source, CharacteristicSet.of(study)
+    characteristics = CharacteristicSet.of(study)
     bounds = tuple(_Bounds.of(constraint, study, characteristics) for constraint in study.constraints)
     region = FeasibleRegion(characteristics, bounds)
     if not bounds:
         return region
     region.check(
         characteristics.original[np.newaxis],
-        f"{source}: the original vehicle",
+        f"{subject()}: the original vehicle",
         otherwise="; the original vehicle must satisfy every constraint",
     )
     shape = (N_PROBES, len(characteristics))
     probes = np.random.default_rng(0).uniform(characteristics.lower, characteristics.upper, shape)
     if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:
         problem = f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them: {region}"
-        raise InputError(source, problem, "narrower domains, or constraints that leave more than an equation does")
+        raise InputError("", problem, "narrower domains, or constraints that leave more than an equation does")
     return region

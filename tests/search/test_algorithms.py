@@ -94,7 +94,7 @@ def begun(
 
 def built(name: str, **arguments: Any) -> Algorithm:
     """An algorithm of ours or of pymoo."""
-    kind = ALGORITHMS.get(name) or pymoo_algorithm(name, "study")
+    kind = ALGORITHMS.get(name) or pymoo_algorithm(name)
     return msgspec.convert(REQUIRED.get(name, {}) | arguments, kind)  # type: ignore[no-any-return]
 
 

@@ -176,7 +176,7 @@ def test_an_algorithm_that_simulates_little_of_its_budget_is_named_unless_it_say
 def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pymoo.config", None)
     with pytest.raises(InputError, match=r"pip install '\.\[pymoo\]'"):
-        pymoo_algorithm("pymoo:GA", "study")
+        pymoo_algorithm("pymoo:GA")
 
 
 MIXED = ["nsga2", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]

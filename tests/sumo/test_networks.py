@@ -91,7 +91,7 @@ GOOD = {
 @pytest.mark.parametrize("what", sorted(GOOD))
 def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> None:
     network = with_traffic(mine, GOOD[what])
-    check_network(network, "study")
+    check_network(network)
     with open_world(copied_network(open_network(network), 2), 2) as world:
         world.enter(None)
         seen = set()
@@ -169,7 +169,7 @@ def test_what_no_network_may_have_is_refused_with_its_name(
 ) -> None:
     rewritten(mine / file, old, new)
     with pytest.raises(InputError, match=r"mine(/[\w.]+)?: ") as caught:
-        check_network(str(mine), "study")
+        check_network(str(mine))
     assert told in str(caught.value)
 
 
@@ -192,7 +192,7 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
         'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70" disallow="pedestrian"',
         'id="departure" from="crossing" to="east" type="slow"',
     )
-    check_network(str(mine), "study")
+    check_network(str(mine))
     (lane,) = roads(mine).iterfind(".//lane[@id='0.departure_0']")
     assert [float(lane.attrib[name]) for name in ("speed", "width")] == [7, 3]
     assert open_network(str(mine)).digests != before
@@ -268,7 +268,7 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
 def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(mine: Path) -> None:
     (mine / "more.add.xml").write_text('<additional><vType id="more"/></additional>')
     rewritten(mine / "scenario.sumocfg", "</input>", '<additional-files value="more.add.xml"/></input>')
-    check_network(str(mine), "study")
+    check_network(str(mine))
     before = open_network(str(mine)).digests
     (mine / "more.add.xml").write_text('<additional><vType id="more" length="7"/></additional>')
     assert open_network(str(mine)).digests != before

@@ -93,7 +93,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["pedestrian_crossing"](network="my_town")
-    assert "my_town" in Scenes().reason_for_sumo([Point(scenario, weather_of("clear", "study"))])
+    assert "my_town" in Scenes().reason_for_sumo([Point(scenario, weather_of("clear"))])
 
 
 @pytest.fixture

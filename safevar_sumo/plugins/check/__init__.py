@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.errors import UserCodeError
+from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_simulations
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -114,10 +114,10 @@ def _first_defect(study: Study, names: Mapping[str, str], failures: Iterator[Fai
     """The first of the failures of user code, or the error that it raises; `names` are its names by their keys."""
     where = " or ".join(_definition(study, key, name) for key, name in names.items()) or study.source
     try:
-        with np.errstate(all="ignore"):
-            for failure in failures:
-                yield Finding(failure.check, failure.got, where, failure.input, failure.expected)
-                return
+        with about(study.source), np.errstate(all="ignore"):
+            failure = next(failures, None)
+        if failure is not None:
+            yield Finding(failure.check, failure.got, where, failure.input, failure.expected)
     except UserCodeError as error:
         yield Finding("contract", error.problem, error.place or where, "", error.legal or "no exception")
 

@@ -134,7 +134,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         scoring=system.measuring.scoring,
     )
     for seed in seeds:
-        algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)
+        algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}")
         search, settings = algorithm.search(problem, np.random.default_rng(seed)), []
         try:
             settings.append(next(search))
