@@ -147,6 +147,8 @@ class Bound(NamedTuple):
     text: str
 
 
+INSIDE = 1e-6
+"""Part of a constraint's range that a search keeps from its limit, which may be excluded itself [-]."""
 KINDS = {"greaterThan": "at_least", "greaterOrEqual": "at_least", "lessThan": "at_most", "lessOrEqual": "at_most"}
 """Bounds by rules: a search does not tell the two apart."""
 
@@ -176,14 +178,18 @@ def constraints_of(
             base = difference(name, limit, middle)
             steps = np.diag(half)
             slopes = np.array([difference(name, limit, middle + step) - base for step in steps]) / half
-            if not np.abs(slopes * half).sum() > 1e-12:
-                continue
+            sign = 1 if KINDS[rule] == "at_least" else -1
+            reach = np.abs(slopes * half).sum()
+            if reach < 1e-12 or sign * base > reach or (sign * base == reach and rule.endswith("Equal")):
+                continue  # the other values decide, or it holds everywhere
             corners = [low, high, middle - half / 3]
             far = [difference(name, limit, corner) - base - slopes @ (corner - middle) for corner in corners]
-            if np.abs(far).max() > 1e-6 * np.abs(slopes * half).sum():
+            if np.abs(far).max() > 1e-6 * reach:
                 raise unsupported(
                     f"the constraint of {name} is not linear in {', '.join(names)}", "other parameters to search"
                 )
             text = f"{name} {rule} {limit}"
-            bounds.append(Bound(slopes.tolist(), KINDS[rule], float(slopes @ middle - base), text))
+            bounds.append(
+                Bound(slopes.tolist(), KINDS[rule], float(slopes @ middle - base + sign * INSIDE * reach), text)
+            )
     return bounds

@@ -31,7 +31,7 @@ LONGEST = 60.0
 """Longest scene [s]: how long a file without a StopTrigger that holds is played."""
 AFTER = 4.0
 """Time after the StopTrigger that is played [s]: with a vehicle that brakes, all happens later."""
-BLOCK = 200
+BLOCK = 500
 """Samples that are played at once at most."""
 MAX_TURN = 0.01
 """Largest turn of an Ego that drives straight on [degrees]."""

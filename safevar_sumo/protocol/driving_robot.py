@@ -65,6 +65,11 @@ class DrivingRobot:
         without a test.
         """
         self._error_share = np.zeros(n)  # the error divided by the tolerance in its direction [-]
+        self._depends_until = np.concatenate(
+            [np.broadcast_to(point.scenario.depends_until, n // len(points)) for point in points]
+        )
+        self._sample, self.acted_early = 0, np.full(n, np.nan)
+        """Times at which systems act before motions no longer depend on the vehicle [s]; NaN for all others."""
 
     def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
         """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while
@@ -85,6 +90,9 @@ class DrivingRobot:
         self._is_driving = ~self._has_braked & (
             system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
         )
+        time, self._sample = self._sample * self._step, self._sample + 1
+        acts = is_open & ~self._is_driving & (time < self._depends_until) & np.isnan(self.acted_early)
+        np.copyto(self.acted_early, time, where=acts)
         error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(
             np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN
@@ -98,5 +106,5 @@ class DrivingRobot:
 
     @property
     def invalid(self) -> BoolArray:
-        """Which vehicles left the tolerance before the system acted; shape (N,)."""
-        return self._error_share > 1
+        """Which vehicles left the tolerance before the system acted, or acted too early; shape (N,)."""
+        return np.asarray((self._error_share > 1) | ~np.isnan(self.acted_early))

@@ -215,8 +215,9 @@ class SimulationRuns:
 
     `collision_speed` is the vehicle's own speed, at the end of the step in which bodies overlap.
     `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed
-    is prescribed [m/s]; `warning_ttc` the time to collision at which the system first warned its driver, NaN if it
-    never did [s].
+    is prescribed [m/s]; `acted_early` the time at which the system acted while the motion of others still depended on
+    the vehicle, NaN otherwise [s]; `warning_ttc` the time to collision at which the system first warned its driver,
+    NaN if it never did [s].
     """
 
     trace: Trace
@@ -225,6 +226,7 @@ class SimulationRuns:
     collision_speed: FloatArray
     contact: Contact = NO_CONTACT
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
+    acted_early: FloatArray = field(default_factory=lambda: UNDEFINED)
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
 
     @cached_property
@@ -250,6 +252,7 @@ class SimulationRuns:
             collision_speed=self.collision_speed[vehicles],
             contact=Contact._make(map(select, self.contact)),
             test_speed_error=select(self.test_speed_error),
+            acted_early=select(self.acted_early),
             warning_ttc=select(self.warning_ttc),
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
@@ -28,7 +29,7 @@ from safevar_sumo.replay.comparison import compare_setting, list_differences, wh
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
-from safevar_sumo.scenarios import degree_note, pre_crash_sentence
+from safevar_sumo.scenarios import OpenScenario, degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import at_point, point_record, simulate_all_points, vehicle_remarks
@@ -191,6 +192,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         f"{simulation.setting[name]:g}; --no-filter keeps it."
         for name, value in simulation.reset_values.items()
     )
+    remarks += _acted_early(system, setting)
     original, simulated, units = simulation.original.numbers, simulation.numbers, {"outcome": "", **simulation.units}
     results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
     tables = {"characteristics": _characteristics(simulation), "results": tabulate("Results", RESULTS, results)}
@@ -217,6 +219,19 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         numbers={**handle, **simulation.numbers},
         tables=tables,
     )
+
+
+def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
+    """Points at which the driving system acts while others still move by a vehicle that keeps its speed."""
+    if any(np.any(point.scenario.depends_until > 0) for point in system.points):
+        for result in simulate_all_points(system, setting[np.newaxis]):
+            (acted,), scenario = result.runs.acted_early, result.point.scenario
+            if np.isfinite(acted) and isinstance(scenario, OpenScenario):
+                at = f"{result.point.name}: " if result.point.name else ""
+                yield (
+                    f"{at}invalid test: {scenario.dependence} depends on an Ego that keeps its speed, and the driving "
+                    f"system acts at {acted:.1f} s: the file's other simulators would show another encounter."
+                )
 
 
 def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_now: bool, point: str | None) -> Target:

@@ -19,7 +19,7 @@ from safevar_sumo.scenarios.base import (
     WorldScenario as WorldScenario,
 )
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.from_file import OpenScenario
+from safevar_sumo.scenarios.from_file import OpenScenario as OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.stop import Stop

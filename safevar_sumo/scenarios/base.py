@@ -281,7 +281,12 @@ class Scenario:
         The scenario's type in NHTSA's typology; "" if it has none.
     test_speed
         Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the speed
-        tolerance before the ADS brakes is an invalid test. Only contacts at the vehicle's front are collisions.
+        tolerance before the ADS brakes is an invalid test.
+    is_hit_in_front
+        Whether only contacts at the vehicle's front are collisions.
+    depends_until
+        Time until which the others move as if the vehicle kept its speed [s]: a run in which the ADS acts before is an
+        invalid test.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     is_user_code
@@ -304,9 +309,17 @@ class Scenario:
         def pre_crash(self) -> str: ...
         @property
         def test_speed(self) -> float | None: ...
+        @property
+        def depends_until(self) -> float: ...
     else:
         pre_crash = ""
         test_speed = None
+        depends_until = 0.0
+
+    @property
+    def is_hit_in_front(self) -> bool:
+        """By default in a test at its speed."""
+        return self.test_speed is not None
 
     def free(self) -> Mapping[str, FreeParameter]:
         """Parameters that a study may search, by name."""

@@ -148,6 +148,17 @@ class OpenScenario(TrackScenario):
         """Width of Ego [m]."""
         return self._scenes[0].played.ego.width
 
+    @property
+    def is_hit_in_front(self) -> bool:
+        """Every contact is a collision."""
+        return False
+
+    @property
+    def dependence(self) -> str:
+        """What depends on Ego, and until when, in words."""
+        played = self._scenes[0].played
+        return f"{played.dependence} at {played.depends_until:.1f} s"
+
     def remarks(self) -> list[str]:
         """What of the file has no effect here, or never happens."""
         return self._scenes[0].played.remarks

@@ -191,6 +191,13 @@ class Constraint(Table, frozen=True, kw_only=True):
         ]
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))  # the first term has its sign without a space
 
+    def allows(self, values: Mapping[str, float]) -> bool:
+        """Whether the sum is within its bounds at these values, or has other terms."""
+        if not self.sum.keys() <= values.keys():
+            return True
+        total = sum(weight * values[name] for name, weight in self.sum.items())
+        return (self.at_least is None or total >= self.at_least) and (self.at_most is None or total <= self.at_most)
+
     def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""
         units = {rows[name].unit for name in self.sum if name in rows}

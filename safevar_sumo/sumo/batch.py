@@ -199,7 +199,8 @@ def drive(
     last_step = np.round(per_vehicle([point.scenario.duration / step for point in system.points], size)).astype(int)
     log = _Log(n, int(last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
-    contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
+    fronts_only = np.repeat([point.scenario.is_hit_in_front for point in system.points], size)
+    contacts, warning_ttc = Contacts(n, fronts_only), np.full(n, np.nan)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.length):
             speed, scene = motion.speeds, observer.observe(motion, outcomes.is_open)
@@ -234,6 +235,7 @@ def drive(
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
         contact=contacts.first,
         test_speed_error=robot.error,
+        acted_early=robot.acted_early,
         warning_ttc=warning_ttc,
     )
 

@@ -45,6 +45,7 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 raise InputError("", problem, "a domain, or values in the weathers")
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
+    corners = [corner for corner in corners if all(one.allows(corner) for one in study.constraints)]
     for point in points:
         try:
             scenarios = [encounter(point, corner).scenario for corner in corners]

@@ -42,7 +42,7 @@ def drive_again(
         _, _, motion = enter(fleet, vehicles, world)
         observer = observer_of(point.scenario, world, stage)
         is_open, frame = np.ones(n, dtype=bool), world.frame
-        contacts = Contacts(n, np.full(n, point.scenario.test_speed is not None))
+        contacts = Contacts(n, np.full(n, point.scenario.is_hit_in_front))
         for sample in range(len(trace.time)):
             watch(world)
             scene = observer.observe(motion, is_open)

@@ -1,0 +1,124 @@
+# ruff: noqa: E501 (lines of XML)
+"""Studies whose scenario is a file of OpenSCENARIO: what the file says takes the place of model, network and matrix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.scenarios import OpenScenario
+from safevar_sumo.study import Study, data_files, load_study
+from safevar_sumo.study.schema import tables_of
+from safevar_sumo.sumo.encounters import encounter
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
+from tests.openscenario.writing import at, event, lane_change, speed, teleport, watching, write
+
+FILES = Path(__file__).parents[1] / "openscenario" / "files"
+LOGICAL = str(FILES / "cut_in_logical.xosc")
+
+
+def study_of(file: str, **scenario: Any) -> Study:
+    return load_study("wear", scenario={"file": file, **scenario})
+
+
+def runs_of(study: Study) -> list[SimulationRuns]:
+    system = assemble(study)
+    return [result.runs for result in simulate_all_points(system, system.characteristics.original[np.newaxis])]
+
+
+def test_a_concrete_file_is_one_scenario_and_drops_what_is_inherited() -> None:
+    study = study_of(str(FILES / "cut_in.xosc"), values={"ego_kmh": 60})
+    assert study.matrix is None
+    assert study.scenario.parameters == {"file": str(FILES / "cut_in.xosc"), "ego_kmh": 60}
+    assert {Path(path).name for path in data_files(study)} == {"cut_in.xosc", "bodies.xosc", "three_lanes.xodr"}
+    assert tables_of(load_study(tables_of(study))) == tables_of(study)
+    (point,) = assemble(study).points
+    assert point.scenario.test_speed == pytest.approx(60 / 3.6)
+
+
+def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None:
+    study = study_of(LOGICAL, values={"ego_kmh": 80}, search={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}})
+    gap, slower = study.scenario.search["gap_m"], study.scenario.search["slower_kmh"]
+    assert (gap.lower, gap.upper, gap.original) == (5, 45, 20)
+    assert (slower.lower, slower.upper, slower.original, slower.unit) == (10, 25, 25, "km/h")
+    assert study.matrix is not None
+    assert len(study.matrix.tests) == 5 * 2
+    names = {point.name for point in assemble(study).points}
+    assert "cut_in_logical, sideways_mps 0.5, side 1, body lorry, wet" in names
+
+
+def test_constraints_of_a_file_hold_in_the_search() -> None:
+    """slower_kmh < ego_kmh - 10 excludes a corner of the two domains."""
+    values = {"gap_m": 20, "sideways_mps": 1.5, "side": -1, "body": "hatchback"}
+    study = study_of(LOGICAL, values=values, search={"ego_kmh": {}, "slower_kmh": {}})
+    (constraint,) = study.constraints
+    assert constraint.sum == pytest.approx({"ego_kmh": -1, "slower_kmh": 1})
+    assert constraint.at_most == pytest.approx(-10, abs=1e-3)
+    region = assemble(study).region
+    settings = np.tile(region.characteristics.original, (2, 1))
+    settings[:, [*region.characteristics.names].index("ego_kmh")] = 40
+    settings[:, [*region.characteristics.names].index("slower_kmh")] = 29.9, 30.0
+    assert region.feasible(settings).tolist() == [True, False]
+
+
+def test_encounters_of_a_search_are_those_of_single_files() -> None:
+    values = {"sideways_mps": 1.5, "side": -1, "body": "hatchback", "ego_kmh": 80}
+    study = study_of(LOGICAL, values=values, search={"gap_m": {}, "slower_kmh": {}})
+    (point,) = assemble(study).points
+    gaps, slower = np.array([8.0, 20.0, 33.5]), np.array([12.0, 25.0, 30.0])
+    searched = encounter(point, {"gap_m": gaps, "slower_kmh": slower}).scenario
+    assert isinstance(searched, OpenScenario)
+    times = (np.arange(200) * 0.05)[:, np.newaxis]
+    (together,) = searched.tracks(times)
+    for k in range(3):
+        (alone,) = encounter(point, {"gap_m": gaps[k], "slower_kmh": slower[k]}).scenario.tracks(times)  # type: ignore[attr-defined]
+        assert np.array_equal(alone.x[:, 0], together.x[:, k])
+        assert np.array_equal(alone.y[:, 0], together.y[:, k])
+
+
+def test_sumo_repeats_a_run() -> None:
+    system = assemble(study_of(str(FILES / "crossing_pedestrian.xosc")))
+    settings = system.characteristics.original[np.newaxis]
+    (result,) = simulate_all_points(system, settings)
+    assert result.runs.outcome[0] != Outcome.INVALID_TEST
+    (point,) = system.points
+    assert verify_in_sumo(system, settings) == ""
+    assert point.scenario.vut_length == 4.2  # type: ignore[attr-defined]
+
+
+def test_a_run_in_which_the_system_acts_while_others_depend_on_ego_is_invalid(tmp_path: Path) -> None:
+    """A slower car ahead changes the lane when Ego is 1 m behind; no system waits for that."""
+    close = '<RelativeDistanceCondition entityRef="Car" relativeDistanceType="longitudinal" freespace="true" rule="lessThan" value="1"/>'
+    change = event(lane_change(-2, "linear", "time", 1), watching("Ego", close))
+    (runs,) = runs_of(study_of(write(tmp_path, change, car=(teleport(at(-1, 120)), speed(10)))))
+    assert runs.outcome[0] == Outcome.INVALID_TEST
+    assert 0 < runs.acted_early[0] < (120 - 50 + 1.5 - 2.5 - 3.5 - 1) / 10
+    (runs,) = runs_of(study_of(write(tmp_path, car=(teleport(at(-1, 120)), speed(10)))))
+    assert runs.outcome[0] != Outcome.INVALID_TEST
+    assert np.isnan(runs.acted_early[0])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "problem"),
+    [
+        ({"file": "gone.xosc"}, "there is no file 'gone.xosc'"),
+        ({"model": "crossing"}, "scenario.model beside scenario.file"),
+        ({"values": {"gap": 3}}, "declares no parameter gap; did you mean 'gap_m'"),
+        ({"search": {"gap_m": {"upper": 90}}}, "gap_m: 5 to 90"),
+        ({"search": {"gap_m": {"lower": 25}}}, "the file's value 20 is not in its range"),
+        ({"search": {"body": {}}}, "body = 'hatchback' is no number"),
+        ({"search": {"gap_m": 3}}, "scenario.search.gap_m = 3"),
+        ({"file": str(FILES / "cut_in.xosc"), "search": {"gap_m": {}}}, "gap_m has no range in the file"),
+        ({"values": {"ego_kmh": 20, "slower_kmh": 15}}, "the file's constraints exclude every combination"),
+    ],
+)
+def test_refusals(scenario: dict[str, Any], problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        load_study("wear", scenario={"file": LOGICAL, **scenario})
