@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from safevar_sumo.errors import InputError, check_name, describe_error
+from safevar_sumo.errors import InputError, SimulationError, UserCodeError, check_name, describe_error
+from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.study import ORIGINAL_DEGREE, PYMOO, label_of
@@ -77,6 +78,10 @@ HIDDEN = {"verb_log", "cmaes_verbose", "maxfevals", "n_diffs", "advance_after_in
 """Arguments that write files, print, or are no choice of the user's."""
 TRIAL = 300
 """Number of settings of a formula that an algorithm with arguments is tried with."""
+TRIAL_TIME = 20.0
+"""The time that it may take [s]: with a population below 4, GDE3 and NSDE draw for ever."""
+SMALL_POPULATION = 10
+"""A study with a smaller one is tried without arguments, too."""
 FAILED = 1e9
 """Objectives and violation, for pymoo, of a setting that could not be scored."""
 
@@ -124,7 +129,7 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         return result.take(problem.scoring.valid(result))
 
     def try_out(self, problem: Problem) -> None:
-        """Search a formula in place of simulations, if the study gives arguments.
+        """Search a formula in place of simulations, if the study gives arguments or has a small population.
 
         Raises
         ------
@@ -137,24 +142,29 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         if size > problem.evaluations:
             legal = f"at most the {problem.evaluations} evaluations of a run"
             raise InputError("", f"{key}.pop_size = {size}", legal)
-        if not given or not (failure := self._failure(problem)):
+        is_tried = bool(given) or problem.population < SMALL_POPULATION
+        if not is_tried or not (failure := self._failure(problem)):
             return
         without = {name: msgspec.structs.replace(self, **{name: UNSET}) for name in given}
         blamed = [name for name, other in without.items() if not other._failure(problem)] or list(given)
         named = " and ".join(f"{key}.{name} = {given[name]!r}" for name in blamed)
+        named = named or f"{key} with search.population = {problem.population}"
         raise InputError("", f"{named}: pymoo fails: {failure}", "another value, or none")
 
     def _failure(self, problem: Problem) -> str:
         """The error with which pymoo fails in a search of a formula, "" if it does not."""
         try:
-            search = self.search(problem, np.random.default_rng(0))
-            settings = next(search)
-            asked = len(settings)
-            while asked < TRIAL:
-                settings = search.send(_formula(settings, problem))
-                asked += len(settings)
+            with end_if_longer(TRIAL_TIME):
+                search = self.search(problem, np.random.default_rng(0))
+                settings = next(search)
+                asked = len(settings)
+                while asked < TRIAL:
+                    settings = search.send(_formula(settings, problem))
+                    asked += len(settings)
         except StopIteration:
             pass
+        except (SimulationError, UserCodeError):  # a script of the user's that calls the library is on the stack
+            return f"it does not end within {TRIAL_TIME:g} s"
         except InputError as error:
             return error.problem
         return ""

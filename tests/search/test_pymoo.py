@@ -19,6 +19,7 @@ from safevar_sumo.questions.research_questions.answer import tables
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import load_runs, read_manifest
 from safevar_sumo.results.manifest import write_manifest
+from safevar_sumo.search import pymoo
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -151,6 +152,19 @@ def test_an_option_with_which_pymoo_fails_is_named_before_anything_is_simulated(
         run(with_pymoo([f"pymoo:{name}"], parameters={f"pymoo:{name}": table}), tmp_path / "out")
     assert error in str(refused.value)
     assert str(refused.value).count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_population_with_which_pymoo_draws_for_ever_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pymoo, "TRIAL_TIME", 0.2)
+    failure = "pymoo fails: it does not end within 0.2 s"
+    for name in ("GDE3", "NSDE"):
+        study = with_pymoo([f"pymoo:{name}"], parameters={f"pymoo:{name}": {"pop_size": 1}})
+        with pytest.raises(InputError, match=rf"pop_size = 1: {failure}"):
+            run(study, tmp_path / "out")
+    study = load_study(with_pymoo(["pymoo:GDE3"]), search={"population": 3})
+    with pytest.raises(InputError, match=rf"'pymoo:GDE3' with search.population = 3: {failure}"):
+        run(study, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
