@@ -247,9 +247,13 @@ def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
     evaluator = made_up_evaluator(1, nowhere)
     evaluator.progress = lambda *values: shown.append(values)
     evaluator.plan("first", "all calls")
+    another = evaluator.for_study(evaluator.study)
     with evaluator.stage("all calls", 4):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")
-        evaluator.for_study(evaluator.study).evaluate(np.array([[4.0], [5.0]]), "another")
+        another.evaluate(np.array([[4.0], [5.0]]), "another")
+    with evaluator.stage("first"):
+        another.evaluate(np.array([[7.0]]), "as many as it takes")
+    assert shown[-1] == ("1 of 2, first", 1, 0)
     evaluator.evaluate(np.array([[6.0]]), "unplanned")
     named = [(done, total) for stage, done, total in shown if stage == "2 of 2, all calls"]
     assert list(dict.fromkeys(named)) == [(0, 4), (3, 4), (3, 5), (5, 5)]
