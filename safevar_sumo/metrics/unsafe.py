@@ -1,11 +1,13 @@
-"""Criteria of an unsafe vehicle: a collision, a safety degree below a limit, or lost points of a rating."""
+"""Criteria of an unsafe vehicle: a collision, a safety degree or a metric beyond a limit, lost points of a rating."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import operator
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,9 +22,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CRITERIA = (
-    "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's "
-    "closing speed in m/s]"
+    "collision, points=X with X points of a rating, below=X with a safety degree X [m, or minus a collision's "
+    'closing speed in m/s], or a metric with <, <=, > or >= and a number, such as "drac > 6"'
 )
+COMPARISONS: Mapping[str, Callable[[Any, float], Any]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
 """The default limit if nothing collides: this share of the original's safety degree, to this many significant digits.
@@ -33,10 +41,26 @@ POINT_LOSS, POINT_DECIMALS = 1.0, 6
 """The default limit in a rated study: the original's points minus this loss, to this many decimals."""
 
 
+class Bound(NamedTuple):
+    """A measure, one of `COMPARISONS`, and a number: `drac > 6`."""
+
+    measure: str
+    comparison: str
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.measure} {self.comparison} {self.limit:.12g}"
+
+    @property
+    def worst_is_largest(self) -> bool:
+        return self.comparison.startswith(">")
+
+
 @dataclass(frozen=True)
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with `below`, a safety degree
-    below this limit [m, or -m/s]; with `points`, at most that many points of a rating.
+    below this limit [m, or -m/s]; with `points`, at most that many points of a rating; with a `bound`, a metric of the
+    study beyond a limit, or a collision.
 
     `contact` is the safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre.
     """
@@ -45,21 +69,36 @@ class Unsafe:
     points: float | None = None
     keep: float = 0.0
     contact: float = 0.0
+    bound: Bound | None = None
     is_half: bool = field(default=False, compare=False, repr=False)
     """Whether `below` is half of the original's safety degree, the default if nothing collides."""
 
     def __str__(self) -> str:
         if self.points is not None:
             return f"points={self.points!r}"
+        if self.bound is not None:
+            return str(self.bound)
         return "collision" if self.below is None else f"below={self.below!r}"
+
+    @property
+    def is_collision(self) -> bool:
+        """Whether a collision alone, or less distance than `keep`, is unsafe."""
+        return self.below is None and self.points is None and self.bound is None
+
+    @property
+    def worst(self) -> Callable[..., float]:
+        """Which of several values is the worst: `min`, or `max` where a bound forbids large ones."""
+        return max if self.bound is not None and self.bound.worst_is_largest else min
 
     @property
     def description(self) -> str:
         """The criterion in words, rounded: `collision (safe: stops at least 0.30 m short)`, `safety degree below 1.4 m
-        (half of the original's, a screening limit)`.
+        (half of the original's, a screening limit)`, `drac > 6, or a collision`.
         """
         if self.points is not None:
             return f"at most {self.points:g} points"
+        if self.bound is not None:
+            return f"{self.bound}, or a collision"
         if self.below is None:
             kept = f"{self.keep:.2f}" if round(self.keep, 2) == self.keep else f"{self.keep:g}"
             where = ", from bumper to bumper" if self.contact else ""
@@ -69,13 +108,15 @@ class Unsafe:
 
     @property
     def in_words(self) -> str:
-        """What an unsafe vehicle does: `collides`, `SD is below 1.4`."""
+        """What an unsafe vehicle does: `collides`, `SD is below 1.4`, `has drac > 6`."""
         if self.points is not None:
             return f"keeps at most {self.points:g} points"
+        if self.bound is not None:
+            return f"has {self.bound}"
         return "collides" if self.below is None else f"SD is below {self.below:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
-        """Which evaluations are unsafe; shape (M,). An undefined safety degree is not unsafe."""
+        """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by every bound."""
         return np.asarray(self._holds(evaluations.outcome, evaluations.column))
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
@@ -88,17 +129,30 @@ class Unsafe:
         if self.below is not None:
             return column(F_SAFE.name) < self.below
         collides = outcome == COLLISION
+        if self.bound is not None:
+            name, comparison, limit = self.bound
+            return collides | COMPARISONS[comparison](column(name), limit)
         return collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
 
-    def margin(self, evaluations: Evaluations) -> FloatArray:
-        """By how much evaluations are above the limit, in the limit's unit; shape (M,).
-
-        If the criterion is a collision without a distance to keep, the limit is a safety degree of 0.
+    def left(self, evaluations: Evaluations) -> FloatArray:
+        """How far evaluations are from the limit, in its unit, shape (M,): below 0 beyond it, NaN where it is
+        undefined; on a collision by a bound, minus the speed of the collision.
         """
-        if self.points is not None:
-            return evaluations.column(RATING_POINTS.name) - self.points
-        limit = self.contact + self.keep if self.keep else 0.0
-        return evaluations.f_safe - (limit if self.below is None else self.below)
+        if self.bound is not None:
+            difference = evaluations.column(self.bound.measure) - self.bound.limit
+            left = -difference if self.bound.worst_is_largest else difference
+            return np.where(evaluations.collided, evaluations.f_safe, left)
+        return evaluations.f_safe - (self.contact + self.keep if self.below is None else self.below)
+
+    def value(self, left: float) -> float:
+        """What is `left` away from the limit: a distance between bumpers [m], or the value that is limited."""
+        if self.bound is not None:
+            return self.bound.limit - left if self.bound.worst_is_largest else self.bound.limit + left
+        return left + (self.keep if self.below is None else self.below)
+
+    def value_in_words(self, value: float) -> str:
+        """What a safe vehicle has: `keeps 0.31 m`, `has drac 5.9`."""
+        return f"keeps {value:.2f} m" if self.bound is None else f"has {self.bound.measure} {value:.3g}"
 
     @classmethod
     def parse(cls, criterion: Criterion) -> Unsafe:
@@ -113,14 +167,26 @@ class Unsafe:
             return criterion
         if criterion == COLLISION:
             return cls()
-        quantity, _, text = criterion.partition("=") if isinstance(criterion, str) else ("below", "", criterion)
+        parts = re.fullmatch(r"\s*([A-Za-z]\w*)\s*(<=|>=|<|>|=)\s*(\S+)\s*", str(criterion))
+        quantity, comparison, text = (
+            ("below", "=", criterion)
+            if isinstance(criterion, float | int)
+            else parts.groups()
+            if parts
+            else ("", "", "")
+        )
         try:
-            limit = float(text) if quantity in ("below", "points") else math.nan
+            limit = float(text)
         except (TypeError, ValueError):
             limit = math.nan
-        if not math.isfinite(limit):
-            raise InputError("unsafe", repr(criterion), CRITERIA)
-        return cls(points=limit) if quantity == "points" else cls(limit)
+        if math.isfinite(limit):
+            if (quantity, comparison) in (("below", "="), (SAFETY_DEGREE, "<")):
+                return cls(below=limit)
+            if (quantity, comparison) in (("points", "="), (RATING_POINTS.name, "<=")):
+                return cls(points=limit)
+            if comparison in COMPARISONS:
+                return cls(bound=Bound(quantity, comparison, limit))
+        raise InputError("unsafe", repr(criterion), CRITERIA)
 
     @classmethod
     def default(cls, original: Tables, outcomes: Any) -> Unsafe:
@@ -174,6 +240,6 @@ def margin_of(study: Study, margin: float | None) -> float:
 
 
 Criterion = Unsafe | float | str
-"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision", "below=X" or
-"points=X".
+"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision", "below=X", "points=X"
+or a metric beyond a limit such as "drac > 6".
 """

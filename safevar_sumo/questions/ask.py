@@ -18,6 +18,7 @@ from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from safevar_sumo.errors import MAX_JOBS, InputError, check_name, unknown_name, warn
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
 from safevar_sumo.records import JsonObject
@@ -60,9 +61,11 @@ Share = Annotated[float, Range(0, 1, is_open=True)]
 """A share such as a confidence."""
 Margin = Annotated[float | None, Range(0, 100)]
 """A distance to keep from a collision [m]."""
-Criterion = Annotated[str | None, "collision|below=X|points=X"]
-"""What is unsafe: a collision, a safety degree below X [m], or at most X points of a rating; by default a collision if
-any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost.
+CRITERION = '"METRIC < X"|collision|below=X|points=X'
+Criterion = Annotated[str | None, CRITERION]
+"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a metric of the study with
+<, <=, > or >= and a number; by default a collision if any evaluated setting collides, else half of the original's
+safety degree; of a rated study, any point lost.
 """
 PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
@@ -198,9 +201,15 @@ class Question:
         """The answer about subjects that have been loaded, and files; `values` are those of options."""
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
+        from safevar_sumo.questions.measure import subject_by
 
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
+            if any(option.metavar == CRITERION and values.get(option.name) is not None for option in self.options):
+                unsafe = Unsafe.parse(values["unsafe"])
+                subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
+                study = study_in(subjects[0])
+                evaluator = evaluator.for_study(study)
             with user_errors(self.name):
                 answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
             if not isinstance(answer, Answer):

@@ -11,6 +11,7 @@ import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -65,15 +66,9 @@ class Model(NamedTuple):
 
     def left_by(self, evaluations: Evaluations) -> FloatArray:
         """What evaluated settings leave; see `left`."""
-        unsafe = self.unsafe
-        limit = unsafe.contact + unsafe.keep if unsafe.below is None else unsafe.below
-        left = evaluations.f_safe - limit
-        left = np.where(unsafe.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
+        left = self.unsafe.left(evaluations)
+        left = np.where(self.unsafe.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
         return np.where(evaluations.valid & np.isfinite(left), left, np.inf)
-
-    def degree(self, left: float) -> float:
-        """The distance that a safe setting keeps, between bumpers [m], or its safety degree where that is limited."""
-        return left + (self.unsafe.keep if self.unsafe.below is None else self.unsafe.below)
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""
@@ -121,11 +116,22 @@ def limit_criterion(
     is by default that of the study; `SEARCHED_MARGIN` in one that searches its scenario, whose originals keep more.
     """
     study = evaluator.study
-    criterion = replace(evaluator.choose_criterion(unsafe, subject, original), contact=assemble(study).contact)
+    is_distance = unsafe is None and margin is not None
+    criterion = Unsafe() if is_distance else evaluator.choose_criterion(unsafe, subject, original)
+    check_margin(criterion, margin)
+    criterion = replace(criterion, contact=assemble(study).contact)
     # A collision that is asked for stands alone.
-    if criterion.below is not None or criterion.points is not None or (margin is None and unsafe is not None):
+    if not criterion.is_collision or (margin is None and unsafe is not None):
         return criterion
     return replace(criterion, keep=distance_to_keep(study, margin))
+
+
+def check_margin(criterion: Unsafe, margin: float | None) -> None:
+    """Refuse a distance to keep beside another criterion than a collision."""
+    if margin is not None and not criterion.is_collision:
+        raise InputError(
+            "margin", f"{margin:g} m beside {str(criterion)!r}", "a collision, from which a distance is kept"
+        )
 
 
 def distance_to_keep(study: Study, margin: float | None) -> float:

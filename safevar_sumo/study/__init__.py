@@ -31,6 +31,7 @@ from safevar_sumo.study.schema import (
     ORIGINAL_DEGREE as ORIGINAL_DEGREE,
     PYMOO as PYMOO,
     SAFETY_DEGREE as SAFETY_DEGREE,
+    WORST as WORST,
     MatrixTable as MatrixTable,
     MatrixTest as MatrixTest,
     MetricsTable as MetricsTable,

@@ -27,6 +27,8 @@ from safevar_sumo.study.characteristics import (
 from safevar_sumo.study.parameters import FreeParameter, searched
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
+WORST = "worst"
+"""The aggregate of a matrix by which the least safety degree decides."""
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 Tables = Mapping[str, Any]
@@ -205,14 +207,15 @@ class MatrixTable(Table, frozen=True, kw_only=True):
     """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then
     rates every setting.
 
-    `aggregate` combines the points' safety degrees: `worst` takes the lowest one. With a `point`, by its name, only
-    this one is simulated, and nothing is rated.
+    `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree, `drac >` at that
+    with the largest value of this metric, `ttc_min <` with the smallest. With a `point`, by its name, only this one is
+    simulated, and nothing is rated.
     """
 
     tests: list[MatrixTest] = []
     protocol: Literal["", "euro_ncap_2026"] = ""
     point: str = ""
-    aggregate: Literal["worst"] = "worst"
+    aggregate: Annotated[str, Meta(pattern=r"^(worst|[A-Za-z][A-Za-z0-9_]{0,63} [<>])\Z")] = WORST
 
     def __post_init__(self) -> None:
         if bool(self.tests) == bool(self.protocol):

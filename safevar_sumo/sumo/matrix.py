@@ -17,7 +17,7 @@ from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, finite_or_none
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
-from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, SAFETY_DEGREE, Study
+from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, SAFETY_DEGREE, WORST, Study
 from safevar_sumo.sumo.batch import drive_all, is_recorded, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
@@ -247,8 +247,9 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:
     """The number of each setting's worst point; `at_points` are the evaluations of the settings at all points.
 
-    It is the point with the least safety degree; of equal points, the first by name. A collision in a valid test always
-    counts. Without a collision, a point with an invalid test counts as the worst, because such a test leaves open
+    It is the point with the least safety degree, or for a setting that collides nowhere the one that is worst by
+    the measure of the study's matrix; of equal points, the first by name. A collision in a valid test always counts.
+    Without a collision, a point with an invalid test counts as the worst, because such a test leaves open
     whether the setting is safe.
     """
     order = np.argsort([point.name for point in system.points])
@@ -257,5 +258,11 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
     safety_degrees[np.isnan(safety_degrees)] = np.inf
     is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])
     has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
-    safety_degrees[is_invalid & ~has_collided] = -np.inf
-    return np.asarray(order[np.argmin(safety_degrees, axis=0)])
+    values = safety_degrees
+    if system.aggregate != WORST:
+        name, direction = system.aggregate.split()
+        measures = np.stack([evaluations.column(name) for evaluations in in_order])
+        measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
+        values = np.where(has_collided, safety_degrees, measures)
+    values[is_invalid & ~has_collided] = -np.inf
+    return np.asarray(order[np.argmin(values, axis=0)])

@@ -34,7 +34,16 @@ from safevar_sumo.scenarios import (
 )
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
-from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
+from safevar_sumo.study import (
+    WORST,
+    MatrixTest,
+    MetricsTable,
+    ModelTable,
+    Study,
+    VehicleTable,
+    Weather,
+    user_code_names,
+)
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
@@ -69,6 +78,7 @@ class System:
     - `scenes` are the recorded scenes of all points, and of points that it is reduced to.
     - `rater` rates results in the matrix of a protocol; None in a study that is not rated.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
+    - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
@@ -88,6 +98,7 @@ class System:
     scenes: Scenes = field(default_factory=Scenes)
     time_limit: float = 300.0
     sees_nobody: bool = False
+    aggregate: str = WORST
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -224,6 +235,10 @@ def _assemble(study: Study) -> System:
     for key, table in tables_of_metrics.items():
         for name in table:
             check_name("", f"{key}.{name} is no metric", name, metrics)
+    aggregate = WORST if study.matrix is None else study.matrix.aggregate
+    if aggregate != WORST:
+        name = aggregate.split()[0]
+        check_name("", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network)
     if not study.scenario.search:
@@ -256,6 +271,7 @@ def _assemble(study: Study) -> System:
         matrix=matrix,
         rater=rater,
         time_limit=study.search.time_limit,
+        aggregate=aggregate,
     )
 
 

@@ -169,7 +169,7 @@ def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_mu
 
 def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
     made = made_up_evaluations([2.0, -1.0])
-    assert [Unsafe(below=below).margin(made).tolist() for below in (None, 0.5)] == [[2.0, -1.0], [1.5, -1.5]]
+    assert [Unsafe(below=below).left(made).tolist() for below in (None, 0.5)] == [[2.0, -1.0], [1.5, -1.5]]
 
 
 SAMPLED = 0.05

@@ -40,7 +40,7 @@ from safevar_sumo.questions.compare.settings import (
     pairs_of,
 )
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import distance_to_keep
+from safevar_sumo.questions.models import check_margin, distance_to_keep
 from safevar_sumo.questions.pairs import (
     ENDS,
     SETTING_COLUMNS,
@@ -173,6 +173,8 @@ def _criteria(
     """
     if stated:
         criterion = stated[0]
+    elif margin is not None:
+        criterion = Unsafe()
     else:
         chosen = list[Unsafe]()
         for one, subject, original in zip(evaluators, subjects, originals, strict=True):
@@ -180,7 +182,8 @@ def _criteria(
                 chosen.append(one.choose_criterion(None, subject, original))
         without_points = [one for one in chosen if one.points is None]
         criterion = Unsafe() if Unsafe() in chosen else [*without_points, *chosen][0]
-    if criterion == Unsafe() and (margin is not None or not stated):
+    check_margin(criterion, margin)
+    if criterion.is_collision and (margin is not None or not stated):
         criterion = replace(criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators))
     return [replace(criterion, contact=assemble(one.study).contact) for one in evaluators]
 

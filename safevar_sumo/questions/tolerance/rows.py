@@ -168,6 +168,8 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
     if unsafe.points is not None:  # points are of the whole matrix
         return f"the car {unsafe.in_words}"
     test = "" if scenario.test_speed is None else f" in the test at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
+    if unsafe.bound is not None and not collided:
+        return f"the car {unsafe.in_words}{test}"
     if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
         impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"

@@ -114,7 +114,7 @@ class _BoxTest:
     def _of(self, box: Box, corners: FloatArray, attempt: int) -> _Test:
         lefts = [model.left(corners[:MAX_CORNERS], TEST_STAGE) for model in self.models]
         least = {
-            model.fit: model.degree(float(left.min(initial=np.inf)))
+            model.fit: model.unsafe.value(float(left.min(initial=np.inf)))
             for model, left in zip(self.models, lefts, strict=True)
         }
         found = [_failures(model, corners[:MAX_CORNERS], left) for model, left in zip(self.models, lefts, strict=True)]
@@ -303,9 +303,10 @@ def _result(
     least = [np.nan, np.nan]
     if test.attack is not None:
         judges = [test.judges[judge] for judge in test.attack.judges]
-        degrees = [model.degree(left) for model, left in zip(judges, test.attack.left.tolist(), strict=True)]
-        of_own = [degree for degree, model in zip(degrees, judges, strict=True) if model.fit == 0]
-        least = [min(degrees, default=np.nan), min(of_own, default=np.nan)]
+        values = [model.unsafe.value(left) for model, left in zip(judges, test.attack.left.tolist(), strict=True)]
+        of_own = [value for value, model in zip(values, judges, strict=True) if model.fit == 0]
+        worst = nothing.members[0].unsafe.worst
+        least = [worst(values, default=np.nan), worst(of_own, default=np.nan)]
     points = [len(model.evaluator.study.matrix.tests) for model in test.judges[:1] if model.evaluator.study.matrix]
     own_tests = nothing.members[0].evaluator.study.matrix
     return nothing._replace(

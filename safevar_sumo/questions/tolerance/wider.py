@@ -104,7 +104,8 @@ def _verdict(models: Models, settings: FloatArray, judges: Rows, left: FloatArra
     values = dict(zip(members.names, settings[0].tolist(), strict=True))
     where = encounter_in_words(members, values)
     if left[0] >= 0:
-        return f"they hold: the worst of {simulated:,} aimed at them keeps {model.degree(left[0]):.2f} m{where}."
+        keeps = model.unsafe.value_in_words(model.unsafe.value(left[0]))
+        return f"they hold: the worst of {simulated:,} aimed at them {keeps}{where}."
     words = describe(model, {"": settings[0]})[""].words
     new_car = ", where the new car is safe" if where else ""  # other encounters of a searched scenario do not count
     return f"they do not hold: {words}{where}{new_car}."

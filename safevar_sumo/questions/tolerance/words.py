@@ -97,16 +97,18 @@ def _attack_in_words(together: LimitsTogether, budget: int) -> str:
     """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67 m)`."""
     if together.attack is None or not budget:
         return "not attacked"
-    least, own = together.least
-    if not least < float("inf"):
+    (least, own), unsafe = together.least, together.members[0].unsafe
+    if not abs(least) < float("inf"):
         return f"{together.attack.simulated:,} aimed at them meet nobody"
-    of_own = f" (with the study's own fit {own:.2f} m)" if own == own and round(own, 2) != round(least, 2) else ""
+    words, of_own = unsafe.value_in_words(least), ""
+    if own == own and unsafe.value_in_words(own) != words:
+        of_own = f" (with the study's own fit {unsafe.value_in_words(own).partition(' ')[2]})"
     between = ""
     if together.between:
         between = f", at {number_of(together.between, 'point')} between those of the study, too"
         if together.between_left_out:
             between += f" ({together.between_left_out} left out, where the new car keeps too little)"
-    return f"the worst of {together.attack.simulated:,} aimed at them keeps {least:.2f} m{of_own}{between}"
+    return f"the worst of {together.attack.simulated:,} aimed at them {words}{of_own}{between}"
 
 
 def _proof_in_words(together: LimitsTogether) -> str:

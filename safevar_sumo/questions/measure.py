@@ -1,0 +1,71 @@
+"""A study and results by the measure of a criterion: it is simulated, and decides which point of a matrix is worst."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.errors import check_name
+from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.system import assemble
+
+STAGE = "solutions by the measure"
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.evaluator import Evaluator
+
+
+def study_by(study: Study, unsafe: Unsafe) -> Study:
+    """A study in which each setting has the measure of a criterion's bound, and in a matrix counts at the point where
+    that is worst; any other criterion leaves it as it is.
+
+    Raises
+    ------
+    InputError
+        If the study has no such metric.
+    """
+    if unsafe.bound is None:
+        return study
+    name, metrics, matrix = unsafe.bound.measure, study.metrics, study.matrix
+    known = assemble(study, study.source).measuring.metrics
+    check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, {**known, **OPTIONAL_METRICS})
+    if name not in known:
+        metrics = replace_in(metrics, also=[*metrics.also, name])
+    if matrix is not None:
+        matrix = replace_in(matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}")
+    return replace_in(study, metrics=metrics, matrix=matrix)
+
+
+def subject_by(subject: Study | Case | Path, unsafe: Unsafe, evaluator: Evaluator) -> Study | Case | Path:
+    """A subject of a question by a criterion; files stay as they are."""
+    if isinstance(subject, Path):
+        return subject
+    return study_by(subject, unsafe) if isinstance(subject, Study) else case_by(subject, unsafe, evaluator)
+
+
+def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
+    """Results by a criterion: with a bound on a metric that they lack, or that is of another point of a matrix, all
+    solutions are simulated again.
+    """
+    study = study_by(case.study, unsafe)
+    if unsafe.bound is None or (study.matrix is None and unsafe.bound.measure in case.solutions):
+        return case
+    evaluator = evaluator.for_study(study, verified=0)
+    names = evaluator.characteristics.names
+    settings = case.solutions[[*names]].to_numpy(dtype=float)
+    evaluations = evaluator.evaluate(np.concatenate([evaluator.characteristics.original[np.newaxis], settings]), STAGE)
+    original, found = evaluations.take(np.arange(1)), evaluations.take(np.arange(1, len(evaluations)))
+    values = {name: found.column(name) for name in ("f_safe", *found.metrics)}
+    solutions = case.solutions.assign(outcome=found.outcome, collision_speed=found.collision_speed, **values)
+    return replace(
+        case,
+        study=study,
+        original={name: float(value[0]) for name, value in original.metrics.items()},
+        solutions=solutions,
+        scoring=replace_in(case.scoring, metrics=assemble(study, study.source).measuring.scoring.metrics),
+    )
