@@ -11,6 +11,7 @@ from safevar_sumo.metrics.base import (
 from safevar_sumo.metrics.measures import (
     AVE_DECE,
     BRAKE_HARSHNESS,
+    DRAC,
     MAX_JERK,
     RATING_POINTS as RATING_POINTS,
     RMS_ACCELERATION,
@@ -18,12 +19,15 @@ from safevar_sumo.metrics.measures import (
     STOPPING_DISTANCE as STOPPING_DISTANCE,
     TET,
     TIT,
+    TTC_MIN,
     time_to_collision as time_to_collision,
 )
 from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe, margin_of as margin_of
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
-OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE)}
+OPTIONAL_METRICS = {
+    metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE, TTC_MIN, DRAC)
+}
 """Metrics that only the studies have that name them."""
 OBJECTIVES = {one.name: one for one in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
     SAFETY_DEGREE_METRIC.name: F_SAFE,

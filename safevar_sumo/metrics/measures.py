@@ -84,6 +84,43 @@ TIT = Measure(
 )
 
 
+def least_time_to_collision(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """The least TTC(t) [s] (Hayward 1972); shape (N,), NaN on a collision, and for a vehicle that approaches nobody."""
+    least = np.min(time_to_collision(runs), axis=0, initial=np.inf)
+    return mask_collisions(runs, np.where(np.isfinite(least), least, np.nan))
+
+
+def largest_deceleration_rate(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """The largest deceleration that would just avoid the collision, v_L^2 / (2 L_s) [m/s^2] (Cooper and Ferguson 1976;
+    DRAC of SUMO's SSM device), over the samples with a TTC; shape (N,), NaN as for the least TTC.
+    """
+    ttc = time_to_collision(runs)
+    is_counted = np.isfinite(ttc) & (ttc > 0)
+    rate = np.divide(runs.encounter.closing_speed, 2 * ttc, out=np.full_like(ttc, np.nan), where=is_counted)
+    largest = np.max(np.where(is_counted, rate, 0.0), axis=0, initial=0.0)
+    return mask_collisions(runs, np.where(is_counted.any(axis=0), largest, np.nan))
+
+
+TTC_MIN = Measure(
+    name="ttc_min",
+    title="least TTC",
+    unit="s",
+    more_is_unsafe=False,
+    over_collisions=False,
+    function=least_time_to_collision,
+    description="Least time to collision during the encounter; without a collision.",
+)
+DRAC = Measure(
+    name="drac",
+    title="DRAC",
+    unit="m/s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=largest_deceleration_rate,
+    description="Largest deceleration rate to avoid the crash, v_L^2 / (2 L_s); without a collision.",
+)
+
+
 def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Mean deceleration over the samples in which the brake is commanded and the vehicle moves [m/s^2].
 

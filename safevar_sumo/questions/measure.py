@@ -32,8 +32,8 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     if unsafe.bound is None:
         return study
     name, metrics, matrix = unsafe.bound.measure, study.metrics, study.matrix
-    known = assemble(study, study.source).measuring.metrics
-    check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, {**known, **OPTIONAL_METRICS})
+    known = [metric.name for metric in assemble(study, study.source).measuring.scoring.metrics]
+    check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, [*known, *OPTIONAL_METRICS])
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     if matrix is not None:
