@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.questions.answer import Answer
     from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.evaluator import Evaluator
 
 QUESTIONS = {
     name: f"safevar_sumo.questions.{name}"
@@ -210,13 +211,14 @@ class Question:
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
+                evaluator.measure = unsafe.bound.measure if unsafe.bound else ""
             with user_errors(self.name):
                 answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
             if not isinstance(answer, Answer):
                 raise InputError(self.name, f"returns {type(answer).__name__}", "an Answer")
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
-        verdict = f"{reason} {answer.verdict}".strip()
+        verdict = " ".join(filter(None, (reason, answer.verdict, _undefined_in_words(evaluator))))
         return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
     def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:
@@ -316,6 +318,14 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     kind = str if is_repeated or not kinds else kinds[0]
     choices = get_args(hint) if get_origin(hint) is Literal else ()
     return Option(parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning)
+
+
+def _undefined_in_words(evaluator: Evaluator) -> str:
+    """How often the metric of the criterion was undefined, in a sentence; empty if it never was."""
+    undefined = sum(count for count, _ in evaluator.undefined)
+    total = sum(number for _, number in evaluator.undefined)
+    of_all = f"{undefined:,} of {total:,} simulated settings, which count as safe"
+    return f"{evaluator.measure} is undefined, without a collision, in {of_all}." if undefined else ""
 
 
 def _name(source: StudyLike | Results) -> str:

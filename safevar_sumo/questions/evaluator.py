@@ -49,6 +49,9 @@ class Evaluator:
     ----------
     simulated
         Number of settings simulated so far; of equal settings in one call only one is simulated.
+    measure, undefined
+        The metric of the question's criterion, if it has one; for each call, also of evaluators of other studies, the
+        number of settings without a collision that have no such value, and of all.
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class Evaluator:
         self.characteristics = self.region.characteristics
         self._pool, self.progress, self._verified = pool, progress, verified
         self.simulated = 0
+        self.measure, self.undefined = "", list[tuple[int, int]]()
 
     def evaluate(self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False) -> Evaluations:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
@@ -151,6 +155,9 @@ class Evaluator:
 
         evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection)
         self.simulated += total
+        if self.measure:
+            is_undefined = np.isnan(evaluations.column(self.measure)) & evaluations.valid & ~evaluations.collided
+            self.undefined.append((int(np.count_nonzero(is_undefined)), len(evaluations)))
         return self._without_unsafe_originals(evaluations) if selection == EVERYTHING else evaluations
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
@@ -291,7 +298,9 @@ class Evaluator:
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
-        return Evaluator(study, self._pool, self._show, self._verified if verified is None else verified)
+        other = Evaluator(study, self._pool, self._show, self._verified if verified is None else verified)
+        other.measure, other.undefined = self.measure, self.undefined
+        return other
 
     def _show(self, stage: str, done: int, total: int) -> None:
         """Show the progress of another evaluator as part of this one's."""

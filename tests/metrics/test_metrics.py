@@ -82,6 +82,18 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
     assert value("tit", run) == pytest.approx(2.0, abs=4 * STEP)
 
 
+def test_least_ttc_and_largest_drac_of_even_braking() -> None:
+    """From 10 m/s with 5 m/s^2 and 12 m ahead, at speed v the distance is 2 m + v^2 / (10 m/s^2)."""
+    least = float(OPTIONAL_METRICS["ttc_min"].function(RUN, THRESHOLDS)[0])
+    largest = float(OPTIONAL_METRICS["drac"].function(RUN, THRESHOLDS)[0])
+    speed = np.linspace(0.01, 10, 100_001)
+    distance = 2 + speed**2 / 10
+    assert least == pytest.approx((distance / speed).min(), rel=1e-3)
+    assert largest == pytest.approx((speed**2 / (2 * distance)).max(), rel=1e-3)
+    nobody = meeting(closing_speed=np.zeros_like(RUN.encounter.closing_speed))
+    assert np.isnan([OPTIONAL_METRICS[name].function(nobody, THRESHOLDS)[0] for name in ("ttc_min", "drac")]).all()
+
+
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
     fine = value("tet", RUN)
     coarse = value("tet", RUN, COARSE)
@@ -220,5 +232,5 @@ def test_rms_agrees_with_scipys_filters() -> None:
 @pytest.mark.parametrize("name", sorted(OPTIONAL_METRICS.keys() - {"stopping_distance"}))
 def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
-    assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()))
+    assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()), equal_nan=True)
     assert np.isnan(comfort(name, speed, collision_speed=3.0)).all()

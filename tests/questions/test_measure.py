@@ -1,0 +1,129 @@
+"""Any metric of a study as the criterion of every question, a user's own, too; in a matrix its worst point counts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.measure import study_by
+from safevar_sumo.study import load_study
+from tests.in_process import json_of, refused, searched
+
+METRIC = """
+import numpy as np
+from safevar_sumo.metrics import Measure
+
+def hardest(runs, thresholds):
+    loss = np.max(-np.diff(runs.trace.speed, axis=0), axis=0, initial=0.0) / runs.trace.step
+    return np.where(np.isnan(runs.collision_speed), loss, np.nan)
+
+HARDEST = Measure(name="hardest", title="hardest", unit="m/s^2", more_is_unsafe=True, function=hardest)
+"""
+STUDY = """
+extends = "rain"
+name = "tiny"
+title = "Who brakes hardest?"
+[metrics]
+also = ["hardest_braking:HARDEST"]
+[search]
+algorithms = ["nsga2"]
+population = 10
+evaluations = 80
+runs = 1
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "hardest_braking.py").write_text(METRIC)
+    (tmp_path / "tiny.toml").write_text(STUDY)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "text", ["collision", "below=0.3", "points=35.0", "drac > 6", "ttc_min <= 1.25", "hardest >= 9"]
+)
+def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
+    assert str(Unsafe.parse(text)) == text
+    assert Unsafe.parse(str(Unsafe.parse(text))) == Unsafe.parse(text)
+
+
+@pytest.mark.parametrize("text", ["drac", "drac >", "drac > x", "drac == 6", "> 6", "drac > inf", "a b > 6", "below<1"])
+def test_a_criterion_that_is_none_is_refused(text: str) -> None:
+    if text == "below<1":  # a name of a metric like any other, which no study has
+        with pytest.raises(InputError, match="no metric 'below'"):
+            study_by(load_study("rain"), Unsafe.parse(text))
+    else:
+        with pytest.raises(InputError, match="unsafe"):
+            Unsafe.parse(text)
+
+
+@pytest.mark.slow
+def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
+    """The worn car stops nearest to a pedestrian at another point than where it had to brake hardest."""
+    study, worn = load_study("wear"), {"brakeTorque": 0.7}
+    by_drac = sv.evaluate(study_by(study, Unsafe.parse("drac > 5.7")), [worn], filtered=False, jobs=1)
+    by_degree = sv.evaluate(load_study("wear", metrics={"also": ["drac"]}), [worn], filtered=False, jobs=1)
+    assert by_drac["drac"][0] == pytest.approx(5.87, abs=0.005)
+    assert by_degree["drac"][0] == pytest.approx(2.52, abs=0.005)
+    assert by_degree["f_safe"][0] < by_drac["f_safe"][0]
+
+
+@pytest.mark.slow
+def test_every_question_takes_an_own_metric(folder: Path) -> None:
+    searched(load_study("tiny.toml"), folder / "results")
+    few = ("--characteristics", "tireFric,maxBrakeTorque")
+    for typed in (
+        ("risk", "tiny.toml", "--samples", "256"),
+        ("rules", "tiny.toml", "--samples", "256"),
+        ("explain", "results", "--fits", "0", "--top", "1"),
+        ("compare", "tiny.toml", "tiny.toml", "--samples", "64"),
+        ("tolerance", "tiny.toml", "--fits", "0", "--attack", "200", *few),
+    ):
+        answer = json_of(*typed, "--unsafe", "hardest > 6.8")
+        assert answer["numbers"]["unsafe"] == "hardest > 6.8", typed
+        assert "hardest > 6.8" in answer["verdict"], typed
+
+
+def test_an_undefined_measure_is_counted(folder: Path) -> None:
+    (folder / "nowhere.py").write_text(METRIC.replace("return np.where", "return np.nan * np.where"))
+    (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
+    verdict = json_of("risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8")["verdict"]
+    (counts,) = re.findall(r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated", verdict)
+    undefined, simulated = (int(text.replace(",", "")) for text in counts)
+    assert 0 < undefined < simulated, "some of all collide"
+
+
+def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
+    """300 cars within the limits together: none brakes harder, and none collides."""
+    few = ("--characteristics", "tireFric,maxBrakeTorque")
+    answer = json_of("tolerance", "tiny.toml", "--fits", "0", "--attack", "500", "--unsafe", "hardest > 6.8", *few)
+    limits = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
+    rng = np.random.default_rng(3)
+    ends = {name: (row["together_low"], row["together_high"]) for name, row in limits.items()}
+    cars = [{name: float(rng.uniform(*both)) for name, both in ends.items()} for _ in range(300)]
+    found = sv.evaluate("tiny.toml", cars, filtered=False, jobs=1)
+    assert answer["numbers"]["box"]
+    assert (found["outcome"] != "collision").all()
+    assert found["hardest"].max() <= 6.8
+    assert answer["numbers"]["least_attacked"] <= 6.8
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("risk rain --unsafe", "study 'rain' has no metric 'hardness'"),
+        ("tolerance rain --margin 0.3 --unsafe", "0.3 m beside 'hardness > 5'"),
+        ("compare rain sun --margin 0.3 --unsafe", "0.3 m beside 'hardness > 5'"),
+    ],
+)
+def test_a_criterion_that_cannot_be_used_is_refused(typed: str, told: str) -> None:
+    criterion = "hardness > 5" if "margin" not in typed else "tet > 5"
+    refused(*typed.split(), criterion, message=(told.replace("hardness > 5", criterion),))
