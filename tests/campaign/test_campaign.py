@@ -218,16 +218,18 @@ def functions_on_the_stack(frame: FrameType | None) -> list[tuple[str, str]]:
     return functions
 
 
-def listed() -> set[tuple[str, str]]:
-    """The functions in the table of the manual: a file in the second column, its functions in the third."""
+def listed() -> list[tuple[str, str]]:
+    """The functions in the table of the manual, in its order: a file in the second column, its functions in the
+    third.
+    """
     section = (ROOT / "docs/architecture.md").read_text().partition("## The path of a value")[2].partition("\n## ")[0]
     rows = re.findall(r"^\|.*\| `([\w/]+\.py)` \| (.+) \|$", section, re.MULTILINE)
-    return {(file, name) for file, names in rows for name in re.findall(r"`([\w.]+)`", names)}
+    return [(file, name) for file, names in rows for name in re.findall(r"`([\w.]+)`", names)]
 
 
 def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
     study = load_study("rain", search={"algorithms": ["nsga2"], "population": 4, "evaluations": 8, "runs": 1})
-    way = set[tuple[str, str]]()
+    way = dict[tuple[str, str], None]()
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         if event == "call":
@@ -237,14 +239,14 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
                 names = [name for _, name in functions]
                 if BESIDE not in names and ("carry_share" in names or "ResultsDirectory.finish" in names):
                     start = names.index("carry_share" if "carry_share" in names else "ResultsDirectory.finish")
-                    way.update(functions[: start + 1])
+                    way.update(dict.fromkeys(functions[start::-1]))
 
     sys.setprofile(note)
     try:
         searched(study, tmp_path)
     finally:
         sys.setprofile(None)
-    assert way == listed()
+    assert list(way) == listed(), "in the order of their first call"
     assert len(way) <= 40
 
 
