@@ -45,6 +45,9 @@ DRIVERS: dict[str, tuple[str, JsonObject]] = {
     f"{ANY_LEADER}_later": ("competent_driver", ANY | LATER),
 }
 """Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
+OF_LANES: dict[str, tuple[str, JsonObject]] = {name: (name, {}) for name in ("rss", "fuzzy_safety", "r157")}
+"""Further drivers where somebody drives ahead in the lane, or comes into it."""
+LANE_TITLES = {"rss": "responsibility-sensitive safety", "fuzzy_safety": "fuzzy safety model", "r157": "UN R157, 5.2.5"}
 TITLES = {LETTER: "competent driver", ANY_LEADER: "competent driver, any braking of a leader", FULL: "full braking"}
 NOBODY, NO_VERDICT = "nobody", "no verdict"
 """In the place of a driver who avoids a collision."""
@@ -55,6 +58,7 @@ COLUMNS: Columns = {
     ),
     "avoided": "collisions that he avoids",
     "later": f"collisions that he avoids if he needs {DELAY:g} s longer",
+    "no_longer": "collisions that he avoids in the original vehicle, but not in this one",
     "no_verdict": "collisions at points where he collides in the original vehicle, too: no verdict",
     **with_interval("share", Column("-", "share that he avoids of those with a verdict", ".2f")),
     "later_share": Column("-", f"the share if he needs {DELAY:g} s longer", is_shown=False),
@@ -82,20 +86,21 @@ def judge_sample(
 
 def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
     """The share that each driver avoids of the collisions on which he has a verdict; without a verdict no share."""
-    return verdicts[[*DRIVERS]].mean().dropna()
+    return verdicts.drop(columns="point").mean().dropna()
 
 
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of `judge_sample`."""
     rows, share_of = [], avoided_shares(verdicts)
-    for driver in TITLES if len(verdicts) else ():
+    drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]
+    for driver in drivers if len(verdicts) else ():
         later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
         low = high = share_of.get(driver)
         if number and len(verdicts) < collisions:
             low, high = clopper_pearson(avoided, number)
         avoided_later = int(verdicts[later].sum()) if later in verdicts else None
         points = [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())]
-        counts = (driver, avoided, avoided_later, len(verdicts) - number)
+        counts = (driver, avoided, avoided_later, number - avoided, len(verdicts) - number)
         rows.append((*counts, share_of.get(driver), low, high, share_of.get(later), points))
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     return frame.astype(
@@ -117,32 +122,40 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     """
     system = assemble(evaluator.study)
     worst = np.zeros(len(collisions), dtype=np.intp) if collisions.worst_points is None else collisions.worst_points
-    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(DRIVERS)).assign(point="")
+    drivers = DRIVERS | (OF_LANES if any(point.scenario.border for point in system.points) else {})
+    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(point="")
     for index in np.unique(worst).tolist():
         rows, point = np.flatnonzero(worst == index), system.points[index]
         study = at_point(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
         settings, there = collisions.settings[rows], system.at(point)
-        verdicts.loc[rows, list(DRIVERS)] = _judge_at_point(evaluator.for_study(study), there, settings)
+        verdicts.loc[rows, list(drivers)] = _judge_at_point(evaluator.for_study(study), there, settings, drivers)
         verdicts.loc[rows, "point"] = point.name
     return verdicts
 
 
-def _judge_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> FloatArray:
+def _judge_at_point(
+    evaluator: Evaluator, system: System, settings: FloatArray, drivers: Mapping[str, tuple[str, JsonObject]]
+) -> FloatArray:
     """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
     approach, verdicts = approach_parameters(system), dict[str, FloatArray]()
     if approach is None:
-        return np.full((len(settings), len(DRIVERS)), np.nan)
+        return np.full((len(settings), len(drivers)), np.nan)
     with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
-    is_led = system.points[0].scenario.pre_crash == PreCrash.LEAD_DECELERATING
-    for driver, (model, parameters) in DRIVERS.items():
+    scenario = system.points[0].scenario
+    is_led = scenario.pre_crash in (PreCrash.LEAD_DECELERATING, PreCrash.CUT_IN)
+    is_searched = len(system.characteristics.scenario) > 0
+    for driver, (model, parameters) in drivers.items():
         if ANY.items() <= parameters.items() and not is_led:  # nobody brakes: both conventions are one
             verdicts[driver] = verdicts[driver.replace(ANY_LEADER, LETTER)]
             continue
         ads = ModelTable(model=model, parameters={**approach, **parameters})
-        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads, spread={}))
+        verified = 0 if driver in OF_LANES else None
+        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads, spread={}), verified=verified)
         runs = with_driver.evaluate(with_original, REFERENCE_DRIVERS)
         avoided = np.where(runs.valid, ~runs.collided, np.nan)
-        verdicts[driver] = avoided[1:] if avoided[0] == 1 else np.full(len(settings), np.nan)
+        # In a searched scenario the original meets each encounter: where it is unsafe, the setting is infeasible.
+        has_verdict = is_searched or avoided[0] == 1
+        verdicts[driver] = avoided[1:] if has_verdict else np.full(len(settings), np.nan)
     return np.column_stack(list(verdicts.values()))
 
 

@@ -202,6 +202,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     final_speed: Annotated[float, Meta(ge=0, le=150)] = 2.0
     heading: Heading = 0.0
     time_after: Seconds = 5.0
+    border = "headway"
 
     @property
     def duration(self) -> Any:

@@ -277,6 +277,9 @@ class Scenario:
         gravity.
     centre_to_centre
         Whether the safety degree is the distance between the centres of two vehicles.
+    border
+        The parameter of which smaller values are more dangerous, which says how far a change moves what is avoidable;
+        "" if it has none.
     pre_crash
         The scenario's type in NHTSA's typology; "" if it has none.
     test_speed
@@ -300,6 +303,7 @@ class Scenario:
     grade: float = 0.0
     centre_to_centre: bool = False
     brakes_fully: bool = False
+    border: ClassVar[str] = ""
     # A scenario may have fields or properties of these names: type checkers see properties. `duration` has no default.
     if TYPE_CHECKING:
 

@@ -83,7 +83,8 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     speed, target_speed
-        Speeds of the vehicle under test and of the other car at the start [km/h].
+        Speeds of the vehicle under test and of the other car at the start [km/h]; by default the other car is 20 km/h
+        slower, and not slower than 10 km/h.
     gap
         Distance of the other car's rear ahead of the vehicle's front when it begins to move sideways [m].
     lateral_speed
@@ -105,29 +106,34 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     side is listed.
     """
 
-    target_speed: Annotated[
-        float, Meta(ge=0, le=130), searched(10.0, 130.0, "km/h", "speed of the car that cuts in")
-    ] = 60.0
+    target_speed: (
+        Annotated[float, Meta(ge=0, le=130), searched(10.0, 130.0, "km/h", "speed of the car that cuts in")] | None
+    ) = None
     target_deceleration: Annotated[
         float, Meta(ge=0, le=12), searched(0.0, 10.0, "m/s^2", "deceleration of the car once it is in the lane")
     ] = 0.0
     duration: Seconds = 30.0
     pre_crash = PreCrash.CUT_IN
+    border = "gap"
+
+    @property
+    def first_speed(self) -> Any:
+        """Speed of the other car at the start [m/s]."""
+        return (np.maximum(self.speed - 20.0, 10.0) if self.target_speed is None else self.target_speed) * KMH
 
     def check(self) -> None:
         """Refuse a car that is beside the vehicle before any of it is in the vehicle's lane."""
         enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
-        left = self.gap - (self.speed - self.target_speed) * KMH * enters_after
+        left = self.gap - (self.start_speed - self.first_speed) * enters_after
         if left <= 0:
             problem = f"gap = {self.gap:g} m is closed before the car is in the lane, after {enters_after:.2f} s"
             raise InputError("scenario.parameters", problem, f"a gap above {self.gap - left:.4g} m")
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The car that cuts in."""
-        first_speed = self.target_speed * KMH
         arrives = BEGINS_AT + LANE_WIDTH / self.lateral_speed
-        speed = np.maximum(first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0)
-        ahead = self.gap + (self.start_speed - first_speed) * BEGINS_AT
+        speed = np.maximum(self.first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0)
+        ahead = self.gap + (self.start_speed - self.first_speed) * BEGINS_AT
         x = ahead + CAR.length / 2 + travelled(speed, times)
         y = self.sign * (LANE_WIDTH - self.moved(times))
         return [Track("target", "car", *CAR, x, y, 1.0, 0.0, speed)]
@@ -166,6 +172,7 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ] = 2.0
     time_after: Seconds = 10.0
     pre_crash = PreCrash.LEAD_STOPPED
+    border = "headway"
 
     @property
     def duration(self) -> Any:

@@ -16,7 +16,9 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import _avoided_in_words
+from safevar_sumo.questions.explain.causes import Cause
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
+from safevar_sumo.questions.explain.moved import find_moved_borders
 from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure, robust_shares
 from safevar_sumo.questions.preventability import DRIVERS, avoided_by, drivers_frame, judge_collisions, judge_sample
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
@@ -24,7 +26,7 @@ from safevar_sumo.study import ModelTable, ScenarioTable, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool
-from tests.made_up import made_up_runs, original_of
+from tests.made_up import drawn, made_up_runs, original_of
 from tests.questions.conftest import box, made_up_evaluator
 
 COLLISION = Unsafe()
@@ -141,7 +143,7 @@ def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_ve
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
     here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
     found = drivers_frame(*judge_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9))))
-    letter, any_braking, _ = found.to_dict("records")
+    letter, any_braking, *_ = found.to_dict("records")
     assert (letter["no_verdict"], any_braking["share"]) == (2, 1.0)
     assert np.isnan(letter["share"])
     (point,) = letter["no_verdict_points"]
@@ -249,3 +251,32 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     assert plain is not None
     assert runs.trace.gap[plain, 0] == pytest.approx(15.0)
     assert unbraked is None
+
+
+@pytest.mark.slow
+def test_what_a_late_sensor_costs_is_the_way_that_it_closes_meanwhile() -> None:
+    """A steady cut-in, 30 km/h slower: a competent driver whose sensors are 0.2 s older needs 0.2 s of closing speed
+    more; the sensors' range, far beyond, moves nothing.
+    """
+    parameters = {"vut_length": 4.7, "vut_width": 1.85, "speed": 80.0, "target_speed": 50.0}
+    study = load_study("wear", matrix=None, scenario={"model": "cut_in", "parameters": parameters})
+    cause = Cause({"sensorLatency": 0.25, "sensorRange": 70.0}, "collision", -1.0, {})
+    moved = find_moved_borders(Evaluator(study, InlinePool()), [cause])
+    assert moved["characteristic"].tolist() == ["sensorLatency"]
+    before, now = moved[["border_before", "border_now"]].iloc[0]
+    assert now - before == pytest.approx(0.2 * 30 / 3.6, abs=0.3)
+
+
+@pytest.mark.slow
+def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
+    study = load_study("alks_joint")
+    evaluator = Evaluator(study, InlinePool(), verified=0)
+    settings = drawn(assemble(study), 24, 3)
+    collisions = evaluator.evaluate(settings, "settings")
+    collisions = collisions.take(collisions.collided)
+    verdicts = judge_collisions(evaluator, collisions)
+    rows = drivers_frame(verdicts, len(collisions)).set_index("driver")
+    assert {"competent_driver", "rss", "fuzzy_safety", "r157"} < {*rows.index}
+    counts = rows["avoided"] + rows["no_longer"] + rows["no_verdict"]
+    assert (counts == len(collisions)).all()
+    assert rows["no_verdict"]["full_braking"] == rows["no_verdict"].min()

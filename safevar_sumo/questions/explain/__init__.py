@@ -34,6 +34,7 @@ from safevar_sumo.questions.explain.failures import (
     compare_at_points,
     find_failures,
 )
+from safevar_sumo.questions.explain.moved import BORDERS, COLUMNS as MOVED_COLUMNS, find_moved_borders
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
 from safevar_sumo.questions.model_spread import FITS_AT_ONCE
 from safevar_sumo.questions.preventability import (
@@ -122,6 +123,7 @@ DISTINCT_COLUMNS: Columns = {
     solutions=SOLUTION_COLUMNS,
     characteristics=[*CHARACTERISTIC_COLUMNS, "needed_in_fits"],
     drivers=[*DRIVER_COLUMNS, "share_in_fits"],
+    moved=MOVED_COLUMNS,
     distinct_causes=DISTINCT_COLUMNS,
 )
 def explain(
@@ -154,7 +156,7 @@ def explain(
         Number of vehicle models that fit the published data about as well (sets of [spread]) with which each conclusion
         is drawn again; 0 leaves this out.
     """
-    evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES)
+    evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES, BORDERS)
     study, population = evaluator.study, find_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)
@@ -172,6 +174,7 @@ def explain(
         "causes": _causes_table(population, evaluator, holding, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **_statistics(evaluator, needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
+        "moved": _moved_table(evaluator, of_chosen),
         "distinct_causes": _distinct_table(evaluator, [causes[row] for row in sample]),
     }
     numbers = {
@@ -301,6 +304,12 @@ def _statistics(
             drivers.assign(share_in_fits=pd.Series(of_drivers, dtype=object)),
         ),
     }
+
+
+def _moved_table(evaluator: Evaluator, causes_of: Sequence[Sequence[Cause]]) -> pd.DataFrame:
+    causes = [] if is_rated(evaluator.study) else [cause for group in causes_of for cause in group]
+    title = "Avoidable in a new car, no longer in this one: a competent driver, any braking of a leader"
+    return tabulate(title, MOVED_COLUMNS, find_moved_borders(evaluator, causes))
 
 
 def _distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
