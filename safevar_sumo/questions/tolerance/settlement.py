@@ -19,6 +19,8 @@ CLEARANCE = 0.8
 """Share of such a move by which a limit keeps off a failure that an attack found between corners."""
 SLAB_ATTACK = 512
 """Number of simulations of an attack on the room beyond a limit."""
+SLAB_CORNERS = 512
+"""Number of corners of that room, in a study that searches its scenario: the test of the box meets many more."""
 KNOWN_CORNERS = 32
 """Number of corners with which that attack begins."""
 
@@ -76,7 +78,8 @@ class Settlement:
         ends = [wider.lower.copy(), wider.upper.copy()]
         for values in ends:
             values[column] = end
-        slab = Box(wider.region, *ends).corners(search.seed, 1)[:MAX_CORNERS]
+        slab = Box(wider.region, *ends).corners(search.seed, 1)
+        slab = slab[: MAX_CORNERS if len(slab) <= MAX_CORNERS else SLAB_CORNERS]
         settings = np.concatenate([slab, search.settings_at_end(sides, step)])
         if search.have_unsafe(settings[np.newaxis])[0]:
             return True
