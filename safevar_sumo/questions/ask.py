@@ -53,7 +53,8 @@ class Range(NamedTuple):
 
     def __str__(self) -> str:
         before, between = ("between", "and") if self.is_open else ("from", "to")
-        return f"{before} {self.low:,.12g} {between} {self.high:,.12g}"
+        ends = [f"{end:,}" if isinstance(end, int) else f"{end:,.12g}" for end in (self.low, self.high)]
+        return f"{before} {ends[0]} {between} {ends[1]}"
 
 
 Count = Annotated[int, Range(1, 100_000_000)]
