@@ -91,7 +91,7 @@ class _Count(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         total = "" if task.total is None else f"/{task.total:.0f}"
-        return Text(f"{task.completed:.0f}{total}")
+        return Text(f"{task.completed:.0f}{total}" if total or task.completed else "")
 
 
 class _Pace(ProgressColumn):

@@ -110,7 +110,7 @@ TYPED = [
     ("import sun --nsga2 mine.csv", "Missing option '--out'"),
     ("import sun --out out --nsga2 mine.csv --original sd=abc", "sd=NUMBER"),
     ("list wether", "did you mean 'weathers'?"),
-    ("tables results/smoke --table rq9", "results/smoke"),
+    ("tables results/smoke --table rq9", "there is no table 'rq9'"),
     ("check", "Missing argument 'NAME'"),
     ("export file --solution nsga2:0:0 --to carla --out x", "file: is a study and has no solutions"),
     ("simulate euro_ncap_pedestrian --point CPNA", "72 points, such as CPNA, speed 10"),
