@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.openscenario.actors import Actor, Array, Following, Running
+from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
 from safevar_sumo.openscenario.places import Place, Way, line_of, neighbour, way_of
 
@@ -273,22 +273,24 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
     if timing is None:
         return []
     if not line.times:
-        raise unsupported("FollowTrajectoryAction with Timing: every vertex needs a time and a place of its own")
+        raise unsupported("FollowTrajectoryAction with Timing: every vertex needs a time")
     is_relative = timing.get("domainAbsoluteRelative") == "relative"
     begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
     times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
     if any(b <= a for a, b in pairwise(times)):
         raise unsupported("FollowTrajectoryAction with Timing: the times of the vertices do not grow")
-    speeds = np.array([0.0, *np.diff(line.starts) / np.diff(times)])
-    now = player.now
-    if times[0] <= now:
-        actor.speed_now = float(speeds[1])
-    running = actor.begin(
-        "along",
-        float(times[-1]) - now,
-        now,
-        lambda time: speeds[np.minimum(np.searchsorted(times, time + now - 1e-9), len(speeds) - 1)],
-    )
+    now, stations = player.now, np.asarray(line.stations)
+    speeds = np.diff(stations) / np.diff(times)
+    # Who changes its speed evenly has the mean of two neighbours at the vertex in between.
+    at_vertices = np.array([speeds[0] if times[0] <= now else 0.0, *(speeds[1:] + speeds[:-1]) / 2, speeds[-1]])
+    actor.speed_now = float(np.interp(now, times, at_vertices))
+    running = actor.begin("along", float(times[-1]) - now, now, lambda time: np.interp(time + now, times, at_vertices))
+
+    def station(time: Array) -> Array:
+        beyond = np.maximum(time + now - times[-1], 0.0)
+        return np.interp(time + now, times, stations) + beyond * speeds[-1]
+
+    actor.stations = Motion(now, station)
     return [running]
 
 
@@ -334,6 +336,12 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         raise unsupported(f"{part(leaf, '*').tag if len(leaf) else leaf.tag} is not supported")
     if leaf.tag not in PRIVATE:
         raise unsupported(f"{leaf.tag} is not supported")
+    if player.ego in actors and player.has_begun and leaf.tag == "FollowTrajectoryAction":
+        player.ignored.add(f"{leaf.tag} of {player.ego.name}")
+        # It is a record of a run; the driving system drives anew.
+        line = line_of(part(leaf, "TrajectoryRef/Trajectory"), player.network, player.place_of)
+        player.ego_turns([piece.start.facing for piece in line.pieces])
+        return []
     if player.sample and player.ego in actors:
         raise unsupported(f"{leaf.tag} of {player.ego.name} after the start: its driving system drives")
     return [running for actor in actors for running in PRIVATE[leaf.tag](player, leaf, actor)]

@@ -82,6 +82,7 @@ class Actor:
     speed_now: float = 0.0
     along: Motion | None = None
     sideways: Motion | None = None
+    stations: Motion | None = None
     follows: Following | None = None
     running: dict[str, Running] = field(default_factory=dict)
     deleted: float = math.inf
@@ -104,7 +105,7 @@ class Actor:
             self.running[domain].is_replaced = True
         self.running[domain] = running
         if domain == "along":
-            self.along, self.follows = Motion(time, value), None
+            self.along, self.follows, self.stations = Motion(time, value), None, None
         else:
             self.sideways = Motion(time, value)
         return running
@@ -115,7 +116,7 @@ class Actor:
             if own is running and not running.is_replaced:
                 running.is_replaced = True
                 if domain == "along":
-                    self.along = self.follows = None
+                    self.along = self.follows = self.stations = None
                 else:
                     self.sideways = None
 
@@ -137,6 +138,8 @@ class Actor:
             speed = np.broadcast_to(self.along.value(times[later] - self.along.since), n)
         before = np.concatenate([[self.speed_now], speed[:-1]])
         ahead = (before + speed) / 2 * STEP
+        if self.stations is not None:
+            ahead = np.diff(self.stations.value(times[later] - self.stations.since), prepend=now.distance)
         forward, left, turn = ahead, np.full(n, now.left), np.ones(n)
         if self.sideways is not None:
             left = np.broadcast_to(self.sideways.value(times[later] - self.sideways.since), n)

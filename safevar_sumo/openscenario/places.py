@@ -14,6 +14,8 @@ from safevar_sumo.openscenario.road import Line, Network, Piece, Pose, Road, uni
 
 MAX_DETOUR = 6
 """Roads between two waypoints of a route at most."""
+LEAST_WAY = 1e-9
+"""Distance between two vertices from which on they are two [m]."""
 AHEAD = -1e-9
 """Cosine of a direction relative to a road from which on it leads along the road [-]."""
 
@@ -41,7 +43,7 @@ class Way(Line):
         for name, is_forward in chain:
             own = network.road(name).line.pieces
             pieces += own if is_forward else [piece.reversed() for piece in reversed(own)]
-        return cls(pieces, (), chain, network)
+        return cls(pieces, chain=chain, network=network)
 
     def road_at(self, distance: float, left: float = 0.0) -> Crossing:
         """The road at a distance, and the place on it."""
@@ -308,18 +310,23 @@ def line_of(trajectory: Element, network: Network, entity: Entity, start: Pose |
 
 
 def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
-    """Class Polyline: straight from vertex to vertex."""
-    vertices = shape.findall("Vertex")
-    places = [place_of(part(vertex, "Position/*"), network, entity).pose.place for vertex in vertices]
-    pieces = [
-        Piece(Pose(a, (b - a) / abs(b - a)), abs(b - a))
-        for a, b in pairwise(places)
-        if not cmath.isclose(a, b, abs_tol=1e-9)
-    ]
-    if not pieces:
-        raise unsupported("a Polyline whose vertices are all at one place")
-    times = [number(vertex, "time") for vertex in vertices if "time" in vertex.attrib]
-    return Line(pieces, tuple(times) if len(times) == len(vertices) == len(pieces) + 1 else ())
+    """Class Polyline: straight from vertex to vertex; who stands at one place has several there."""
+    positions = [(vertex, part(vertex, "Position/*")) for vertex in shape.findall("Vertex")]
+    poses = [place_of(position, network, entity).pose for _, position in positions]
+    pieces, stations = [], [0.0]
+    for (a, _), (b, _) in pairwise(poses):
+        length = abs(b - a)
+        stations.append(stations[-1] + (length if length > LEAST_WAY else 0.0))
+        if length > LEAST_WAY:
+            pieces.append(Piece(Pose(a, (b - a) / length), length))
+    times = [number(vertex, "time") for vertex, _ in positions if "time" in vertex.attrib]
+    has_facings = all("h" in position.attrib for _, position in positions)
+    return Line(
+        pieces or [Piece(poses[0], 1.0)],
+        stations,
+        times if len(times) == len(poses) else (),
+        [pose.facing for pose in poses] if has_facings else (),
+    )
 
 
 def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | None) -> list[Piece]:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import fresnel
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario.document import Element, attribute, number, part, root_of, unsupported
 
 LEAST_TURN = 1e-9
@@ -90,10 +91,16 @@ def _fresnel(value: Number, sign: float) -> Number:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of pieces, straight on beyond both ends; `times` are those of a trajectory's vertices [s]."""
+    """A line of pieces, straight on beyond both ends.
+
+    A trajectory has vertices at these `stations` [m], with `times` [s] and directions that a body faces, `facings`, if
+    the file states them.
+    """
 
     pieces: Sequence[Piece]
+    stations: Sequence[float] = ()
     times: Sequence[float] = ()
+    facings: Sequence[complex] = ()
 
     @cached_property
     def starts(self) -> Any:
@@ -116,7 +123,7 @@ class Line:
 
     def pose(self, distance: Number, left: Number = 0.0) -> Pose:
         """The poses at distances along the line, and so far to its left."""
-        if len(self.pieces) == 1 and self.is_straight:
+        if len(self.pieces) == 1 and self.is_straight and not self.facings:
             return self.pieces[0].start.moved(distance, left)
         distances = np.atleast_1d(np.asarray(distance, dtype=float))
         inside = np.clip(distances, 0.0, self.length)
@@ -126,6 +133,9 @@ class Line:
             here = pieces == k
             place[here], facing[here] = self.pieces[k].pose(inside[here] - self.starts[k])
         pose = Pose(place, facing).moved(distances - inside, left)
+        if self.facings:
+            between = np.interp(inside, self.stations, self.facings)
+            pose = pose._replace(facing=between / np.abs(between))
         return pose if np.ndim(distance) else Pose(complex(pose.place[0]), complex(pose.facing[0]))
 
     def curvature(self, distance: Any) -> Any:
@@ -145,14 +155,24 @@ Cubics = list[tuple[float, tuple[float, ...]]]
 
 @dataclass(frozen=True)
 class Road:
-    """A road: its reference line, sections with widths by lane, offsets of lane 0, and the elements at its ends."""
+    """A road: its reference line, sections with widths by lane, offsets of lane 0, and the elements at its ends; a
+    `flaw` says why nobody can be on it.
+    """
 
     id: str
-    line: Line
+    pieces: Sequence[Piece]
+    flaw: str
     sections: list[tuple[float, dict[int, Cubics]]]
     offsets: Cubics
     links: dict[str, tuple[str, str, str]]
     is_left_hand: bool
+
+    @cached_property
+    def line(self) -> Line:
+        """The reference line."""
+        if self.flaw:
+            raise unsupported(self.flaw)
+        return Line(self.pieces)
 
     @property
     def length(self) -> float:
@@ -248,8 +268,12 @@ def _road(element: Element) -> Road:
         for section in element.findall("lanes/laneSection")
     ]
     offsets = _cubics(part(element, "lanes"), "laneOffset", "s")
-    line = Line([_piece(each, name) for each in element.findall("planView/geometry")])
-    return Road(name, line, sections, offsets, links, element.get("rule") == "LHT")
+    pieces, flaw = [], ""
+    try:
+        pieces = [_piece(each, name) for each in element.findall("planView/geometry")]
+    except InputError as error:
+        flaw = error.problem
+    return Road(name, pieces, flaw, sections, offsets, links, element.get("rule") == "LHT")
 
 
 def _cubics(element: Element, tag: str, start: str) -> Cubics:

@@ -115,6 +115,8 @@ class Player:
         self.dependences: dict[str, float] = {}
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
+        self.has_begun = False
+        """Whether Init is over."""
         self.stop = math.inf
         self._seen: dict[int, tuple[int, Array]] = {}
         self._board = part(document.root, "Storyboard")
@@ -149,6 +151,12 @@ class Player:
         """Note what depends on Ego, and until when [s]."""
         if other is self.ego and (self.sample or until > self.now):
             self.dependences[what] = max(until, self.dependences.get(what, 0.0))
+
+    def ego_turns(self, facings: Array) -> None:
+        """Refuse directions of Ego that differ from the one at the start."""
+        turn = max(turn_of(complex(facing), self.ego.here.pose.facing) for facing in np.unique(facings))
+        if turn > MAX_TURN:
+            raise unsupported(f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees")
 
     def remark(self, text: str) -> None:
         """Note a remark, once."""
@@ -241,6 +249,7 @@ class Player:
         for one in init:
             if one.tag != "Private":
                 act(self, one, [])
+        self.has_begun = True
         for actor in self.actors.values():
             actor.note(0)
 
@@ -412,9 +421,7 @@ def play(file: str, values: Mapping[str, str], ego: str = "Ego", longest: float 
     player.play()
     own = player.ego
     samples = slice(0, player.sample + 1)
-    turn = max(turn_of(complex(facing), complex(own.facing[0])) for facing in np.unique(own.facing[samples]))
-    if turn > MAX_TURN:
-        raise unsupported(f"{ego} does not drive straight on: it turns by {turn:.1f} degrees")
+    player.ego_turns(own.facing[samples])
     if own.speed[0] <= 0:
         raise unsupported(f"{ego} stands at the start", "a SpeedAction in Init")
     others = [_moved(actor, samples) for actor in player.actors.values() if actor is not own]

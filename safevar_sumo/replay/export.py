@@ -43,6 +43,8 @@ CARLA_WHEELS = {
     "maxBrakeTorque": "max_brake_torque",
 }
 """Attributes of each `WheelPhysicsControl`, by characteristic; CARLA's radius is in cm, as the characteristic is."""
+EGO = "Ego"
+"""Name of the vehicle under test in OpenSCENARIO."""
 WHEELBASE = 0.58
 """Assumed wheelbase over the vehicle's length, with equal overhangs [-]."""
 HEIGHTS = {"pedestrian": 1.8, "bicycle": 1.7, "car": 1.5}
@@ -72,6 +74,7 @@ class Poses(NamedTuple):
     x: FloatArray
     y: FloatArray
     heading: FloatArray
+    start_speed: float = 0.0
 
     @property
     def height(self) -> float:
@@ -108,7 +111,8 @@ def poses_of(comparison: Comparison) -> list[Poses]:
             kind, to_middle = "pedestrian", 0.0
         x, y = x - to_middle * np.cos(heading), y - to_middle * np.sin(heading)
         samples = (values[is_present] for values in (time, x, y, heading))
-        actors.append(Poses(name, kind, track.length, track.width, *samples))
+        start_speed = float(comparison.runs.trace.speed[0, row]) if name == VUT else 0.0
+        actors.append(Poses(EGO if name == VUT else name, kind, track.length, track.width, *samples, start_speed))
     return actors
 
 

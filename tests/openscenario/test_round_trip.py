@@ -1,0 +1,53 @@
+"""A run that was exported as OpenSCENARIO is driven again from its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.replay.comparison import compare_setting
+from safevar_sumo.replay.export import write_files
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import assemble
+
+FILES = Path(__file__).parent / "files"
+WEAR = {"treadDepth": 1.6, "brakeTorque": 0.2}
+
+
+def runs_of(study: Study) -> tuple[SimulationRuns, Any, np.ndarray]:
+    system = assemble(study)
+    setting = system.characteristics.original.copy()
+    for name, value in WEAR.items():
+        setting[[*system.characteristics.names].index(name)] = value
+    (result,) = simulate_all_points(system, setting[np.newaxis])
+    return result.runs, system, setting
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        {"file": str(FILES / "crossing_pedestrian.xosc")},
+        {"file": str(FILES / "cut_in.xosc"), "values": {"gap_m": 6, "slower_kmh": 30}},
+        {"file": str(FILES / "braking_leader.xosc")},
+        {"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 50}},
+        {"model": "crossing", "parameters": {"test": "CPNA", "speed": 40}},
+    ],
+)
+def test_an_exported_run_is_the_same_from_its_file(tmp_path: Path, scenario: dict[str, Any]) -> None:
+    study = load_study("wear", scenario=scenario, matrix={"tests": []})
+    runs, system, setting = runs_of(study)
+    write_files(compare_setting(study, system, setting), "openscenario", tmp_path / "out", "RS:0:0", {})
+    (file,) = (tmp_path / "out").glob("*.xosc")
+    assert runs.outcome == Outcome.COLLISION
+    again, *_ = runs_of(load_study("wear", scenario={"file": str(file)}))
+    assert again.outcome == runs.outcome
+    n = int(np.count_nonzero(runs.trace.active)) + 1
+    for name in ("position", "gap", "lateral"):
+        first, second = (getattr(one.trace, name)[:n, 0] for one in (runs, again))
+        assert np.abs(first - second - (first[0] - second[0]) * (name == "position")).max() < 1e-3, name
+    assert again.collision_speed == pytest.approx(runs.collision_speed, abs=1e-3, nan_ok=True)
