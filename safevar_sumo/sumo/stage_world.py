@@ -60,10 +60,12 @@ class Placed(NamedTuple):
 
     @classmethod
     def of(cls, track: Track, ids: list[str], start: Frame) -> Placed:
-        x, y = start.point(track.x + track.along * track.length / 2, track.y + track.left * track.length / 2)
+        is_person = track.kind in PERSONS
+        ahead = 0.0 if is_person else track.length / 2
+        x, y = start.point(track.x + track.along * ahead, track.y + track.left * ahead)
         east, north = start._replace(origin=(0.0, 0.0)).point(track.along, track.left)
         angle = np.degrees(np.arctan2(east, north)) % 360
-        return cls(track, ids, track.kind in PERSONS, np.asarray(x), np.asarray(y), angle)
+        return cls(track, ids, is_person, np.asarray(x), np.asarray(y), angle)
 
 
 class StageWorld(SumoWorld):

@@ -73,10 +73,10 @@ def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Co
     samples = slice(0, comparison.moments[row].end + 1)
     boxes = {item.name: item.entityobject.boundingbox for item in scenario.entities.scenario_objects}
     groups = scenario.storyboard.stories[0].acts[0].maneuvergroup
-    assert {group.actors.actors[0].entity for group in groups} == comparison.tracks.keys()
+    assert {group.actors.actors[0].entity for group in groups} == {"Ego", *comparison.tracks} - {"vut"}
     for group in groups:
         name = group.actors.actors[0].entity
-        track, box = comparison.tracks[name], boxes[name]
+        track, box = comparison.tracks["vut" if name == "Ego" else name], boxes[name]
         trajectory = group.maneuvers[0].events[0].action[0].action.trajectory
         places = trajectory.shapes.positions
         x, y, heading = (np.array([getattr(place, axis) for place in places], dtype=float) for axis in "xyh")
