@@ -110,9 +110,11 @@ def poses_of(comparison: Comparison) -> list[Poses]:
         if track.is_person:
             kind, to_middle = "pedestrian", 0.0
         x, y = x - to_middle * np.cos(heading), y - to_middle * np.sin(heading)
-        samples = (values[is_present] for values in (time, x, y, heading))
-        start_speed = float(comparison.runs.trace.speed[0, row]) if name == VUT else 0.0
-        actors.append(Poses(EGO if name == VUT else name, kind, track.length, track.width, *samples, start_speed))
+        time_of, x, y, heading = (values[is_present] for values in (time, x, y, heading))
+        actor = Poses(name, kind, track.length, track.width, time_of, x, y, heading)
+        if name == VUT:
+            actor = actor._replace(name=EGO, start_speed=float(comparison.runs.trace.speed[0, row]))
+        actors.append(actor)
     return actors
 
 
