@@ -136,6 +136,8 @@ OUTSIDE: Mapping[str, str] = {
     **dict.fromkeys((*CARLA_ENGINE, *LGSVL_ENGINE), NO_ENGINE),
     "maxSteeringAngle": "the second model drives straight, without steering",
     "maxSpeed": "the model has no governor",
+    "sensorAngle": "the model has no direction of its sensors",
+    "sensorDropout": "the model's sensors lose no frames",
 }
 """Characteristics that the second model cannot represent, each with the reason."""
 

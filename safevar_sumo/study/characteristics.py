@@ -58,11 +58,6 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
     weight: PositiveNumber = 1.0
     counterpart: Description = ""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.original == 0:
-            raise mistake("original = 0", "a value other than 0: changes are relative to it")
-
 
 def unit_text(unit: str, layout: str = " {}") -> str:
     """A unit as text after a number or, in another `layout`, after a name; empty for a pure number."""

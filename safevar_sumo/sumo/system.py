@@ -302,7 +302,8 @@ def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scen
 def models_of(study: Study) -> tuple[Vehicle, Ads, Scenario, Weather]:
     """The study's models with their parameters; raises the errors of `assemble`."""
     lookup = Lookup.of(study)
-    vehicle, ads = _create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup)
+    vehicle = _create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
+    ads = _create_ads(study.ads, lookup)
     return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather)
 
 

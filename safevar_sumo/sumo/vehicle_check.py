@@ -35,11 +35,14 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
         if name in RESULT_COLUMNS:
             raise InputError("", f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
         check_name("", f"{key}: {study.vehicle.model} has no such characteristic", name, units)
+        if entry.original == 0 and name not in vehicle.OPTIONAL:
+            raise InputError("", f"{key}: original = 0", "a value other than 0: changes are relative to it")
         if entry.unit != units[name]:
             raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
     for name in units:
-        if name not in table:
-            raise InputError("", f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
+        if name not in table and name not in vehicle.OPTIONAL:
+            needed = ", ".join(name for name in units if name not in vehicle.OPTIONAL)
+            raise InputError("", f"vehicle.characteristics.{name} is missing", f"all of {needed}")
 
 
 def check_plausible(study: Study, vehicle: Vehicle) -> None:
@@ -51,6 +54,8 @@ def check_plausible(study: Study, vehicle: Vehicle) -> None:
         raise InputError("", problem, "(lowest, highest) or (lowest, highest, unit) by name") from None
     for name, (lowest, highest, own_unit) in ranges.items():
         entry = study.vehicle.characteristics.get(name)
+        if entry is None and name in vehicle.OPTIONAL:
+            continue
         if entry is None and not hasattr(vehicle, name):
             problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}"
             raise InputError("", problem, "names of characteristics and of parameters")

@@ -201,6 +201,8 @@ class Vehicle:
     ----------
     UNITS
         Units of the characteristics by name.
+    OPTIONAL
+        Characteristics that a study may leave out: then they are 0, which may be their original value, too.
     PLAUSIBLE
         Plausible values of characteristics and parameters by name; a study with others is refused. A name may be
         missing.
@@ -226,10 +228,15 @@ class Vehicle:
         "advance": Returned((LEGAL_STATE,), like=2),
     }
     UNITS: Mapping[str, str]
+    OPTIONAL: ClassVar[tuple[str, ...]] = ()
     PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType({})
     FITTED_UP_TO: ClassVar[float] = np.inf
     remarks: Sequence[str] = ()
     second_model: ClassVar[str] = ""
+
+    def seeded(self, seed: int) -> Vehicle:
+        """The vehicle with the study's seed, for what is random in it, the same for all vehicles; most need none."""
+        return self
 
     @abstractmethod
     def prepare(

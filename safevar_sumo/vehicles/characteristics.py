@@ -232,10 +232,11 @@ class CharacteristicSet:
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
         """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w (method section 3,
-        where w = 1), of the vehicle's characteristics.
+        where w = 1), of the vehicle's characteristics; the domain's width stands for an original of 0.
         """
         vehicle = self.vehicle
-        change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / np.abs(vehicle.original)
+        scale = np.where(vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original))
+        change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
         return np.asarray(np.max(vehicle.weight * change, axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:

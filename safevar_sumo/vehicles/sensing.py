@@ -11,9 +11,11 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import (
+    DELAYED,
     FRICTION,
     LEVEL,
     MASS,
@@ -31,6 +33,8 @@ from safevar_sumo.vehicles.base import (
 )
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 
+TANGENT_DECIMALS = 12
+"""Decimals to which a tangent is rounded: its last bits differ between machines."""
 RELEASED_BRAKE = 1e-6
 """Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command that fades out between
 two steps must not hold the engine off.
@@ -40,7 +44,8 @@ two steps must not hold the engine off.
 class SensingState(NamedTuple):
     """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the wheels [m/s^2].
 
-    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation.
+    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation. `frame` is what the
+    sensors last reported, in the order of `DELAYED`, where they may lose frames.
     """
 
     speed: FloatArray
@@ -50,6 +55,7 @@ class SensingState(NamedTuple):
     seen: DelayedSignal | None
     brake_commands: DelayedSignal
     acceleration: FloatArray
+    frame: FloatArray | None = None
 
 
 class SensingVehicle(Vehicle):
@@ -216,7 +222,8 @@ class _PreparedWorn(NamedTuple):
     """Constants of a run, SI, shape (N,); see `SensingVehicle`.
 
     `grip` is the friction coefficient at rest, `lift` its fall with speed (wet_road.py) [s^2/m^2]; `front_load` and
-    `rear_load` are the axles' shares of the weight at rest [-].
+    `rear_load` are the axles' shares of the weight at rest [-]. `tangent` is that of the sensors' angle, `dropout` the
+    share of lost frames [-]; None if the study does not have them.
     """
 
     step: float
@@ -232,6 +239,8 @@ class _PreparedWorn(NamedTuple):
     sensor_range: FloatArray
     latency: FloatArray
     slope: Slope
+    tangent: FloatArray | None
+    dropout: FloatArray | None
 
 
 class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -250,9 +259,15 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         Constants a [s^2/m^2 mm^0.5] and b [mm] of the friction on a wet road (wet_road.py), fitted to published stops.
     max_speed
         Top speed [m/s].
+    frame_seed
+        Seed of the pattern of lost frames; that of the study's search.
 
     Notes
     -----
+    With a `sensorAngle` the lateral place of what is seen is off by its gap times the tangent of the angle, above 0
+    away from the side that it comes from. Of the sensors' frames the share `sensorDropout` is lost, the same frames in
+    all vehicles: then the driving system sees the last one again.
+
     The friction coefficient mu on a dry road is `tyre_friction` times the weather's `road_friction`, whatever the
     tread. Under water this is the grip at rest, and mu falls with speed, water and lost tread, step by step
     (wet_road.py).
@@ -274,7 +289,10 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         "payloadCentre": "m",
         "sensorRange": "m",
         "sensorLatency": "s",
+        "sensorAngle": "deg",
+        "sensorDropout": "-",
     }
+    OPTIONAL = ("sensorAngle", "sensorDropout")
     PLAUSIBLE = {
         "treadDepth": Plausible(0.1, 50),
         "brakeTorque": Plausible(0.01, 10),
@@ -283,6 +301,8 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         "payloadCentre": Plausible(0.05, 20),
         "sensorRange": Plausible(0.5, 2000),
         "sensorLatency": SECONDS,
+        "sensorAngle": Plausible(-45, 45),
+        "sensorDropout": Plausible(0, 0.99),
         "kerb_mass": MASS,
         "kerb_centre": Plausible(0.1, 10, "m"),
         "wheelbase": Plausible(0.5, 12, "m"),
@@ -304,6 +324,11 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     water_lift: Positive = WET_FRICTION["worn"]["water_lift"]
     road_texture: Positive = WET_FRICTION["worn"]["road_texture"]
     max_speed: Positive = 55.56
+    frame_seed: Annotated[int, Meta(ge=0)] = 0
+
+    def seeded(self, seed: int) -> WornVehicle:
+        """The vehicle with a pattern of lost frames."""
+        return replace(self, frame_seed=seed)
 
     def prepare(
         self,
@@ -317,6 +342,9 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         mass = self.kerb_mass + c["payload"]
         rear_load = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
         tread = np.maximum(c["treadDepth"], 0.0)
+        tangent: FloatArray | None = None
+        if "sensorAngle" in c:
+            tangent = np.asarray(np.round(np.tan(np.radians(c["sensorAngle"])), TANGENT_DECIMALS), dtype=float)
         return _PreparedWorn(
             step=step,
             mass=mass,
@@ -331,7 +359,24 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             sensor_range=c["sensorRange"],
             latency=c["sensorLatency"],
             slope=slope,
+            tangent=tangent,
+            dropout=c.get("sensorDropout"),
         )
+
+    def sense(self, prepared: Prepared, state: SensingState, seen: Observation) -> tuple[Observation, SensingState]:
+        """What sensors see that look aside and lose frames."""
+        sensed, state = SensingVehicle.sense(self, prepared, state, seen)
+        if prepared.tangent is not None:
+            distance = np.where(np.isfinite(sensed.gap), sensed.gap, 0.0)
+            sensed = sensed._replace(lateral=sensed.lateral + distance * prepared.tangent)
+        if prepared.dropout is None:
+            return sensed, state
+        frame = np.stack([getattr(sensed, name) for name in DELAYED])
+        if state.frame is not None:
+            number = round(seen.time / prepared.step)
+            is_lost = np.random.default_rng([self.frame_seed, number]).random() < prepared.dropout
+            frame = np.where(is_lost, state.frame, frame)
+        return sensed._replace(**dict(zip(DELAYED, frame, strict=True))), state._replace(frame=frame)
 
     def friction(self, prepared: _PreparedWorn, speed: FloatArray) -> FloatArray:
         """The friction coefficient at speeds [m/s], shape (N,)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +17,12 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import spearmanr
 
 from calibration import wet_friction as fit
+from safevar_sumo.ads.base import is_in_the_way
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.tolerance.scans import scan
-from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
+from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray, Observation
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -27,6 +30,7 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 from tests.in_process import InlinePool
+from tests.made_up import drawn
 
 CAR = WornVehicle()
 HEALTHY = {
@@ -300,3 +304,74 @@ def test_a_change_of_just_the_threshold_is_noise() -> None:
     """Numbers that are exact in binary: 2 % of a width of 100."""
     exact = CharacteristicSet((one(0, 50, 100),))
     assert exact.filter(np.array([[52.0], [48.0], [52.5], [47.5]])).ravel().tolist() == [50, 50, 52.5, 47.5]
+
+
+def seen_at(gap: Any, time: float = 0.0) -> Observation:
+    """A pedestrian of 0.5 m in the middle of the lane, seen by one vehicle or several."""
+    n = np.size(gap)
+    zeros = np.zeros(n)
+    columns = {"speed": zeros + 10.0, "closing_speed": zeros + 10.0, "lateral": zeros, "lateral_speed": zeros}
+    return Observation(time=time, gap=zeros + gap, visibility=1.0, obstacle_width=zeros + 0.5, **columns)
+
+
+def sensors(**values: float | list[float]) -> tuple[WornVehicle, Any, Any]:
+    """Worn cars with perfect sensors but for these values; the model, their constants and their state."""
+    n = max(np.size(value) for value in values.values())
+    table = load_study("wear").vehicle.characteristics
+    original = {name: np.full(n, row.original) for name, row in table.items()}
+    given = {name: np.zeros(n) + value for name, value in values.items()}
+    vehicle = WornVehicle()
+    prepared = vehicle.prepare({**original, "sensorLatency": np.full(n, 1e-9), **given}, 1.0, 0.05)
+    return vehicle, prepared, vehicle.at_speed(prepared, np.full(n, 10.0))
+
+
+def test_an_angle_of_one_degree_puts_a_pedestrian_outside_a_corridor_beyond_92_metres() -> None:
+    """1.6 m / tan(1 degree) = 91.66 m; nearer he is inside, at every angle in proportion to 1 / tan."""
+    for angle in (-4.0, 1.0, 2.0):
+        border = 1.6 / abs(math.tan(math.radians(angle)))
+        vehicle, prepared, state = sensors(sensorAngle=[angle, angle], sensorRange=200.0)
+        seen, _ = vehicle.sense(prepared, state, seen_at(np.array([border - 0.01, border + 0.01])))
+        assert is_in_the_way(seen, corridor=1.6 - 0.25).tolist() == [True, False]
+    assert 1.6 / math.tan(math.radians(1.0)) == pytest.approx(91.66, abs=0.01)
+    unseen, _ = vehicle.sense(prepared, state, seen_at(np.array([np.inf, np.inf])))
+    assert np.isfinite(unseen.lateral).all()
+
+
+def test_lost_frames_repeat_the_last_one_in_a_pattern_that_all_vehicles_share() -> None:
+    shares = [0.0, 0.25, 0.25, 0.5]
+    patterns = []
+    for seed in (3, 3, 4):
+        vehicle, prepared, state = sensors(sensorDropout=shares)
+        seeded = vehicle.seeded(seed)
+        gaps = []
+        for k in range(400):
+            seen, state = seeded.sense(prepared, state, seen_at(np.full(4, 1000.0 - k) / 20, k * 0.05))
+            gaps.append(seen.gap * 20)
+        steps = np.diff(np.array(gaps), axis=0)
+        patterns.append(steps == 0)
+    lost = patterns[0]
+    assert np.array_equal(lost, patterns[1])
+    assert not np.array_equal(lost, patterns[2])
+    assert not lost[:, 0].any()
+    assert np.array_equal(lost[:, 1], lost[:, 2])
+    assert (lost[:, 3] | ~lost[:, 1]).all(), "who loses more loses these, too"
+    assert lost.mean(axis=0) == pytest.approx(shares, abs=0.07)
+
+
+def test_a_study_without_them_drives_as_with_none() -> None:
+    """`wear` keeps its bytes, and an original of 0 counts with the domain's width in f_diff."""
+    with_them, without = assemble(load_study("sensing", matrix=None)), assemble(load_study("wear", matrix=None))
+    settings = drawn(without, 6, 2)
+    more = np.concatenate([settings, np.zeros((6, 2))], axis=1)
+    ours, theirs = evaluate(with_them, more), evaluate(without, settings)
+    assert ours.f_safe.tolist() == theirs.f_safe.tolist()
+    angled = with_them.characteristics.original.copy()
+    angled[with_them.characteristics.names.index("sensorAngle")] = 2.5
+    assert with_them.characteristics.largest_change(angled[np.newaxis]).tolist() == [0.25]
+
+
+def test_an_original_of_0_is_refused_where_changes_are_relative() -> None:
+    row = {"unit": "mm", "original": 0, "lower": 0, "upper": 8}
+    study = load_study("wear", vehicle={"characteristics": {"treadDepth": row}})
+    with pytest.raises(InputError, match=r"treadDepth: original = 0\nexpected: a value other than 0"):
+        assemble(study)
