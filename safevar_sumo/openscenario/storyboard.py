@@ -38,13 +38,16 @@ MAX_TURN = 0.01
 
 
 class Moved(NamedTuple):
-    """How an entity moves: its shape, and the places of its middle, directions and speeds at all samples."""
+    """How an entity moves: its shape, the places of its middle, directions and speeds at all samples, and the time at
+    which it is deleted [s].
+    """
 
     name: str
     shape: Shape
     place: Array
     facing: Array
     speed: Array
+    deleted: float
 
 
 class Played(NamedTuple):
@@ -73,11 +76,18 @@ class Event:
     names: tuple[tuple[str, str], ...]
     actors: list[Actor]
     running: dict[str, list[Running]] = field(default_factory=dict)
+    has_begun: bool = False
+    has_ended: bool = False
 
     @property
     def key(self) -> tuple[str, str]:
         """The event in conditions on states."""
         return "event", attribute(self.element, "name")
+
+    @property
+    def moves(self) -> bool:
+        """Whether an action of it moves somebody."""
+        return not all(is_ignored(each) for each in self.element.findall("Action/*"))
 
 
 @dataclass
@@ -86,11 +96,17 @@ class Act:
 
     element: Element
     events: list[Event]
+    has_begun: bool = False
 
     @property
     def key(self) -> tuple[str, str]:
         """The act in conditions on states."""
         return "act", attribute(self.element, "name")
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether all of it is over."""
+        return self.has_begun and all(event.has_ended for event in self.events)
 
 
 class Player:
@@ -115,8 +131,8 @@ class Player:
         self.dependences: dict[str, float] = {}
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
-        self.has_begun = False
-        """Whether Init is over."""
+        self.has_begun, self._changes = False, 0
+        """Whether Init is over; how many events have begun or ended."""
         self.stop = math.inf
         self._seen: dict[int, tuple[int, Array]] = {}
         self._board = part(document.root, "Storyboard")
@@ -258,16 +274,16 @@ class Player:
         now = slice(self.sample, self.sample + 1)
         is_settled = False
         while not is_settled:
-            before = len(self.begun), len(self.ended)
+            before = len(self.begun), len(self.ended), self._changes
             for one in self._acts:
-                trigger = one.element.find("StartTrigger")
-                if one.key not in self.begun and self._holds(trigger, now)[0]:
-                    self.begun[one.key] = self.now
+                if not one.has_begun and self._holds(one.element.find("StartTrigger"), now)[0]:
+                    one.has_begun = True
+                    self.begun.setdefault(one.key, self.now)
                     self._note_ego(one.element)
                     self._check(one)
-                if one.key in self.begun and one.key not in self.ended:
+                if one.has_begun and one.key not in self.ended:
                     self._settle_act(one, now)
-            is_settled = before == (len(self.begun), len(self.ended))
+            is_settled = before == (len(self.begun), len(self.ended), self._changes)
         for actor in self.actors.values():
             actor.note(self.sample)
 
@@ -275,17 +291,16 @@ class Player:
         stop = one.element.find("StopTrigger")
         is_stopped = stop is not None and len(stop) > 0 and bool(self._holds(stop, now)[0])
         for event in one.events:
-            if is_stopped and event.key not in self.ended:
+            if is_stopped and not event.has_ended:
                 self._cut(event)
-            elif event.key not in self.begun and self._holds(event.element.find("StartTrigger"), now)[0]:
+            elif not event.has_begun and self._holds(event.element.find("StartTrigger"), now)[0]:
                 self._begin(event, one)
-            if event.key in self.begun:
+            if event.has_begun and not event.has_ended:
                 self._finish(event)
         for place in range(3):  # maneuvers, groups and the act
             for name in dict.fromkeys(event.names[place] for event in one.events):
-                own = [event for event in one.events if event.names[place] == name]
                 self.begun.setdefault(name, self.now)
-                if all(event.key in self.ended for event in own):
+                if all(event.has_ended for event in one.events if event.names[place] == name):
                     self.ended.setdefault(name, self.now)
         if not one.events:
             self.ended.setdefault(one.key, self.now)
@@ -293,11 +308,10 @@ class Player:
     def _check(self, one: Act) -> None:
         """Refuse events that only a run can begin."""
         for event in one.events:
-            if not all(is_ignored(each) for each in event.element.findall("Action/*")):
-                for kind in self._watched(event.element.find("StartTrigger")):
-                    if kind in REACTIONS:
-                        waits = f"the event {event.key[1]} waits for a {kind} of {self.ego.name}"
-                        raise unsupported(f"{waits}, which only a run can tell")
+            for kind in self._watched(event.element.find("StartTrigger")) if event.moves else ():
+                if kind in REACTIONS:
+                    waits = f"the event {event.key[1]} waits for a {kind} of {self.ego.name}"
+                    raise unsupported(f"{waits}, which only a run can tell")
 
     def _begin(self, event: Event, one: Act) -> None:
         """Begin an event: `override` ends the others of its maneuver, `skip` waits for none."""
@@ -305,32 +319,36 @@ class Player:
         others = [
             other
             for other in one.events
-            if other is not event
-            and other.names == event.names
-            and other.key in self.begun
-            and other.key not in self.ended
+            if other is not event and other.names == event.names and other.has_begun and not other.has_ended
         ]
-        self.begun[event.key] = self.now
+        event.has_begun = True
+        self._changes += 1
+        self.begun.setdefault(event.key, self.now)
         if priority == "skip" and others:
             self._cut(event)
             return
         if priority in ("override", "overwrite"):
             for other in others:
                 self._cut(other)
-        moves = [each for each in event.element.findall("Action/*") if not is_ignored(each)]
-        if moves:
+        if event.moves:
             self._note_ego(event.element)
         for action in event.element.findall("Action"):
             name = attribute(action, "name")
-            self.begun["action", name] = self.now
+            self.begun.setdefault(("action", name), self.now)
             event.running[name] = [running for each in action for running in act(self, each, event.actors)]
 
     def _finish(self, event: Event) -> None:
-        for name, running in event.running.items():
-            if all(one.is_done(self.now) for one in running):
-                self.ended.setdefault(("action", name), self.now)
-        if all(("action", name) in self.ended for name in event.running):
-            self.ended.setdefault(event.key, self.now)
+        done = [name for name, running in event.running.items() if all(one.is_done(self.now) for one in running)]
+        for name in done:
+            self.ended.setdefault(("action", name), self.now)
+        if len(done) == len(event.running):
+            self._end(event)
+
+    def _end(self, event: Event) -> None:
+        event.has_begun = event.has_ended = True
+        self._changes += 1
+        self.begun.setdefault(event.key, self.now)
+        self.ended.setdefault(event.key, self.now)
 
     def _cut(self, event: Event) -> None:
         """End an event before its time."""
@@ -339,8 +357,7 @@ class Player:
                 for actor in event.actors:
                     actor.end(one)
             self.ended.setdefault(("action", name), self.now)
-        self.begun.setdefault(event.key, self.now)
-        self.ended.setdefault(event.key, self.now)
+        self._end(event)
 
     def _note_ego(self, element: Element) -> None:
         for kind in self._watched(element.find("StartTrigger")):
@@ -357,11 +374,11 @@ class Player:
         stop = self._board.find("StopTrigger")
         triggers = [stop] if stop is not None and len(stop) and math.isinf(self.stop) else []
         for one in self._acts:
-            if one.key not in self.begun:
+            if not one.has_begun:
                 start = one.element.find("StartTrigger")
                 triggers += [] if start is None else [start]
-            elif one.key not in self.ended:
-                waiting = [event.element.find("StartTrigger") for event in one.events if event.key not in self.begun]
+            elif not one.has_ended:
+                waiting = [event.element.find("StartTrigger") for event in one.events if not event.has_begun]
                 triggers += [trigger for trigger in waiting if trigger is not None]
                 end = one.element.find("StopTrigger")
                 triggers += [end] if end is not None and len(end) else []
@@ -381,7 +398,7 @@ class Player:
             if is_asked and self._holds(stop, slice(self.sample, self.sample + 1))[0]:
                 self.stop = self.now
                 final = min(final, self.sample + round(AFTER / STEP))
-            if self.sample >= final or any(actor.deleted <= self.now for actor in self.actors.values()):
+            if self.sample >= final:
                 return
             last = min(final, self.sample + BLOCK)
             for actor in sorted(self.actors.values(), key=lambda one: one.follows is not None):
@@ -424,6 +441,8 @@ def play(file: str, values: Mapping[str, str], ego: str = "Ego", longest: float 
     player.ego_turns(own.facing[samples])
     if own.speed[0] <= 0:
         raise unsupported(f"{ego} stands at the start", "a SpeedAction in Init")
+    if np.ptp(own.speed[samples]) > 1e-6:
+        raise unsupported(f"{ego} does not keep its speed at the start: its driving system drives")
     others = [_moved(actor, samples) for actor in player.actors.values() if actor is not own]
     if not others:
         raise unsupported(f"nobody but {ego} is in the file", "another ScenarioObject")
@@ -440,7 +459,7 @@ def play(file: str, values: Mapping[str, str], ego: str = "Ego", longest: float 
 
 def _moved(actor: Actor, samples: slice) -> Moved:
     place = actor.place[samples] + actor.facing[samples] * complex(actor.shape.ahead, actor.shape.left)
-    return Moved(actor.name, actor.shape, place, actor.facing[samples], actor.speed[samples])
+    return Moved(actor.name, actor.shape, place, actor.facing[samples], actor.speed[samples], actor.deleted)
 
 
 def _remark(player: Player) -> None:
@@ -449,10 +468,8 @@ def _remark(player: Player) -> None:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")
     for actor in player.actors.values():
         if actor.deleted < math.inf:
-            player.remark(f"the scene ends at {actor.deleted:.1f} s, when {actor.name} is deleted")
+            player.remark(f"{actor.name} is deleted at {actor.deleted:.1f} s")
     for one in player._acts:
         for event in one.events:
-            if event.key not in player.begun and not all(
-                is_ignored(each) for each in event.element.findall("Action/*")
-            ):
-                player.remark(f"the {event.element.tag.lower()} {event.key[1]} never fires")
+            if event.moves and not event.has_begun:
+                player.remark(f"the event {event.key[1]} never fires")

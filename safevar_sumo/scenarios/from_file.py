@@ -11,12 +11,14 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import STEP, Moved, Played, play
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.tracks import Track, TrackScenario
 from safevar_sumo.study import FreeParameter
 
 WIDEST = 1e9
 """Largest size of a parameter of a file, which says itself what it allows."""
+AWAY_SPEED = 90.0
+"""Speed at which a deleted entity, a point without size, leaves the scene to the left [m/s]."""
 DIGITS = 9
 """Decimals of the places in tracks [m]: the last bits of a sine differ between machines."""
 
@@ -183,9 +185,14 @@ class OpenScenario(TrackScenario):
         facing = facing / np.abs(facing)
         place = place + beyond * STEP * speed * facing
         shape = bodies[0].shape
-        return Track(
-            name, shape.kind, shape.length, shape.width, place.real, place.imag, facing.real, facing.imag, speed
-        )
+        length: Quantity = shape.length
+        width: Quantity = shape.width
+        deleted = np.array([body.deleted for body in bodies])
+        gone = np.maximum(samples[:, np.newaxis] * STEP - deleted, 0.0)
+        if gone.any():
+            length, width = (np.where(gone > 0, 0.0, size) for size in (length, width))
+        y = place.imag + AWAY_SPEED * gone
+        return Track(name, shape.kind, length, width, place.real, y, facing.real, facing.imag, speed)
 
 
 def _sampled(column: Any, samples: FloatArray) -> Any:

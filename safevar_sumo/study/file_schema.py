@@ -10,6 +10,11 @@ from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.study.schema import Study
 
 EXTENDS = {"type": "string", "description": "The study that this file extends, by its name or the path of its file."}
+FROM_FILE = {
+    "file": {"type": "string", "description": "A file of OpenSCENARIO, in place of model and parameters."},
+    "ego": {"type": "string", "description": "The vehicle under test in the file, by default Ego."},
+    "values": {"type": "object", "description": "Values of the file's parameters."},
+}
 
 
 def schema_text() -> str:
@@ -24,6 +29,7 @@ def schema_text() -> str:
     tables["Study"]["properties"]["extends"] = EXTENDS
     tables["SearchTable"]["additionalProperties"] = {"type": "object"}
     tables["RepairTable"]["additionalProperties"] = {"$ref": "#/$defs/FreeParameter"}
+    tables["ScenarioTable"]["properties"] |= FROM_FILE
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 

@@ -18,7 +18,8 @@ from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.openscenario.writing import at, event, lane_change, speed, teleport, watching, write
+from tests.openscenario.writing import AT_ONCE, at, event, lane_change, speed, teleport, trigger, watching, write
+from tests.scenarios.holding import Hold, driven
 
 FILES = Path(__file__).parents[1] / "openscenario" / "files"
 LOGICAL = str(FILES / "cut_in_logical.xosc")
@@ -103,6 +104,16 @@ def test_a_run_in_which_the_system_acts_while_others_depend_on_ego_is_invalid(tm
     (runs,) = runs_of(study_of(write(tmp_path, car=(teleport(at(-1, 120)), speed(10)))))
     assert runs.outcome[0] != Outcome.INVALID_TEST
     assert np.isnan(runs.acted_early[0])
+
+
+def test_who_is_deleted_is_not_hit(tmp_path: Path) -> None:
+    """A standing car in the lane, which is deleted 1 s before Ego would be there."""
+    delete = '<EntityAction entityRef="Car"><DeleteEntityAction/></EntityAction>'
+    action = f'<Action name="a"><GlobalAction>{delete}</GlobalAction></Action>'
+    gone = f'<Event name="Gone" priority="parallel">{action}{trigger(AT_ONCE.format(4))}</Event>'
+    car = (teleport(at(-1, 50 + 100 + 3.5 + 1)), speed(0))
+    assert driven(OpenScenario(write(tmp_path, gone, car=car)), Hold()).outcome[0] == Outcome.PASSED
+    assert driven(OpenScenario(write(tmp_path, car=car)), Hold()).outcome[0] == Outcome.COLLISION
 
 
 @pytest.mark.parametrize(
