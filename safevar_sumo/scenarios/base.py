@@ -158,9 +158,6 @@ class World(Protocol):
     def walk(self, person: str, speed: float | FloatArray) -> None:
         """Make a person continue at a walking speed [m/s], one for all copies or one for each."""
 
-    def drive(self, vehicle: str, speed: float | FloatArray) -> None:
-        """Make a vehicle reach a speed [m/s] within the coming step, one for all copies or one for each."""
-
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
         """Make a person turn round and walk back to its first edge at an unchanged speed, by default in all copies."""
 

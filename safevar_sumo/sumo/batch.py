@@ -207,7 +207,8 @@ def drive(
             if system.sees_nobody:  # the run ends at the place of the encounter
                 scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
             collisions = contacts.count(world, motion.hits, scene)
-            contacts.check(world, scene, outcomes.is_open & ~scene.over, sample * step)
+            if isinstance(observer, SceneObserver):  # bodies on a stage touch wherever they overlap
+                contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, sample * step)
             active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_step)
             observation = perception.observe(sample * step, speed, scene)._replace(
                 throttle=state.throttle, brake=state.brake

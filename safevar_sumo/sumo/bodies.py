@@ -106,11 +106,6 @@ class World(Protocol):
     def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
         """The bodies of vehicles that hit somebody in this step, and of those whom they hit, both in columns."""
 
-    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        """Each of these vehicles with each other actor of its scene: numbers of the vehicles, shape (M,), their bodies
-        and those of the actors, both in columns.
-        """
-
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
 
@@ -120,6 +115,11 @@ class SceneWorld(World, ScenariosWorld, Protocol):
 
     def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory."""
+
+    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
+        """Each of these vehicles with each other actor of its scene: numbers of the vehicles, shape (M,), their bodies
+        and those of the actors, both in columns.
+        """
 
 
 TOUCH = 1e-3
@@ -154,7 +154,7 @@ class Contacts:
         side = self.first.side
         return {copy: speed for copy, speed in hits.items() if not self._is_tested[copy] or side[copy] == FRONT}
 
-    def check(self, world: World, scene: Scene, is_open: BoolArray, time: float) -> None:
+    def check(self, world: SceneWorld, scene: Scene, is_open: BoolArray, time: float) -> None:
         """Refuse a scene in which the front of an open run's vehicle drives into a body and no collision is reported.
 
         To be called at every sample, after `count`. A body that comes into the vehicle from the side is none in its

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, FloatArray, IntArray
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.recorded_world import distance_covered
@@ -42,9 +42,6 @@ class LaneWorld:
 
     def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
         return self._stage.bodies(vehicles, self._front, self._speed)
-
-    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        return self._stage.bodies_around(vehicles, self._front, self._speed)
 
     def vehicle_length(self, actor: str) -> float:
         return self._stage.length

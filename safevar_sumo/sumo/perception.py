@@ -69,15 +69,16 @@ class SceneObserver:
     """Observes the obstacle of a scenario in a world, once the vehicles are there."""
 
     def __init__(self, scenario: WorldScenario, world: SceneWorld) -> None:
-        self._scenario, self._world = scenario, world
+        self._scenario = scenario
+        self.world = world
         self._has_begun = False
         self._memory: ScenarioMemory = None
 
     def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
         if not self._has_begun:
-            self._memory = self._world.begin(self._scenario)
+            self._memory = self.world.begin(self._scenario)
             self._has_begun = True
-        scene, self._memory = self._scenario.observe(self._world, self._world.step_length, self._memory)
+        scene, self._memory = self._scenario.observe(self.world, self.world.step_length, self._memory)
         return scene
 
     def encounter(self, trace: Trace) -> Encounter:

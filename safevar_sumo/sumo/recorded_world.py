@@ -128,7 +128,7 @@ class RecordedWorld:
     def walk(self, *_: object) -> None:
         """Do nothing: actors move as recorded."""
 
-    drive = turn_back = walk
+    turn_back = walk
 
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle number.

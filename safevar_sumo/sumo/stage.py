@@ -164,15 +164,6 @@ class Stage:
         columns = (np.stack(column)[struck, np.arange(len(numbers))] for column in zip(*others, strict=True))
         return self._own(front[numbers], speed[numbers]), Body(*columns)
 
-    def bodies_around(
-        self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray
-    ) -> tuple[IntArray, Body, Body]:
-        """Each of these vehicles with each body that it may meet."""
-        owners = np.tile(np.asarray(vehicles), len(self._met))
-        others = [self._body(k, np.asarray(vehicles)) for k in self._met]
-        columns = (np.concatenate(column) for column in zip(*others, strict=True))
-        return owners, self._own(front[owners], speed[owners]), Body(*columns)
-
     def _own(self, front: FloatArray, speed: FloatArray) -> Body:
         return Body.behind(
             np.stack([front, np.zeros_like(front)], axis=1),

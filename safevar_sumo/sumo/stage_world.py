@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import BoolArray, FloatArray, IntArray
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
@@ -109,9 +109,6 @@ class StageWorld(SumoWorld):
 
     def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
         return self._lane.bodies(vehicles)
-
-    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        return self._lane.bodies_around(vehicles)
 
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
         return {}

@@ -246,11 +246,6 @@ class SumoWorld:
         for id_, value in zip(self.ids(person), np.broadcast_to(speed, self.n).tolist(), strict=True):
             self.api.person.setSpeed(id_, value)
 
-    def drive(self, vehicle: str, speed: float | FloatArray) -> None:
-        for id_, value in zip(self.ids(vehicle), np.broadcast_to(speed, self.n).tolist(), strict=True):
-            self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
-            self.api.vehicle.setSpeed(id_, value)
-
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
         api, ids = self.api.person, self.ids(person)
         for id_ in ids if copies is None else (ids[copy] for copy in copies):
