@@ -228,14 +228,15 @@ def at_point(study: Study, name: str, source: object) -> Study:
 
 def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
     """Yield groups of at most `size` points that may share a batch, sorted by duration: those whose scenarios are
-    tracks of equally many bodies around equal vehicles; any other point is alone.
+    tracks around equal vehicles; any other point is alone. Where one batch does not hold all points, those of a batch
+    have equally many bodies: others would carry bodies that they do not have.
     """
     groups: dict[Hashable, list[Point]] = {}
     for point in system.points:
         one = point.scenario
         key: Hashable = point.name
         if isinstance(one, TrackScenario):
-            n_bodies = len(one.tracks(np.zeros((1, 1))))
+            n_bodies = 0 if len(system.points) <= size else len(one.tracks(np.zeros((1, 1))))
             key = one.vut_length, one.vut_width, one.sensor_setback, n_bodies, one.network
         groups.setdefault(key, []).append(point)
     for group in groups.values():

@@ -135,10 +135,13 @@ class Stage:
                 one.gap + OFF_THE_WAY * ~is_in_way + HIDDEN * ~one.visible + PASSED * one.is_passed + NOT_MET * ~counts
             )
             ranks.append(np.where(self._struck == one.body, -np.inf, rank))
-        chosen = np.argmin(np.stack(ranks), axis=0), np.arange(self.n)
-        scenes = [self._scene_of(one, over) for one in seen]
-        columns = zip(*scenes, strict=True)
-        return Scene(*(np.stack([np.broadcast_to(values, self.n) for values in column])[chosen] for column in columns))
+        chosen = np.argmin(np.stack(ranks), axis=0)
+        first, *others = (number for number in range(len(seen)) if (chosen == number).any())
+        scene = self._scene_of(seen[first], over)
+        for number in others:
+            columns = zip(self._scene_of(seen[number], over), scene, strict=True)
+            scene = Scene(*(np.where(chosen == number, its, known) for its, known in columns))
+        return scene
 
     def hits(self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray) -> dict[int, float]:
         """Speeds of the vehicles of open runs that touch a body at a sample, by number."""

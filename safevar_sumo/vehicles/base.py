@@ -153,8 +153,9 @@ def sensed_observation(
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; and the history for
     the next call.
     """
-    columns = (getattr(seen, name) for name in DELAYED)
-    sample = np.stack([np.broadcast_to(column, seen.gap.shape) for column in columns])
+    sample = np.empty((len(DELAYED), *seen.gap.shape))
+    for row, name in enumerate(DELAYED):
+        sample[row] = getattr(seen, name)
     past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
     then = dict(zip(DELAYED, past.delayed(), strict=True))
     is_detected = then["gap"] <= reach * seen.visibility
