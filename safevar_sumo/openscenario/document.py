@@ -18,8 +18,8 @@ from safevar_sumo.openscenario.expressions import Values, compare, literal
 
 Element: TypeAlias = "ElementTree.Element[str]"
 
-FILE_KEY = "scenario.file"
-"""The key that errors name; the study stands before it."""
+FILE_KEY = ""
+"""Who reads a file names it, and the study."""
 
 
 def unsupported(problem: str, legal: str = "") -> InputError:

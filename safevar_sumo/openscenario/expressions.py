@@ -67,7 +67,7 @@ def literal(text: str, values: Values) -> str:
 def compare(rule: str, value: str, limit: str) -> bool:
     """Whether two texts satisfy a rule, as numbers if both are numbers."""
     if rule not in RULES:
-        raise InputError("scenario.file", f"the rule {rule} is not supported", ", ".join(RULES))
+        raise InputError("", f"the rule {rule} is not supported", ", ".join(RULES))
     try:
         return bool(RULES[rule](float(value), float(limit)))
     except ValueError:
@@ -76,7 +76,7 @@ def compare(rule: str, value: str, limit: str) -> bool:
 
 def _value(name: str, values: Values) -> str:
     if name not in values:
-        raise InputError("scenario.file", f"the file declares no parameter {name}", "a declared one")
+        raise InputError("", f"the file declares no parameter {name}", "a declared one")
     return values[name]
 
 
@@ -88,7 +88,7 @@ def evaluate(expression: str, values: Values) -> Any:
         text = NAME.sub(lambda match: f"({_value(match[1], values)})", expression)
         return _evaluated(ast.parse(text.strip(), mode="eval").body)
     except (SyntaxError, ValueError, ArithmeticError, TypeError, KeyError, RecursionError) as error:
-        raise InputError("scenario.file", f"the expression ${{{expression}}} has no value: {error}") from None
+        raise InputError("", f"the expression ${{{expression}}} has no value: {error}") from None
 
 
 def _evaluated(node: ast.expr) -> Any:

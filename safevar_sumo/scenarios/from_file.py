@@ -88,7 +88,11 @@ class OpenScenario(TrackScenario):
         """The scenes of all encounters."""
         found = self.__dict__.get("_found")
         if found is None:
-            found = self.__dict__["_found"] = [*self._played()]
+            try:
+                found = self.__dict__["_found"] = [*self._played()]
+            except InputError as error:
+                name = os.path.basename(self.file)
+                raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
         return found
 
     def _played(self) -> Sequence[_Scene]:
@@ -110,7 +114,7 @@ class OpenScenario(TrackScenario):
         try:
             return (os.stat(self.file).st_mtime_ns,)
         except OSError:
-            raise InputError("scenario.file", f"there is no file {self.file!r}", "the path of a file") from None
+            raise InputError("", f"there is no file {self.file!r}", "the path of a file") from None
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "_found"}

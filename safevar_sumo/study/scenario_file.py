@@ -38,7 +38,10 @@ def files_of(scenario: Parameters, places: Sequence[str], source: object) -> dic
         return {}
     path = path_of(file, places, source)
     given = {name: str(value) for name, value in scenario.items() if name not in ("file", "ego")}
-    document = read(path, given)
+    try:
+        document = read(path, given)
+    except InputError as error:
+        raise InputError(source, f"scenario.file = {file!r}: {error.problem}", error.legal) from None
     return {name: name for name in (path, *document.catalogs, document.road)}
 
 
@@ -60,8 +63,9 @@ def with_file(source: object, tables: Raw, places: Sequence[str]) -> Parameters:
     for key, value, kind in (("file", name, str), ("values", values, dict), ("search", search, dict)):
         if not isinstance(value, kind):
             raise InputError(source, f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
+    path = path_of(name, places, source)
     try:
-        return _expanded(source, tables, open_file(path_of(name, places, source)), places)
+        return _expanded(source, tables, open_file(path), places)
     except InputError as error:
         raise InputError(source, f"scenario.file = {name!r}: {error.problem}", error.legal) from None
 

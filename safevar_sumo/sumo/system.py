@@ -25,6 +25,7 @@ from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import (
     SCENARIOS,
     VUT,
+    OpenScenario,
     Point,
     Scenario,
     TrackScenario,
@@ -418,6 +419,8 @@ def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     if member.code is not None:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
         check_fields(member.code, scenario, **further)
+    if isinstance(scenario, OpenScenario):
+        scenario.remarks()  # refuses what the file has and nobody can play
     return _locate_network(scenario, lookup.folders)
 
 
