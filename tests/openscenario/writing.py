@@ -11,7 +11,7 @@ ROAD = """<OpenDRIVE><header revMajor="1" revMinor="6"/>
 <right><lane id="-1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane>
 <lane id="-2" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></right></laneSection></lanes></road></OpenDRIVE>"""
 STRAIGHT = '<geometry s="0" x="10" y="20" hdg="0" length="2000"><line/></geometry>'
-BOX = '<BoundingBox><Center x="1.5" y="0" z="0.7"/><Dimensions width="2" length="{length}" height="1.5"/></BoundingBox>'
+BOX = '<BoundingBox><Center x="{ahead}" y="0" z="0.7"/><Dimensions width="{width}" length="{length}" height="1.5"/></BoundingBox>'
 FILE = """<?xml version="1.0"?>{prolog}
 <OpenSCENARIO><FileHeader revMajor="{version}" revMinor="2"/><ParameterDeclarations>{parameters}</ParameterDeclarations>
 <CatalogLocations>{catalogs}</CatalogLocations><RoadNetwork><LogicFile filepath="{road}"/></RoadNetwork>
@@ -20,8 +20,14 @@ FILE = """<?xml version="1.0"?>{prolog}
 AT_ONCE = "<SimulationTimeCondition rule='greaterOrEqual' value='{}'/>"
 
 
-def body(name: str, length: float = 4.0) -> str:
-    return f'<ScenarioObject name="{name}"><Vehicle name="" vehicleCategory="car">{BOX.format(length=length)}</Vehicle></ScenarioObject>'
+def body(name: str, length: float = 4.0, width: float = 2.0) -> str:
+    box = BOX.format(length=length, width=width, ahead=1.5)
+    return f'<ScenarioObject name="{name}"><Vehicle name="" vehicleCategory="car">{box}</Vehicle></ScenarioObject>'
+
+
+def person(name: str, length: float, width: float) -> str:
+    box = BOX.format(length=length, width=width, ahead=0)
+    return f'<ScenarioObject name="{name}"><Pedestrian name="">{box}</Pedestrian></ScenarioObject>'
 
 
 def at(lane: int, s: float, offset: float = 0.0) -> str:
