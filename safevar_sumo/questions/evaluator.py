@@ -183,7 +183,7 @@ class Evaluator:
         pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(-1, settings.shape[1])
         evaluations = self.evaluate(pairs, stage)
         degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
-        worst = np.argmin(degrees.reshape(len(settings), -1), axis=1)
+        worst = np.argmin(degrees.reshape(-1, len(encounters)), axis=1)
         return evaluations.take(worst + np.arange(len(settings)) * len(encounters))
 
     @cached_property
