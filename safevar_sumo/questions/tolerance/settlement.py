@@ -13,8 +13,8 @@ from safevar_sumo.records import FloatArray
 
 LEAST_MOVE = 1 / 50
 """A limit that cannot move out by this share of its range, or by one printed digit, is at its end."""
-STRIDES = (8, 4, 2, 1)
-"""Numbers of such moves that are tried at once, the largest first."""
+STRIDES = (1, 2, 4, 8)
+"""Numbers of such moves that are tried at once, until one is too far."""
 CLEARANCE = 0.8
 """Share of such a move by which a limit keeps off a failure that an attack found between corners."""
 SLAB_ATTACK = 512
@@ -46,13 +46,13 @@ class Settlement:
 
     def _moved(self, box: Box, step: Step) -> Box | None:
         """The box with one limit moved out as far as nothing unsafe is met; None if it cannot move."""
+        moved = None
         for stride in STRIDES:
             wider = self.trial(box, step, stride)
-            if wider is None:
-                return None
-            if not self._is_blocked(box, wider, step):
-                return wider
-        return None
+            if wider is None or self._is_blocked(box, wider, step):
+                break
+            moved = wider
+        return moved
 
     def trial(self, box: Box, step: Step, stride: int = 1) -> Box | None:
         """The box with one limit moved out by some moves, rounded; None at the end of the domain."""

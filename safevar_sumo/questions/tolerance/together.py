@@ -95,14 +95,14 @@ class _Test(NamedTuple):
 
 
 class _BoxTest:
-    """The test of boxes: all corners with each fit, an attack over all fits, and settings drawn at random. Progress is
-    shown by the evaluator of the question.
+    """The test of boxes: all corners with each fit, those first in which earlier boxes failed, an attack over all fits,
+    and settings drawn at random. Progress is shown by the evaluator of the question.
     """
 
     def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
         self.models, self.budget, self.evaluator = models, budget, evaluator
         self.seed = models[0].evaluator.study.search.seed
-        self.tests = 0
+        self.tests, self._first = 0, {0}
 
     def of(self, box: Box, attempt: int) -> _Test:
         """Test a box; the first part that finds failures ends it."""
@@ -112,25 +112,37 @@ class _BoxTest:
             return self._of(box, corners, attempt)
 
     def _of(self, box: Box, corners: FloatArray, attempt: int) -> _Test:
-        lefts = [model.left(corners[:MAX_CORNERS], TEST_STAGE) for model in self.models]
-        least = {
-            model.fit: model.unsafe.value(float(left.min(initial=np.inf)))
-            for model, left in zip(self.models, lefts, strict=True)
-        }
-        found = [_failures(model, corners[:MAX_CORNERS], left) for model, left in zip(self.models, lefts, strict=True)]
-        if any(found):
-            return _Test([each for each in found if each], least)
+        of_each, lefts = corners[:MAX_CORNERS], dict[int, FloatArray]()
+        failures = self._failing_corners(of_each, self._first, lefts)
+        if failures:
+            return _Test(failures, {})
+        orders = {number: np.argsort(left, kind="stable") for number, left in lefts.items()}
         worst = [
-            corners[np.argsort(left, kind="stable")[: KNOWN if number == 0 else KNOWN // 8]]
-            for number, left in enumerate(lefts)
+            of_each[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
+            for number in range(len(self.models))
         ]
-        test = self._attack(box, worst, attempt)._replace(corners=least)
+        test = self._attack(box, worst, attempt)
+        failures = test.failures or self._failing_corners(of_each, {*range(len(self.models))} - self._first, lefts)
         own = self.models[0]
-        if not test.failures and len(corners) > MAX_CORNERS:  # corners of a study that searches its scenario
+        if not failures and len(corners) > MAX_CORNERS:  # corners of a study that searches its scenario
             others = corners[MAX_CORNERS:]
-            failures = _failures(own, others, own.left(others, TEST_STAGE))
-            test = test._replace(failures=[failures] if failures else [])
-        return test if test.failures else self._prove(box, test, attempt)
+            failures = list(filter(None, [_failures(own, others, own.left(others, TEST_STAGE))]))
+        if failures:
+            return test._replace(failures=failures)
+        least = {
+            model.fit: model.unsafe.value(float(lefts[row].min(initial=np.inf)))
+            for row, model in enumerate(self.models)
+        }
+        return self._prove(box, test._replace(corners=least), attempt)
+
+    def _failing_corners(self, corners: FloatArray, numbers: set[int], lefts: dict[int, FloatArray]) -> list[_Failures]:
+        """The unsafe corners in some models, which are the first in later tests; `lefts` takes what all leave."""
+        for number in sorted(numbers):
+            lefts[number] = self.models[number].left(corners, TEST_STAGE)
+        failing = [number for number in sorted(numbers) if lefts[number].min(initial=np.inf) < 0]
+        self._first |= {*failing}
+        found = [_failures(self.models[number], corners, lefts[number]) for number in failing]
+        return [each for each in found if each]
 
     def _attack(self, box: Box, worst: Sequence[FloatArray], attempt: int) -> _Test:
         own, judges, left_out = self.models[0], list[Model](), list[int]()
