@@ -60,7 +60,7 @@ class OpenScenario(TrackScenario):
     """
 
     def __init__(self, file: str, ego: str = "Ego", **values: Any) -> None:
-        self.file, self.ego, self.values = os.path.abspath(file), ego, values
+        self.name, self.file, self.ego, self.values = file, os.path.abspath(file), ego, values
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, OpenScenario) and self._key == other._key

@@ -420,6 +420,7 @@ def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
         check_fields(member.code, scenario, **further)
     if isinstance(scenario, OpenScenario):
+        scenario.file = file_beside(scenario.name, lookup.folders) or scenario.file
         scenario.remarks()  # refuses what the file has and nobody can play
     return _locate_network(scenario, lookup.folders)
 

@@ -44,6 +44,16 @@ def test_a_concrete_file_is_one_scenario_and_drops_what_is_inherited() -> None:
     assert point.scenario.test_speed == pytest.approx(60 / 3.6)
 
 
+def test_a_path_counts_from_the_study(tmp_path: Path) -> None:
+    write(tmp_path)
+    path = tmp_path / "near.toml"
+    path.write_text('extends = "wear"\n[scenario]\nfile = "scenario.xosc"\n')
+    study = load_study(path)
+    assert study.scenario.parameters["file"] == "scenario.xosc"
+    assert {Path(file) for file in data_files(study).values()} == {tmp_path / "scenario.xosc", tmp_path / "road.xodr"}
+    assert assemble(study).points[0].scenario.duration == pytest.approx(14)
+
+
 def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None:
     study = study_of(LOGICAL, values={"ego_kmh": 80}, search={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}})
     gap, slower = study.scenario.search["gap_m"], study.scenario.search["slower_kmh"]
