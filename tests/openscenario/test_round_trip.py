@@ -31,11 +31,11 @@ def runs_of(study: Study) -> tuple[SimulationRuns, Any, np.ndarray]:
 @pytest.mark.parametrize(
     "scenario",
     [
-        {"file": str(FILES / "crossing_pedestrian.xosc")},
+        pytest.param({"file": str(FILES / "crossing_pedestrian.xosc")}, marks=pytest.mark.slow),
         {"file": str(FILES / "cut_in.xosc"), "values": {"gap_m": 6, "slower_kmh": 30}},
-        {"file": str(FILES / "braking_leader.xosc")},
-        {"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 50}},
-        {"model": "crossing", "parameters": {"test": "CPNA", "speed": 40}},
+        pytest.param({"file": str(FILES / "braking_leader.xosc")}, marks=pytest.mark.slow),
+        pytest.param({"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 50}}, marks=pytest.mark.slow),
+        pytest.param({"model": "crossing", "parameters": {"test": "CPNA", "speed": 40}}, marks=pytest.mark.slow),
     ],
 )
 def test_an_exported_run_is_the_same_from_its_file(tmp_path: Path, scenario: dict[str, Any]) -> None:

@@ -94,6 +94,7 @@ def test_encounters_of_a_search_are_those_of_single_files() -> None:
         assert np.array_equal(alone.y[:, 0], together.y[:, k])
 
 
+@pytest.mark.slow
 def test_sumo_repeats_a_run() -> None:
     system = assemble(study_of(str(FILES / "crossing_pedestrian.xosc")))
     settings = system.characteristics.original[np.newaxis]
