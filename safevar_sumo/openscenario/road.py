@@ -11,7 +11,6 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fresnel
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario.document import Element, attribute, number, part, root_of, unsupported
@@ -85,6 +84,8 @@ class Piece(NamedTuple):
 
 
 def _fresnel(value: Number, sign: float) -> Number:
+    from scipy.special import fresnel  # takes longer to load than a simulation
+
     sine, cosine = fresnel(value)
     return cosine + 1j * sign * sine
 

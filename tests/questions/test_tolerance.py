@@ -15,6 +15,7 @@ import scipy
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo import tolerance
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import models, scope
 from safevar_sumo.questions.answer import Answer
@@ -404,7 +405,9 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
     assert ends(margin=0) == ("collision", 0, 9.0)
     assert ends(unsafe="collision") == ("collision", 0, 9.0), "as it stands"
     assert ends(unsafe="collision", margin=5) == ("collision", 5, 8.0)
-    assert ends(unsafe="below=4.5", margin=5) == ("below=4.5", 0, 8.5)
+    assert ends(unsafe="below=4.5") == ("below=4.5", 0, 8.5)
+    with pytest.raises(InputError, match=r"5 m beside 'below=4\.5'"):
+        ends(unsafe="below=4.5", margin=5)
 
 
 def test_gaps_are_between_bumpers() -> None:

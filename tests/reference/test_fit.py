@@ -167,8 +167,7 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 
 @pytest.mark.slow
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("SCAN_VALUES", "COARSE_SCAN_VALUES"):
-        monkeypatch.setattr(scans, name, 21)
+    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
     gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
     study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
 

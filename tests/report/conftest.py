@@ -37,5 +37,5 @@ def page(slippery: Path, case: Case) -> str:
         page = page_of(slippery, ask=ASK, paper=True, jobs=1, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
         assert shows[-1][0] == "replays"
-        assert all(done <= total for _, done, total in shows)
+        assert all(done <= total or not total for _, done, total in shows)
         return page

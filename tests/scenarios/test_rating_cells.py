@@ -12,6 +12,7 @@ import pytest
 
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
+from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import batch
 from safevar_sumo.sumo.bodies import Contacts
@@ -128,6 +129,13 @@ def edge_cells() -> Iterator[Cell]:
     yield from along("CBLA", 80, 10, 20)
 
 
+def middle_beside(scenario: Any) -> float:
+    """How far the middle of a rotated body ahead is beside the middle of its rear, which is hit [m]."""
+    if not isinstance(scenario, CarToCar):
+        return 0.0
+    return -math.sin(math.radians(scenario.heading)) * BODIES["car"].length / 2
+
+
 def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
@@ -138,10 +146,10 @@ def check(cells: list[Cell]) -> None:
         late = at_contact(run, run.trace.time) - cell.arrival
         assert abs(late) * scenario.speed * KMH < 0.05, (late, scenario)
         lateral = at_contact(run, run.trace.lateral[:, 0])
-        assert abs(lateral - (scenario.impact_location / 100 - 0.5) * scenario.vut_width) < 0.02 * scenario.vut_width, (
-            scenario
-        )
-        assert run.contact.place == pytest.approx(min(max(scenario.impact_location, 0), 100), abs=2), scenario
+        expected = (scenario.impact_location / 100 - 0.5) * scenario.vut_width + middle_beside(scenario)
+        assert abs(lateral - expected) < 0.02 * scenario.vut_width, scenario
+        middle = 100 * (expected / scenario.vut_width + 0.5)
+        assert run.contact.place == pytest.approx(min(max(middle, 0), 100), abs=2), scenario
         assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), scenario
 
 
