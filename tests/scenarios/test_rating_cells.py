@@ -133,7 +133,8 @@ def middle_beside(scenario: Any) -> float:
     """How far the middle of a rotated body ahead is beside the middle of its rear, which is hit [m]."""
     if not isinstance(scenario, CarToCar):
         return 0.0
-    return -math.sin(math.radians(scenario.heading)) * BODIES["car"].length / 2
+    body = BODIES["motorcyclist" if scenario.test.startswith("CM") else "car"]
+    return -math.sin(math.radians(scenario.heading)) * body.length / 2
 
 
 def check(cells: list[Cell]) -> None:
