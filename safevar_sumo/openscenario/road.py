@@ -250,7 +250,7 @@ def _network(file: str, modified: int) -> Network:
 
 
 def _road(element: Element) -> Road:
-    """A road (OpenDRIVE 1.7, sections 9 and 11)."""
+    """A road of OpenDRIVE."""
     name = attribute(element, "id")
     links = {
         link.tag: (attribute(link, "elementType"), attribute(link, "elementId"), link.get("contactPoint", ""))
@@ -283,7 +283,7 @@ def _cubics(element: Element, tag: str, start: str) -> Cubics:
 
 
 def _piece(geometry: Element, road: str) -> Piece:
-    """A geometry (OpenDRIVE 1.7, section 8.3: line, arc, spiral)."""
+    """A geometry of OpenDRIVE: line, arc, spiral."""
     start = Pose.at(number(geometry, "x"), number(geometry, "y"), number(geometry, "hdg"))
     length = number(geometry, "length")
     for shape in geometry:

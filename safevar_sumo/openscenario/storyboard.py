@@ -473,3 +473,5 @@ def _remark(player: Player) -> None:
         for event in one.events:
             if event.moves and not event.has_begun:
                 player.remark(f"the event {event.key[1]} never fires")
+            if (times := number(event.element, "maximumExecutionCount", 1)) > 1:
+                player.remark(f"the event {event.key[1]} is played once, of up to {times:g} times")

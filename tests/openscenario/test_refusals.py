@@ -80,6 +80,8 @@ def test_what_happens_less_than_the_file_says_is_remarked(tmp_path: Path) -> Non
     played = play(write(tmp_path, late, init=actions), {})
     assert "without effect here: EnvironmentAction" in played.remarks
     assert "the event Event never fires" in played.remarks
+    often = late.replace("<Event ", '<Event maximumExecutionCount="3" ')
+    assert "the event Event is played once, of up to 3 times" in play(write(tmp_path, often), {}).remarks
     assert any("the scene ends at 3.3 s, when Car is at the end of its road" in remark for remark in played.remarks)
     assert played.duration == pytest.approx(3.33)
 
