@@ -336,14 +336,14 @@ class BoxSearch(BoxGeometry):
         return settings
 
     def best(self, start: FloatArray) -> FloatArray | None:
-        """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be unless
-        the study searches its scenario; None if every search finds something.
+        """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be; None if
+        every search finds something.
         """
         sides = start
         for _ in range(MAX_ATTEMPTS):
             sides = self.largest(sides, start)
             found = self.failures_in(sides)
-            if not len(found) and not len(self.characteristics.scenario):  # with encounters this costs most of the time
+            if not len(found):
                 sides = self.widened(sides)
                 found = self.failures_in(sides)
             if not len(found):
