@@ -207,8 +207,9 @@ class Question:
 
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
-            if any(option.metavar == CRITERION and values.get(option.name) is not None for option in self.options):
-                unsafe = Unsafe.parse(values["unsafe"])
+            criterion = next((values.get(option.name) for option in self.options if option.metavar == CRITERION), None)
+            if criterion is not None:
+                unsafe = Unsafe.parse(criterion)
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)

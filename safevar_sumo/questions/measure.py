@@ -14,10 +14,11 @@ from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 
-STAGE = "solutions by the measure"
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
     from safevar_sumo.questions.evaluator import Evaluator
+
+STAGE = "solutions by the measure"
 
 
 def study_by(study: Study, unsafe: Unsafe) -> Study:

@@ -47,14 +47,14 @@ DRIVERS: dict[str, tuple[str, JsonObject]] = {
 """Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
 OF_LANES: dict[str, tuple[str, JsonObject]] = {name: (name, {}) for name in ("rss", "fuzzy_safety", "r157")}
 """Further drivers where somebody drives ahead in the lane, or comes into it."""
-LANE_TITLES = {"rss": "responsibility-sensitive safety", "fuzzy_safety": "fuzzy safety model", "r157": "UN R157, 5.2.5"}
 TITLES = {LETTER: "competent driver", ANY_LEADER: "competent driver, any braking of a leader", FULL: "full braking"}
 NOBODY, NO_VERDICT = "nobody", "no verdict"
 """In the place of a driver who avoids a collision."""
 COLUMNS: Columns = {
     "driver": (
         "reference driver in the same vehicle: a competent driver; one who reacts to any braking of a leader, not only "
-        "above 5 m/s^2; full braking at the first possible moment"
+        "above 5 m/s^2; full braking at the first possible moment; where a car ahead brakes, or takes or leaves "
+        "the lane, rss (responsibility-sensitive safety), fuzzy_safety and r157 (UN R157, 5.2.5)"
     ),
     "avoided": "collisions that he avoids",
     "later": f"collisions that he avoids if he needs {DELAY:g} s longer",

@@ -19,6 +19,8 @@ WIDEST = 1e9
 """Largest size of a parameter of a file, which says itself what it allows."""
 AWAY_SPEED = 90.0
 """Speed at which a deleted entity, a point without size, leaves the scene to the left [m/s]."""
+KEPT_SCENES = 1000
+"""Number of played scenes that a process keeps: one of 20 s with three bodies takes about 250 kB."""
 DIGITS = 9
 """Decimals of the places in tracks [m]: the last bits of a sine differ between machines."""
 
@@ -30,7 +32,7 @@ class _Scene(NamedTuple):
     bodies: dict[str, Moved]
 
 
-@lru_cache(maxsize=20_000)
+@lru_cache(maxsize=KEPT_SCENES)
 def _scene(file: str, stamp: tuple[int, ...], ego: str, values: tuple[tuple[str, str], ...]) -> _Scene:
     played = play(file, dict(values), ego)
     start = played.start

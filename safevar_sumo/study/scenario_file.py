@@ -12,13 +12,14 @@ import numpy as np
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.openscenario import constraints_of, open_file, read
 from safevar_sumo.openscenario.logical import Source, originals
-from safevar_sumo.study.schema import Parameters
+from safevar_sumo.study.parameters import free_parameters
+from safevar_sumo.study.schema import Parameters, Weather
 
 MODEL = "openscenario"
 """The scenario that plays a file."""
 MOST_POINTS = 2000
 """Largest number of combinations of a file's values in a matrix."""
-WEATHER = ("road_friction", "visibility", "recognition_delay")
+WEATHER = tuple(free_parameters(Weather))
 """Parameters of the weather, which a study may search as well."""
 Raw = Mapping[str, Any]
 

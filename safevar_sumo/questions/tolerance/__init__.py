@@ -73,7 +73,7 @@ INTERVALS: Columns = {
 FITS: Columns = {
     "fit": Column("-", "number of the fit among the sets of [spread]; 0 is the study's own", "d"),
     "specified": "whether the specified limits hold with it; left out: the original is unsafe or keeps too little",
-    "corners": Column("m", "the least that the corners of the limits together keep; in -m/s on a collision", ".2f"),
+    "corners": Column("", "what the worst corner of the limits together keeps [m], or has of a metric", ".2f"),
 }
 POINTS: Columns = {
     **CHARACTERISTIC,
@@ -141,7 +141,7 @@ def tolerance(
     """
     study = evaluator.study
     members = evaluator.characteristics
-    evaluator.plan(SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, TEST_STAGE, *([WIDER_STAGE] if study.wider else []))
+    evaluator.plan(SCAN_STAGE, SEARCH_STAGE, TEST_STAGE, ALONE_STAGE, *([WIDER_STAGE] if study.wider else []))
     columns = _columns_of(members.vehicle.names, characteristics)
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -153,9 +153,6 @@ def tolerance(
         scans = scan(evaluator, columns, criterion)
     is_safe = not criterion.of(original)[0]
     models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
-    judges = _denser(models, attack) if is_sought else models.members
-    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
-        alone = limits_alone(scans, columns, judges, attack)
     together = None
     if is_sought and is_safe:
         all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
@@ -163,6 +160,11 @@ def tolerance(
         known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, scans)]
         all_limits = {**specified, **everywhere}
         together = find_limits_together(models, all_columns, all_limits, scans, np.concatenate(known), attack)
+    judges = _denser(models, attack) if is_sought else models.members
+    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
+        met = () if together is None else together.searched
+        failures = np.zeros((0, len(members))) if together is None else together.failures_alone
+        alone = limits_alone(scans, columns, judges, attack, met, failures)
     found = limit_rows(alone, together, specified, models.members)
     tables = {
         "limits": tabulate("Limits, rounded to the safe side", LIMITS, found.rows),

@@ -87,9 +87,16 @@ class _Ends:
 
 
 def limits_alone(
-    scans: Sequence[OneAtATimeScan], columns: Sequence[int], models: Sequence[Model], budget: int
+    scans: Sequence[OneAtATimeScan],
+    columns: Sequence[int],
+    models: Sequence[Model],
+    budget: int,
+    met: Sequence[Model],
+    failures: FloatArray,
 ) -> list[AloneLimit]:
-    """The limits alone that hold in all models, from scans with the study's own fit, the first model."""
+    """The limits alone that hold in all models, from scans with the study's own fit, the first model; and before the
+    failures of one characteristic that the search for limits together met in some models, shape (K, n).
+    """
     if any(scan.safe is None for scan in scans):
         return [AloneLimit(scan, None) for scan in scans]
     ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True)]
@@ -100,6 +107,11 @@ def limits_alone(
         lefts = np.split(model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1])
         for each, rows, left in zip(ends, settings, lefts, strict=True):
             _move(each, model, rows[left < 0])
+    for each in ends:
+        values = failures[:, each.column]
+        inside = failures[(values != each.item.original) & (values >= each.ends[0]) & (values <= each.ends[1])]
+        for model in met if len(inside) else ():
+            _move(each, model, inside[model.are_unsafe(inside, ALONE_STAGE)])
     if len(models[0].evaluator.characteristics.scenario) and budget:
         for each in ends:
             _attack_alone(each, models, round(ATTACK_SHARE * budget))

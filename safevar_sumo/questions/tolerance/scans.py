@@ -62,11 +62,6 @@ class OneAtATimeScan(NamedTuple):
         original = self.characteristic.original
         return next((ends for ends in self.of_state("safe") if ends[0] <= original <= ends[1]), None)
 
-    def nearest_unsafe(self, value: float) -> float | None:
-        """The unsafe value that is nearest to `value`, the lower one of two; None if nothing is unsafe."""
-        values = [float(np.clip(value, low, high)) for low, high in self.of_state("unsafe")]
-        return min(values, key=lambda unsafe: (abs(unsafe - value), unsafe), default=None)
-
     def degree(self, value: float) -> float:
         """The safety degree at a value of the profile [m, or -m/s]."""
         return float(self.profile.set_index("value")[SAFETY_DEGREE][value])

@@ -158,6 +158,12 @@ class BoxSearch(BoxGeometry):
                 return
         self.models.append(model)
 
+    @property
+    def failures_alone(self) -> FloatArray:
+        """The known unsafe settings in which one characteristic of the vehicle is changed, shape (K, n)."""
+        is_changed = (self.unsafe_settings != self.original) & self.characteristics.of_vehicle
+        return np.asarray(self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1])
+
     def needs(self, settings: FloatArray) -> FloatArray:
         """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2, n)."""
         extents = self.extents(settings)

@@ -58,6 +58,8 @@ class LimitsTogether(NamedTuple):
         Which characteristics could have room, shape (n,): those that vary and have no limit on both sides.
     searched
         The models that the search of the box had to survive, then all others in which it was tested.
+    failures_alone
+        Unsafe settings that were met, in which one characteristic is changed, shape (K, n).
     """
 
     promise: Box
@@ -73,7 +75,8 @@ class LimitsTogether(NamedTuple):
     beyond: Mapping[tuple[int, int], FloatArray]
     corners: Mapping[int, float]
     room: BoolArray
-    searched: tuple[Model, ...] = ()
+    searched: tuple[Model, ...]
+    failures_alone: FloatArray
 
 
 class _Failures(NamedTuple):
@@ -238,6 +241,8 @@ def find_limits_together(
         {},
         {},
         np.asarray(search.is_free.any(axis=0)),
+        members,
+        search.failures_alone,
     )
     if own.fit in broken:
         return nothing
@@ -247,14 +252,20 @@ def find_limits_together(
         with test.evaluator.stage(SEARCH_STAGE):
             sides = search.best(start)
         if sides is None:
-            return nothing._replace(boxes=number)
+            return _without_box(nothing, search, number)
         box = search.printed(sides)
         found = test.of(box, number)
         if not found.failures:
             return _grown(nothing, search, test, box, found, number)
         with test.evaluator.stage(SEARCH_STAGE):
             _learn(search, found)
-    return nothing._replace(boxes=MAX_BOXES)
+    return _without_box(nothing, search, MAX_BOXES)
+
+
+def _without_box(nothing: LimitsTogether, search: BoxSearch, boxes: int) -> LimitsTogether:
+    """No limits together, and what the search met."""
+    searched = (*nothing.members, *search.models)
+    return nothing._replace(boxes=boxes, searched=searched, failures_alone=search.failures_alone)
 
 
 def _learn(search: BoxSearch, test: _Test) -> None:
@@ -332,4 +343,5 @@ def _result(
         beyond=settlement.beyond(box),
         corners=test.corners,
         searched=(*nothing.members, *search.models, *test.judges),
+        failures_alone=search.failures_alone,
     )
