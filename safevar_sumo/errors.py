@@ -59,7 +59,9 @@ class InputError(SafevarError):
     exit_code = 2
 
     def __init__(self, source: object, problem: str, legal: str = "") -> None:
-        self.source, self.problem, self.legal = source or subject(), problem, legal
+        self.source = source or subject()
+        self.problem = problem
+        self.legal = legal
         super().__init__(self.source, problem, legal)
 
     def __str__(self) -> str:
@@ -87,9 +89,11 @@ class EnvironmentFault(SafevarError):
 
 def warn(message: str) -> None:
     """Warn, and name the line of user code that called this package."""
-    frame, level = inspect.currentframe(), 1
+    frame = inspect.currentframe()
+    level = 1
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]:
-        frame, level = frame.f_back, level + 1
+        frame = frame.f_back
+        level = level + 1
     warnings.warn(message, stacklevel=level)
 
 

@@ -47,7 +47,8 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self._title_line:
             yield self._title_line  # rich breaks a title where its table ends
-        sizes, count = [], len(self.columns)
+        sizes = []
+        count = len(self.columns)
         for column in self.columns:
             cells = (column.header, *column.cells)
             measures = [Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell) for cell in cells]
@@ -99,12 +100,16 @@ class _Pace(ProgressColumn):
 
     def __init__(self) -> None:
         super().__init__()
-        self._done, self._total, self._last = 0, 0, 0.0
+        self._done = 0
+        self._total = 0
+        self._last = 0.0
         self._begun: tuple[int, float] | None = None
         """What was done when the stage began, such as by an earlier command, and the time [s]."""
 
     def update(self, done: int, total: int) -> None:
-        self._done, self._total, self._last = done, total, time.monotonic()
+        self._done = done
+        self._total = total
+        self._last = time.monotonic()
         if done == 0 or self._begun is None:
             self._begun = done, self._last
 
@@ -112,7 +117,8 @@ class _Pace(ProgressColumn):
         if not self._total:
             return Text("")
         done_before, start = self._begun or (0, 0.0)
-        done, worked = self._done - done_before, self._last - start
+        done = self._done - done_before
+        worked = self._last - start
         if done <= 0 or worked < SETTLING_TIME:
             return Text("-:--:-- left")
         seconds = (self._total - self._done) * worked / done - (time.monotonic() - self._last)
@@ -126,7 +132,9 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         yield progress or show_no_progress
         return
     console = console or Console(stderr=True)
-    pace, ended, line = _Pace(), Event(), "searching"
+    pace = _Pace()
+    ended = Event()
+    line = "searching"
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal line

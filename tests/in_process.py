@@ -94,7 +94,9 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
     """Run a command as a user types it; its exit code must be `expect`. Afterwards, unload modules that it took from
     the test's folder.
     """
-    out, err, code = io.StringIO(), io.StringIO(), None
+    out = io.StringIO()
+    err = io.StringIO()
+    code = None
     # a command that fails ignores Ctrl-C, and so would later processes
     handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
     loaded_modules = set(sys.modules)

@@ -22,7 +22,8 @@ def made_up_runs(
     step: float, speed: FloatArray, gap: FloatArray | float = 0.0, collision_speed: Any = np.nan, **columns: FloatArray
 ) -> SimulationRuns:
     """Vehicles of these speeds, shape (T, N), that end by standing or colliding; other columns of the trace are 0."""
-    zero, gaps = np.zeros_like(speed), np.broadcast_to(gap, speed.shape)
+    zero = np.zeros_like(speed)
+    gaps = np.broadcast_to(gap, speed.shape)
     names = ("position", "lateral", "lateral_speed", "throttle", "brake", "gear")
     active = {"active": np.ones_like(speed, dtype=bool)}
     trace = Trace(
@@ -52,7 +53,9 @@ def seen(
 ) -> Observation:
     """What vehicles observe of an obstacle with the speed `leader` ahead of them."""
     zero = np.zeros(np.size(gap))
-    across, across_speed, ahead = zero + lateral, zero + lateral_speed, zero + leader
+    across = zero + lateral
+    across_speed = zero + lateral_speed
+    ahead = zero + leader
     return Observation(
         time, zero + speed, zero + gap, speed - ahead, across, across_speed, visibility, ahead, zero + throttle
     )

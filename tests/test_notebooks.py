@@ -154,7 +154,8 @@ def main() -> None:
                 output["data"] for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output
             ]:
                 if "image/png" in data:
-                    drawn, picture = Image.open(io.BytesIO(base64.b64decode(data["image/png"]))), io.BytesIO()
+                    drawn = Image.open(io.BytesIO(base64.b64decode(data["image/png"])))
+                    picture = io.BytesIO()
                     drawn.convert("RGB").quantize(128).save(picture, "png", optimize=True)
                     data["image/png"] = base64.b64encode(picture.getvalue()).decode()
             nbformat.write(notebook, NOTEBOOKS / f"{name}.ipynb")

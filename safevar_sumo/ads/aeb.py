@@ -107,7 +107,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     warning_time: NonNegativeParameter = 2.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        zeros, nobody = np.zeros(n), np.zeros(n, dtype=bool)
+        zeros = np.zeros(n)
+        nobody = np.zeros(n, dtype=bool)
         return _Memory(
             nominal, step, None, zeros, intervened=nobody, obstacle=zeros, obstacle_speed=zeros, warns=nobody
         )
@@ -138,7 +139,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
         """The braking stage; it does not fall while the obstacle blocks the way, nor at standstill."""
-        speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
+        speed = seen.speed
+        obstacle_speed = _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
         lost_speed = np.where(seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0)
         obstacle_deceleration = lost_speed / memory.step

@@ -91,7 +91,8 @@ class ScalarAds(ABC):
 
     def start(self, nominal: Nominal, step: float) -> None:
         """Called once before the run, with the original vehicle and the time between two calls of `drive` [s]."""
-        self.nominal, self.step = nominal, step
+        self.nominal = nominal
+        self.step = step
 
     @abstractmethod
     def drive(self, seen: Observation) -> tuple[float, float]:
@@ -102,7 +103,8 @@ class PerVehicleAds(Ads):
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
     def __init__(self, create: Callable[[], ScalarAds], code: UserCode) -> None:
-        self._create, self._code = create, code
+        self._create = create
+        self._code = code
 
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
         drivers = [self._create() for _ in range(n)]
@@ -112,7 +114,8 @@ class PerVehicleAds(Ads):
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        observations, pedals = list(_scalar_observations(seen)), [(0.0, 0.0)] * len(memory)
+        observations = list(_scalar_observations(seen))
+        pedals = [(0.0, 0.0)] * len(memory)
         with np.errstate():
             for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():  # vehicles whose run has not ended
                 pedals[i] = self._checked_pedals(memory[i].drive(observations[i]))
@@ -146,7 +149,8 @@ def interpolate_tables(table_speeds: FloatArray, speed: FloatArray, *tables: Flo
     spacing = table_speeds[1]
     position = np.minimum(speed / spacing, len(table_speeds) - 1.001)  # just before the last row: there is a next one
     row = position.astype(np.intp)
-    share, next_row = position - row, row + 1
+    share = position - row
+    next_row = row + 1
     values = ((table[row], table[next_row]) for table in tables)
     return [low + (high - low) * share for low, high in values]
 
@@ -183,7 +187,8 @@ class DelayLine(NamedTuple):
         in one of them, is that of the earlier step.
         """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
-        older, newer = past[0], past[1]
+        older = past[0]
+        newer = past[1]
         if np.ndim(self.fraction) or self.fraction:
             with np.errstate(invalid="ignore"):  # the difference of two infinities
                 mixture = newer + (older - newer) * self.fraction

@@ -76,7 +76,8 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         """The control law of the mode that applies; near standstill it keeps 2 m more than the headway (Xiao et al.
         2017).
         """
-        excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
+        excess_speed = speed - self.cruise_speed
+        relative_speed = leader_speed - speed
         standing_distance = np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
         gap_error = gap - self.standing_gap - standing_distance - self.headway * speed
         closing, keeping, avoiding = (

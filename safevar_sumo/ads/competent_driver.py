@@ -91,7 +91,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
-        reaction, never = ReferenceDriver.start(self, n, nominal, step), np.full(n, -1.0)
+        reaction = ReferenceDriver.start(self, n, nominal, step)
+        never = np.full(n, -1.0)
         nowhere = np.full(n, np.inf)
         return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere)
 

@@ -44,11 +44,9 @@ class Fmu:
     """
 
     def __init__(self, path: str, table: ModelTable, code: UserCode) -> None:
-        source, self.code, self._folder = (
-            code.source,
-            code,
-            TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True),
-        )
+        source = code.source
+        self.code = code
+        self._folder = TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True)
         expected = "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
         try:
             from fmpy import extract, read_model_description  # an extra
@@ -91,7 +89,8 @@ class Fmu:
         """A new instance at the beginning of its time."""
         from fmpy.simulation import instantiate_fmu
 
-        kind, experiment = self._model.coSimulation, self._model.defaultExperiment
+        kind = self._model.coSimulation
+        experiment = self._model.defaultExperiment
         own = getattr(kind, "fixedInternalStepSize", None)
         if not kind.canHandleVariableCommunicationStepSize and experiment:
             own = own or experiment.stepSize
@@ -115,7 +114,8 @@ class FmuAds(ScalarAds):
     """Drives one vehicle with an instance of an FMU; see `ScalarAds`."""
 
     def __init__(self, fmu: Fmu) -> None:
-        self._fmu, self._calls = fmu, 0
+        self._fmu = fmu
+        self._calls = 0
         self._trim: Trim | None = None
 
     def start(self, nominal: Nominal, step: float) -> None:
@@ -137,7 +137,8 @@ class FmuAds(ScalarAds):
 
     def _step(self, values: Mapping[str, float]) -> dict[str, float]:
         """Advance the instance with observed values; returns its outputs."""
-        slave, time = self._slave, self._calls * self.step
+        slave = self._slave
+        time = self._calls * self.step
         try:
             for name, variable in self._fmu.inputs.items():
                 write(slave, variable, float(values[name]))

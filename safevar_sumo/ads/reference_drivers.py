@@ -151,7 +151,9 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         following
             Upper limit of the acceleration when following a leader [m/s^2].
         """
-        nominal, step, cruise = memory.nominal, memory.step, memory.cruise
+        nominal = memory.nominal
+        step = memory.step
+        cruise = memory.cruise
         if cruise is None:
             cruise = *cruise_at(nominal, seen, self.cruise_speed), seen.brake
         speed_to_hold, initial_trim, initial_brake = cruise
@@ -162,7 +164,8 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         is_reacting = np.where(is_aware, danger_lasts, danger)
         danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, 0.0), -1.0)
         was_braking, is_braking = (time >= reaction_time - TIME_ROUNDING for time in (memory.danger_time, danger_time))
-        intended_before, felt_before = memory.intended_deceleration, memory.felt_deceleration
+        intended_before = memory.intended_deceleration
+        felt_before = memory.felt_deceleration
         braked = np.maximum(intended_before - felt_before, 0.0)
         felt = np.where(was_braking, felt_before, np.maximum(-memory.acceleration(seen) - braked, 0.0))
         # A step has the mean of the deceleration that rises within it.
@@ -278,7 +281,8 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
-        rt, reaction_speed = self.reaction_time, speed + self.reaction_time * self.acceleration
+        rt = self.reaction_time
+        reaction_speed = speed + self.reaction_time * self.acceleration
         stop = speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
         leader_stop = leader_speed * leader_speed / (2 * self.leader_deceleration)
         return np.maximum(stop - leader_stop, 0.0)

@@ -32,7 +32,9 @@ class VariedAds(Ads):
     """
 
     def __init__(self, ads: Ads, names: tuple[str, ...], values: FloatArray) -> None:
-        self._ads, self._names, self._values = ads, names, values
+        self._ads = ads
+        self._names = names
+        self._values = values
         self.tau_parameter = ads.tau_parameter
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:

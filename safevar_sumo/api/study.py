@@ -118,7 +118,8 @@ def study(
     directory = out or Path("results") / as_written.name
     if status:
         return summarise(load(directory))
-    search, given = as_written.search, {"runs": runs, "evaluations": evaluations, "seed": seed}
+    search = as_written.search
+    given = {"runs": runs, "evaluations": evaluations, "seed": seed}
     changes: JsonObject = {name: value for name, value in given.items() if value is not None}
     if algorithms is not None:
         names = [name.strip() for name in algorithms.split(",")]
@@ -141,7 +142,8 @@ def study(
     except KeyboardInterrupt:
         warn(f"finished evaluations are kept in {directory}: run the same command again to continue")
         raise
-    answer, reason = summarise(results), why_no_verdict(system)
+    answer = summarise(results)
+    reason = why_no_verdict(system)
     following = ", ".join(question_command(name, str(directory)) for name in ("explain", "tolerance"))
     verdict = f"{reason or _verdict(results, system)} Next: {following}"
     return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
@@ -186,7 +188,8 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
 
 def _verdict(results: Results, system: System) -> str:
     """How many solutions are unsafe, and how little is enough."""
-    case, names = results.case, list(system.characteristics.names)
+    case = results.case
+    names = list(system.characteristics.names)
     if results.original["collision"] and not system.rater and not system.characteristics.scenario:
         return "The original vehicle itself collides: no change is needed."
     solutions = case.solutions.drop_duplicates(names)
@@ -213,18 +216,21 @@ def summarise(results: Results) -> Answer:
     InputError
         If the results are imported.
     """
-    case, study = results.case, results.study
+    case = results.case
+    study = results.study
     if not case.has_runs:
         problem = "holds imported solutions, which have no runs"
         raise InputError(results.directory, problem, "results of the command `study`")
-    finished, rows = Counter(name for name, _ in results.finished), []
+    finished = Counter(name for name, _ in results.finished)
+    rows = []
     for name in study.search.labels:
         simulated, solutions = (frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions))
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
         counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
-        collisions, best = int(are_collisions(feasible).sum()), feasible["f_safe"].min()
+        collisions = int(are_collisions(feasible).sum())
+        best = feasible["f_safe"].min()
         ends = (collisions, *counts, best, len(solutions))
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
     metrics = {metric.name: Column(metric.unit, "mean over solutions", ".2f") for metric in case.scoring.metrics}

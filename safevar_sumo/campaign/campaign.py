@@ -173,8 +173,10 @@ def measure_speed(task: Task, pool: Pool) -> float:
     little beside them.
     """
     system = system_of(task.study)
-    characteristics, size = system.characteristics, max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
-    rng, shape = np.random.default_rng(task.study.search.seed), (pool.workers, size, len(characteristics))
+    characteristics = system.characteristics
+    size = max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
+    rng = np.random.default_rng(task.study.search.seed)
+    shape = (pool.workers, size, len(characteristics))
     jobs = [(task, rows) for rows in rng.uniform(characteristics.lower, characteristics.upper, shape)]
     carry_out(evaluate_settings, jobs, pool)  # workers load the study, and warm up
     start = time.perf_counter()

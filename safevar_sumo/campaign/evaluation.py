@@ -156,7 +156,8 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
 
 def _failed_evaluation(study: Study, row: FloatArray, failure: SimulationError | UserCodeError) -> Evaluations:
     """The evaluation of a setting that SUMO cannot simulate; raises the error of user code, with a command."""
-    characteristics, undefined = CharacteristicSet.of(study), np.full(1, np.nan)
+    characteristics = CharacteristicSet.of(study)
+    undefined = np.full(1, np.nan)
     setting = row[:, : len(characteristics)]  # without the ADS's parameters
     if isinstance(failure, UserCodeError):
         command = reproduction_command(study, setting[0])
@@ -186,8 +187,10 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
     """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
-    selection, n = task.selection, len(system.characteristics)
-    settings, values = rows[:, :n], rows[:, n:]
+    selection = task.selection
+    n = len(system.characteristics)
+    settings = rows[:, :n]
+    values = rows[:, n:]
     if selection.each:
         return evaluate_matrix(system, settings, task.engine, each=True)
     if not values.size:
@@ -196,7 +199,8 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
         return replace(evaluate(system, settings, task.engine, with_originals=False), settings=rows)
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
-    groups, rows_of_groups = [], []
+    groups = []
+    rows_of_groups = []
     for number, parameter_set in enumerate(parameter_sets.tolist()):
         group = np.flatnonzero(set_of_row.ravel() == number)
         study = with_parameters(task.study, dict(zip(selection.parameters, parameter_set, strict=True)))
@@ -217,7 +221,8 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the only point to which
     the study was reduced.
     """
-    characteristics, origin = CharacteristicSet.of(study), study.origin
+    characteristics = CharacteristicSet.of(study)
+    origin = study.origin
     words = [f"{PROGRAM_COMMAND} simulate", shlex.quote(origin.called or study.name)]
     words += ["--point", shlex.quote(origin.point)] if origin.point else []
     words += [

@@ -34,7 +34,8 @@ class ProcessWorker:
 
     def __init__(self, last_words: Path) -> None:
         self._last_words = last_words
-        context, arguments = multiprocessing.get_context("spawn"), (ImportPath.here(), last_words)
+        context = multiprocessing.get_context("spawn")
+        arguments = (ImportPath.here(), last_words)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
         with _hide_main(), _show_package(), _block_interrupts():
             self._executor.submit(os.getpid)  # starts the process

@@ -68,10 +68,12 @@ class Pool:
     """
 
     def __init__(self, workers: int, start: Callable[[int], Worker]) -> None:
-        self.workers, self._start = workers, start
+        self.workers = workers
+        self._start = start
         self._places: Sequence[int] = range(workers)
         self._is_abandoned = Event()
-        self._started, self.verified = dict[int, Worker](), Counter[bytes]()
+        self._started = dict[int, Worker]()
+        self.verified = Counter[bytes]()
         self.compiled = set[str]()
 
     def map(
@@ -90,14 +92,18 @@ class Pool:
         WorkerLostError
             If another worker dies of the same job.
         """
-        results, deaths = dict[int, Any](), Counter[int]()
-        waiting, idle = deque(range(len(jobs))), deque(self._places)
-        ended, under_way = SimpleQueue[Future[Any]](), dict[Future[Any], tuple[int, int]]()
+        results = dict[int, Any]()
+        deaths = Counter[int]()
+        waiting = deque(range(len(jobs)))
+        idle = deque(self._places)
+        ended = SimpleQueue[Future[Any]]()
+        under_way = dict[Future[Any], tuple[int, int]]()
         while len(results) < len(jobs):
             if self._is_abandoned.is_set():
                 raise AbandonedError
             while waiting and idle:
-                place, number = idle.popleft(), waiting.popleft()
+                place = idle.popleft()
+                number = waiting.popleft()
                 future = self._begin(place, function, jobs[number])
                 under_way[future] = place, number
                 future.add_done_callback(ended.put)
@@ -129,7 +135,8 @@ class Pool:
         count = min(len(functions), self.workers)
         if count < 2:
             return [function(self) for function in functions]
-        free, is_abandoned = SimpleQueue[Pool](), Event()
+        free = SimpleQueue[Pool]()
+        is_abandoned = Event()
         for number in range(count):
             free.put(self._part(self._places[number::count], is_abandoned))
 
@@ -153,7 +160,9 @@ class Pool:
     def _part(self, places: Sequence[int], is_abandoned: Event) -> Pool:
         """A pool of some of the workers, which knows what all of them know."""
         part = copy(self)
-        part.workers, part._places, part._is_abandoned = len(places), places, is_abandoned
+        part.workers = len(places)
+        part._places = places
+        part._is_abandoned = is_abandoned
         return part
 
     def close(self) -> None:

@@ -56,7 +56,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     """
     with about(study.source):
         search = study.search
-        name, key = search.labels.get(label, label), f"search.{label}"
+        name = search.labels.get(label, label)
+        key = f"search.{label}"
         parameters_of = {label_of(table): parameters for table, parameters in search.parameters.items()}
         if len(search.labels) < len(search.algorithms):
             raise InputError(
@@ -73,7 +74,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         if PYMOO + name in PYMOO_ALGORITHMS:
             raise InputError("", f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
         if name.startswith(PYMOO):
-            member, key = Member(pymoo_algorithm(name)), f"search.{name!r}"
+            member = Member(pymoo_algorithm(name))
+            key = f"search.{name!r}"
         else:
             member = lookup.class_of({**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm)
         parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
@@ -118,10 +120,15 @@ class Run:
     solutions: Evaluations
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, budget: int) -> None:
-        self.key, self._search, self._journal, self._budget = key, search, journal, budget
-        self._content, self._journaled = journal.content, set(journal.content.positions)
+        self.key = key
+        self._search = search
+        self._journal = journal
+        self._budget = budget
+        self._content = journal.content
+        self._journaled = set(journal.content.positions)
         settings = journal.content.evaluations.settings
-        self._row_of, self._request = {setting.tobytes(): row for row, setting in enumerate(settings)}, settings[:0]
+        self._row_of = {setting.tobytes(): row for row, setting in enumerate(settings)}
+        self._request = settings[:0]
         self._asked = 0
         """Number of settings in all earlier requests."""
         self._missing = dict[bytes, int]()
@@ -142,7 +149,8 @@ class Run:
             try:
                 self._request = self._search.send(answer)  # type: ignore[arg-type]
             except StopIteration as end:
-                self.solutions, self._has_ended = end.value, True
+                self.solutions = end.value
+                self._has_ended = True
                 break
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:

@@ -109,7 +109,8 @@ def refuse_other_inputs(task: Task, share: Share) -> None:
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:
     """Open the journal of a run and begin its search."""
-    study, system = task.study, system_of(task.study)
+    study = task.study
+    system = system_of(task.study)
     path = journal_file(share.directory, str(key))
     head = journal_head(identity_digest(share.manifest), str(key), system.characteristics.names)
     problem = problem_of(study, system, share.original)

@@ -127,7 +127,8 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     Positive for a loss of speed; shape (N,); NaN for a vehicle that never braked.
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
-    speed, active = runs.trace.speed[::stride], runs.trace.active[::stride]
+    speed = runs.trace.speed[::stride]
+    active = runs.trace.active[::stride]
     is_braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
     decelerations = (speed[:-1] - speed[1:]) / (stride * runs.trace.step)
     is_counted = is_braking[1:]
@@ -156,7 +157,8 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     A sample's pedal acts in the step before it.
     """
     trace = runs.trace
-    pedal, vehicles = np.broadcast_to(trace.pedal, trace.speed.shape), np.arange(trace.speed.shape[1])
+    pedal = np.broadcast_to(trace.pedal, trace.speed.shape)
+    vehicles = np.arange(trace.speed.shape[1])
     is_pressed = pedal > pedal[0] + PEDAL_ROUNDING
     begin = np.maximum(np.argmax(is_pressed, axis=0) - 1, 0)
     has_stopped = is_pressed.any(axis=0) & (trace.speed[-1] <= STANDSTILL)
@@ -225,7 +227,8 @@ def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
     The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling
     rate.
     """
-    high_pass_rate, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
+    high_pass_rate = 2 * np.pi * HIGH_PASS
+    transition = 2 * np.pi * TRANSITION
     butterworth = 1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate
     passed = _filter(acceleration, (1.0, 0.0, 0.0), butterworth, step)
     band_limit = 1.0, transition / TRANSITION_QUALITY, transition * transition
@@ -250,7 +253,8 @@ def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArr
 
 def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Largest deceleration over half a second [m/s^2]; shape (N,), NaN on a collision."""
-    speed, active = runs.trace.speed, runs.trace.active
+    speed = runs.trace.speed
+    active = runs.trace.active
     steps = _step_count(BRAKING_TIME, runs.trace.step, largest_count=len(speed) - 1)
     decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
     return mask_collisions(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))

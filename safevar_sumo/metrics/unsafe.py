@@ -203,7 +203,8 @@ class Unsafe:
         outcomes
             Outcomes of the other vehicles, as an array or a column of `Outcome`.
         """
-        points, safety_degree = original.get(RATING_POINTS.name), original.get(SAFETY_DEGREE) or 0.0
+        points = original.get(RATING_POINTS.name)
+        safety_degree = original.get(SAFETY_DEGREE) or 0.0
         if points is not None:
             return cls(points=round(points - POINT_LOSS, POINT_DECIMALS))
         if (outcomes == COLLISION).any() or not safety_degree > 0:

@@ -57,7 +57,8 @@ def user_error_of(source: str, error: BaseException) -> UserCodeError | None:
         frames.append((error.filename, error.lineno, "import"))
     for file, line, name in reversed(frames):
         if is_user_file(file):
-            method, place = name.replace("<module>", "import"), f"{file}:{line}"
+            method = name.replace("<module>", "import")
+            place = f"{file}:{line}"
             reason, legal = _reason_of(error)
             return UserCodeError(source, f"user code raised in {method}: {reason} ({place})", legal, place)
     return None
@@ -271,7 +272,8 @@ def violation(candidate: Any, base: type) -> str:
     if not inspect.isclass(candidate):
         return f"is a {type(candidate).__name__}, not a class"
     for name, parameters in _methods(base).items():
-        attribute, method = getattr(candidate, name, getattr(base, name)), f"{name}({', '.join(parameters)})"
+        attribute = getattr(candidate, name, getattr(base, name))
+        method = f"{name}({', '.join(parameters)})"
         if hasattr(attribute, ABSTRACT) or not callable(attribute):
             return f"has no method {method}"
         # A static or class method takes no `self`.

@@ -42,7 +42,8 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
     A module is a file; of a package every file counts.
     """
     own_folders = (*folders, os.getcwd())
-    paths, known = set[Path](), {PACKAGE.name, *sys.stdlib_module_names}
+    paths = set[Path]()
+    known = {PACKAGE.name, *sys.stdlib_module_names}
     waiting = [(module, (*own_folders, *sys.path)) for module in modules]
     while waiting:
         module, search_path = waiting.pop()

@@ -125,7 +125,8 @@ class Lookup(NamedTuple):
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
-        modules_before, dont_write_bytecode = set(sys.modules), sys.dont_write_bytecode
+        modules_before = set(sys.modules)
+        dont_write_bytecode = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         try:
             with user_errors(subject()), np.errstate():
@@ -196,7 +197,9 @@ def only_from(folder: str) -> Iterator[None]:
     """Within the block, also in processes that start in it, user code and files that it names without their folder are
     those of one folder, the working directory; only libraries are imported from elsewhere.
     """
-    place, path, modules = os.getcwd(), ImportPath.here(), dict(sys.modules)
+    place = os.getcwd()
+    path = ImportPath.here()
+    modules = dict(sys.modules)
     own = {name for name in modules if name != "__main__" and is_user_file(file_of_module(name))}
     for name in own:
         del sys.modules[name]

@@ -56,10 +56,14 @@ class DrivingRobot:
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
-        self._prepared, self._vehicle = prepared, vehicle
-        self._start_pedal, self._brake_threshold = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
-        self._step, self._integral = step, np.zeros(n)
-        self._has_braked, self._max_system_pedal = ~self.has_test_speed, np.full(n, -np.inf)
+        self._prepared = prepared
+        self._vehicle = vehicle
+        self._start_pedal = state.throttle - state.brake
+        self._brake_threshold = state.brake + ACTION_THRESHOLD
+        self._step = step
+        self._integral = np.zeros(n)
+        self._has_braked = ~self.has_test_speed
+        self._max_system_pedal = np.full(n, -np.inf)
         self.error = np.where(self.has_test_speed, 0.0, np.nan)
         """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN
         without a test.
@@ -68,7 +72,8 @@ class DrivingRobot:
         self._depends_until = np.concatenate(
             [np.broadcast_to(point.scenario.depends_until, n // len(points)) for point in points]
         )
-        self._sample, self.acted_early = 0, np.full(n, np.nan)
+        self._sample = 0
+        self.acted_early = np.full(n, np.nan)
         """Times at which systems act before motions no longer depend on the vehicle [s]; NaN for all others."""
 
     def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
@@ -90,7 +95,8 @@ class DrivingRobot:
         self._is_driving = ~self._has_braked & (
             system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
         )
-        time, self._sample = self._sample * self._step, self._sample + 1
+        time = self._sample * self._step
+        self._sample = self._sample + 1
         acts = is_open & ~self._is_driving & (time < self._depends_until) & np.isnan(self.acted_early)
         np.copyto(self.acted_early, time, where=acts)
         error = np.where(self._is_driving, error, 0.0)

@@ -68,12 +68,14 @@ class Rater:
 
     def points(self, results: CellResults) -> Points:
         """Points of M vehicles."""
-        protocol, colours = self.protocol, colours_of(self.protocol, results)
+        protocol = self.protocol
+        colours = colours_of(self.protocol, results)
         layers = _which_layers_hold(protocol, colours)
         fails = (colours[:, protocol.required_cells] != GREEN).any(axis=1)
         tests = {}
         for test, matrices in protocol.tests.items():
-            claimed, test_layers = self.claims.get(test, ()), protocol.layers_of(test)
+            claimed = self.claims.get(test, ())
+            test_layers = protocol.layers_of(test)
             held_count = sum(
                 layers.get((test, layer.name), np.full(len(fails), layer.name in claimed)) for layer in test_layers
             )
@@ -124,7 +126,8 @@ def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dic
     """Whether simulated layers hold, shape (M,) each: some standard-range cell is not red, and every such cell passes
     in all variations.
     """
-    passes, nominal = passing_cells(protocol, colours), colours[:, protocol.nominal_numbers]
+    passes = passing_cells(protocol, colours)
+    nominal = colours[:, protocol.nominal_numbers]
     is_counted = (nominal != RED) & (nominal != UNKNOWN)
     holds = {}
     for layer in protocol.layers:
@@ -139,7 +142,8 @@ def passing_cells(protocol: Protocol, colours: npt.NDArray[np.int8]) -> BoolArra
     """Whether robustness cells meet their criteria, shape (M, cells): not red, or the colour of the cell that they vary
     or a better one.
     """
-    nominal, only_not_red = colours[:, protocol.nominal_numbers], [cell.criterion == NOT_RED for cell in protocol.cells]
+    nominal = colours[:, protocol.nominal_numbers]
+    only_not_red = [cell.criterion == NOT_RED for cell in protocol.cells]
     return np.asarray((colours != UNKNOWN) & np.where(only_not_red, colours != RED, colours <= nominal))
 
 
@@ -199,7 +203,8 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
     if study.matrix is None or not study.matrix.protocol:
         return study
     shared_parameters = {name: value for name, value in study.scenario.parameters.items() if name in SHARED_PARAMETERS}
-    by_night, tests = darken(weather), []
+    by_night = darken(weather)
+    tests = []
     for cell in protocol_of(study.matrix.protocol).cells:
         model, parameters, is_night = cell.scenario
         parameters = {**shared_parameters, **parameters}

@@ -290,17 +290,21 @@ class SimulationRuns:
         sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of the step counts: `collision_speed` minus the
         obstacle's speed.
         """
-        trace, vehicles = self.trace, np.arange(len(self.collision_speed))
+        trace = self.trace
+        vehicles = np.arange(len(self.collision_speed))
         last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)  # the last active one
         sample_before = np.maximum(last_sample - 1, 0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
         speed = trace.speed - obstacle_speed
-        speed_before, speed_after = speed[sample_before, vehicles], speed[last_sample, vehicles]
-        gap_before, gap_after = trace.gap[sample_before, vehicles], trace.gap[last_sample, vehicles]
+        speed_before = speed[sample_before, vehicles]
+        speed_after = speed[last_sample, vehicles]
+        gap_before = trace.gap[sample_before, vehicles]
+        gap_after = trace.gap[last_sample, vehicles]
         gap_closes = (gap_before > -TOUCH_OVERLAP) & np.isfinite(gap_before) & (gap_after <= 0) & (speed_before > 0)
         distance = np.where(gap_closes, np.maximum(gap_before, 0.0), 0.0)
         squared_speed = speed_before * speed_before + 2 * (speed_after - speed_before) / trace.step * distance
-        min_speed, max_speed = np.minimum(speed_before, speed_after), np.maximum(speed_before, speed_after)
+        min_speed = np.minimum(speed_before, speed_after)
+        max_speed = np.maximum(speed_before, speed_after)
         at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))

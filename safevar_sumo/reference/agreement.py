@@ -57,8 +57,10 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
     here = evaluator.evaluate(data.settings, "settings", ignore_constraints=True)
     if not here.valid.any():
         raise SimulationError(f"study {study.name!r} cannot be simulated with any row of {reference}")
-    data, here = data.take(here.valid), here.take(here.valid)
-    numbers, table = count_collisions(data, here), measure_agreement(data, here)
+    data = data.take(here.valid)
+    here = here.take(here.valid)
+    numbers = count_collisions(data, here)
+    table = measure_agreement(data, here)
     measures = table.loc[table["metric"] == SAFETY_DEGREE, ["spearman", "mean_absolute_error", "bias"]]
     order, error, bias = map(two_decimals, measures.to_numpy(float)[0])
     verdict = (
@@ -82,7 +84,8 @@ def _draw(title: str, reference: ReferenceData, here: Evaluations, answer: Answe
     figure, axes = new_panels(title, len(table), 4, (3.0, 2.6), min_width=12.0, title_height=0.6)
     colours = np.where(reference.collided | here.collided, VERMILION, BLUE)
     for axis, name, order in zip(axes, table["metric"], table["spearman"], strict=True):
-        there, simulated = reference.metrics[name], here.metrics[name]
+        there = reference.metrics[name]
+        simulated = here.metrics[name]
         label = f"{METRICS[name].title} [{as_formula(METRICS[name].unit)}]"
         axis.scatter(there, simulated, s=6, alpha=0.4, c=colours, linewidths=0)
         defined, _ = defined_pairs(there, simulated)

@@ -178,7 +178,8 @@ def import_published(
     InputError
         If the study or a file cannot be used, no file is given, or the original vehicle's safety degree is unknown.
     """
-    loaded_study, directory = load_study(study), Path(out)
+    loaded_study = load_study(study)
+    directory = Path(out)
     given = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
     files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
     if not files:

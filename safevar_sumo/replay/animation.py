@@ -49,7 +49,8 @@ def animate(comparison: Comparison, path: Path) -> None:
     InputError
         If the ending is unknown, or the file cannot be written.
     """
-    ending, scene = path.suffix.lower(), lay_out_scene(comparison)
+    ending = path.suffix.lower()
+    scene = lay_out_scene(comparison)
     if ending not in ENDINGS:
         raise InputError("animate", str(path), f"a file that ends in {', '.join(ENDINGS)}")
     with whole_file(path, "animate") as file:
@@ -64,7 +65,8 @@ def _write_gif(scene: FlatScene, path: Path) -> None:
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     figure, show = draw_scene(scene)
-    stride, last = max(1, round(SECONDS_PER_FRAME / scene.step)), scene.sample_count - 1
+    stride = max(1, round(SECONDS_PER_FRAME / scene.step))
+    last = scene.sample_count - 1
     while True:
         samples = [*range(0, last, stride), *[last] * (1 + round(LAST_FRAME_DURATION / (stride * scene.step)))]
         animation = FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False)
@@ -149,7 +151,8 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
     """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle, is at the origin."""
     from matplotlib.patches import Circle, Rectangle
 
-    length, width = body.length, body.width
+    length = body.length
+    width = body.width
     if body.is_person:
         return [
             axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white", zorder=3))
@@ -203,10 +206,13 @@ def animation_page(scene: FlatScene) -> str:
 
 def player_data(scene: FlatScene) -> JsonObject:
     """The data of the template `player`, under `played` those of its script. y points down."""
-    comparison, trace = scene.comparison, scene.comparison.runs.trace
-    drives, jumps = [], []
+    comparison = scene.comparison
+    trace = scene.comparison.runs.trace
+    drives = []
+    jumps = []
     for row, (braking_start, nearest, end) in enumerate(comparison.moments):
-        name, samples = comparison.name(row), slice(0, end + 1)
+        name = comparison.name(row)
+        samples = slice(0, end + 1)
         ending = "is nearest" if np.isnan(comparison.runs.collision_speed[row]) else "collides"
         moments = ((f"{name} brakes", braking_start), (f"{name} {ending}", nearest))
         jumps += [{"name": words, "sample": sample} for words, sample in moments if sample is not None]

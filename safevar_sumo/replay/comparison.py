@@ -111,7 +111,8 @@ class Comparison:
 
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
-        runs, nearest = self.runs, self.moments[row].nearest
+        runs = self.runs
+        nearest = self.moments[row].nearest
         if not math.isnan(runs.closing_speed[row]):
             return f"collides at {runs.closing_speed[row]:.1f} m/s"
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
@@ -165,7 +166,8 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     worst_system = system_at_worst_point(system, settings)
     worst = worst_system.scenario, worst_system.weather
     point = next((point.name for point in system.matrix if (point.scenario, point.weather) == worst), "")
-    network, scoring = stage_network(worst_system.scenario), worst_system.measuring.scoring
+    network = stage_network(worst_system.scenario)
+    scoring = worst_system.measuring.scoring
     runs, tracks = _film(worst_system, settings)
     objectives = {objective.name for objective in scoring.objectives} - {*METRICS, RATING_POINTS.name}
     return Comparison(
@@ -185,7 +187,9 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
 
 def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, Film]]:
     """Simulate N settings, shape (N, n), and record in SUMO how all actors move, by name in alphabetical order."""
-    runs, tracks, samples = simulate(system, settings), dict[str, Film](), count()
+    runs = simulate(system, settings)
+    tracks = dict[str, Film]()
+    samples = count()
     length = len(runs.trace.time)
     drive_again(system, settings, runs, lambda world: world.film(tracks, next(samples), length))
     return runs, dict(sorted(tracks.items()))

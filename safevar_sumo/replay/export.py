@@ -89,7 +89,8 @@ class Poses(NamedTuple):
 
     def places(self, behind: float = 0.0) -> list[tuple[float, float, float, float]]:
         """Time [s], x, y [m] and heading [rad] of the point that is `behind` the middle by so much [m]."""
-        x, y = self.x - behind * np.cos(self.heading), self.y - behind * np.sin(self.heading)
+        x = self.x - behind * np.cos(self.heading)
+        y = self.y - behind * np.sin(self.heading)
         return list(zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True))
 
 
@@ -97,19 +98,24 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     """All actors of the changed vehicle's run, or of the original's if nothing is changed, until its end; the vehicle
     under test is the first.
     """
-    row, actors = comparison.rows[-1], []
+    row = comparison.rows[-1]
+    actors = []
     end = comparison.moments[row].end + 1
     time = np.round(comparison.runs.trace.time[:end], TIME_DECIMALS)
     for name, track in sorted(comparison.tracks.items(), key=lambda item: item[0] != VUT):
-        x, y = track.x[:end, row], track.y[:end, row]
+        x = track.x[:end, row]
+        y = track.y[:end, row]
         is_present = np.isfinite(x)
         if not is_present.any():
             continue
         heading = track.heading[:end, row]
-        kind, to_middle = "bicycle" if track.width < BICYCLE_WIDTH else "car", track.length / 2
+        kind = "bicycle" if track.width < BICYCLE_WIDTH else "car"
+        to_middle = track.length / 2
         if track.is_person:
-            kind, to_middle = "pedestrian", 0.0
-        x, y = x - to_middle * np.cos(heading), y - to_middle * np.sin(heading)
+            kind = "pedestrian"
+            to_middle = 0.0
+        x = x - to_middle * np.cos(heading)
+        y = y - to_middle * np.sin(heading)
         time_of, x, y, heading = (values[is_present] for values in (time, x, y, heading))
         actor = Poses(name, kind, track.length, track.width, time_of, x, y, heading)
         if name == VUT:
@@ -166,7 +172,8 @@ def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float
     """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings counter-clockwise) and
     pedals.
     """
-    row, trace = comparison.rows[-1], comparison.runs.trace
+    row = comparison.rows[-1]
+    trace = comparison.runs.trace
     vut, *others = poses_of(comparison)
     samples = slice(0, comparison.moments[row].end + 1)
     return {
@@ -219,7 +226,8 @@ def export(
     target = load_target(directory, solution, [], as_it_is_now, point)
     system = assemble(target.study, directory)
     setting = target.setting(system)
-    vehicle, of_vehicle = system.characteristics.vehicle, setting[system.characteristics.of_vehicle]
+    vehicle = system.characteristics.vehicle
+    of_vehicle = setting[system.characteristics.of_vehicle]
     values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
     physics = carla_physics(values, directory) if to == "carla" else {}
     write_files(compare_setting(target.study, system, setting), to, out, solution, physics)
@@ -236,7 +244,8 @@ def write_files(
         files[SCRIPT] = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")
         files[VEHICLE] = json.dumps(scene, indent=1, allow_nan=False) + "\n"
     else:
-        actors, template = poses_of(comparison), template_environment().get_template(f"{SCENARIO}.j2")
+        actors = poses_of(comparison)
+        template = template_environment().get_template(f"{SCENARIO}.j2")
         files[SCENARIO] = template.render(
             title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
             road=ROAD,

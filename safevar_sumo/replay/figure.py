@@ -36,8 +36,10 @@ def draw_comparison(comparison: Comparison) -> Figure:
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
-    runs, divergence = comparison.runs, find_divergence(comparison.runs)
-    trace, ttc = runs.trace, time_to_collision(runs)
+    runs = comparison.runs
+    divergence = find_divergence(comparison.runs)
+    trace = runs.trace
+    ttc = time_to_collision(runs)
     divergence_time = None if divergence is None else float(trace.time[divergence])
     quantities = {
         "speed [m/s]": trace.speed,
@@ -83,7 +85,8 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row:
     has_impact = not np.isnan(impact_speed)
 
     def draw(axis: Axes, sample: int, value: float, mark: str, text: str = "", **place: Any) -> None:
-        point, colour = (trace.time[sample], value), COLOURS[row]
+        point = (trace.time[sample], value)
+        colour = COLOURS[row]
         size = 12 - 4 * row + 2 * (mark == IMPACT_MARK)
         axis.plot(*point, mark, color=colour, markersize=size, linestyle="", zorder=6 + row, markeredgecolor="white")
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}

@@ -133,7 +133,9 @@ def _road_origin(scene: FlatScene, row: int) -> tuple[float, float]:
 def _add_actor(api: Api, body: FlatBody) -> None:
     """Add an actor, which is a vehicle in sumo-gui; persons only have another shape."""
     name = f"{body.row}.{body.name}"
-    length, width, colour = body.length, body.width, COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
+    length = body.length
+    width = body.width
+    colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     if body.is_person:  # a circle
         length, width, colour = max(length, width), max(length, width), PERSON_COLOUR
     api.vehicletype.copy("DEFAULT_VEHTYPE", name)
@@ -157,9 +159,12 @@ def _paint_road(api: Api, scene: FlatScene, row: int) -> None:
 
 def _show_sample(api: Api, scene: FlatScene, sample: int) -> None:
     """Show the actors, the camera and the legend at one sample."""
-    comparison, left_end = scene.comparison, scene.left_ends[sample]
+    comparison = scene.comparison
+    left_end = scene.left_ends[sample]
     for body in scene.bodies:
-        x, y, angle = body.x[sample], body.y[sample], 90 - np.rad2deg(body.heading[sample])
+        x = body.x[sample]
+        y = body.y[sample]
+        angle = 90 - np.rad2deg(body.heading[sample])
         if not np.isnan(x):
             name, (right, up) = f"{body.row}.{body.name}", _road_origin(scene, body.row)
             api.vehicle.moveToXY(name, "", 0, x + right, y + up, angle, keepRoute=ANY_POSITION)

@@ -84,7 +84,8 @@ class FlatScene:
 
     def reading(self, row: int, sample: int) -> str:
         """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run ends."""
-        trace, moments = self.comparison.runs.trace, self.comparison.moments[row]
+        trace = self.comparison.runs.trace
+        moments = self.comparison.moments[row]
         shown = min(sample, moments.end)
         ending = "brakes" if trace.brake[shown, row] > 0 else ""
         if sample >= moments.decided:
@@ -110,7 +111,8 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     for name, track in comparison.tracks.items():
         for row, moments in enumerate(comparison.moments):
             samples = np.minimum(np.arange(sample_count), moments.end)  # then the actor stays in place
-            track_x, track_y = track.x[samples, row], track.y[samples, row]
+            track_x = track.x[samples, row]
+            track_y = track.y[samples, row]
             distance = np.hypot(track_x - vut.x[samples, row], track_y - vut.y[samples, row])
             if np.any(distance < MAX_DISTANCE + track.length):
                 x, y = rotation @ (np.stack([track_x, track_y]) - start[:, np.newaxis])
@@ -136,7 +138,8 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> tuple[FloatAr
     bottom = float(np.nanmin(y - half_width)) - MARGIN / 2
     height = float(np.nanmax(y + half_width)) + MARGIN / 2 - bottom
     padding = max(0.0, MIN_HEIGHT - height) / 2
-    left_ends, width = np.full(sample_count, left_end), right_end - left_end
+    left_ends = np.full(sample_count, left_end)
+    width = right_end - left_end
     if width > MAX_LENGTH:
         width = CAMERA_LENGTH
         left_ends = np.clip(x[is_vut].mean(axis=0) - width * CAMERA_LEAD, left_end, max(left_end, right_end - width))

@@ -185,7 +185,8 @@ def simulate(
 
 def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of a matrix."""
-    study, setting = target.study, simulation.evaluation.settings[0]
+    study = target.study
+    setting = simulation.evaluation.settings[0]
     remarks = _remarks(system)
     remarks += (
         f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
@@ -193,7 +194,9 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         for name, value in simulation.reset_values.items()
     )
     remarks += _acted_early(system, setting)
-    original, simulated, units = simulation.original.numbers, simulation.numbers, {"outcome": "", **simulation.units}
+    original = simulation.original.numbers
+    simulated = simulation.numbers
+    units = {"outcome": "", **simulation.units}
     results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
     tables = {"characteristics": _characteristics(simulation), "results": tabulate("Results", RESULTS, results)}
     verdict = [simulation.no_verdict, *_verdict(simulation)]
@@ -282,7 +285,8 @@ def _sweep(study: Study, system: System, requested: FloatArray, names: list[str]
     characteristics = system.characteristics
     settings = characteristics.filter(requested) if filtered else requested
     evaluations = evaluate_settings(study, np.concatenate([characteristics.original[np.newaxis], settings]))
-    contact, no_verdict = system.contact, why_no_verdict(system)
+    contact = system.contact
+    no_verdict = why_no_verdict(system)
     frame = pd.DataFrame(settings, columns=list(characteristics.names))[names]
     columns = {item.name: Column(item.unit, "value", "g") for item in characteristics if item.name in names}
     columns["outcome"] = Column("", "how the simulation ends")
@@ -292,7 +296,8 @@ def _sweep(study: Study, system: System, requested: FloatArray, names: list[str]
     columns["gap"] = Column("m", "least distance between bodies", ".3f", is_shown=bool(contact))
     values = {"outcome": evaluations.outcome, **evaluations.metrics, "gap": evaluations.gaps(contact)}
     frame = frame.assign(**{name: column[1:] for name, column in values.items()})
-    collisions, resets = int(evaluations.collided[1:].sum()), np.count_nonzero((settings != requested).any(axis=1))
+    collisions = int(evaluations.collided[1:].sum())
+    resets = np.count_nonzero((settings != requested).any(axis=1))
     remarks = [*_remarks(system), degree_note(contact)]
     if resets:
         remarks.append(f"In {resets} of {len(frame)} settings the filter reset small changes; --no-filter keeps them.")
@@ -334,7 +339,8 @@ def _safety_comparison(simulation: Simulation) -> str:
     stop, original = (one.metrics.get(STOPPING_DISTANCE.name, np.nan) for one in (simulation, simulation.original))
     if np.isfinite(stop / original):
         return f"in {stop / original:.2f} times the distance of the original"
-    degree, original = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
+    degree = simulation.metrics[SAFETY_DEGREE]
+    original = simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):
         return "whether that is less safe cannot be decided"
     if degree == original:

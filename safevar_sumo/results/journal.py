@@ -108,7 +108,8 @@ class Journal:
     """
 
     def __init__(self, path: Path, head: JsonObject, *, retry_failed: bool = False) -> None:
-        self.path, self._characteristics = path, head["characteristics"]
+        self.path = path
+        self._characteristics = head["characteristics"]
         self._file = _open_and_lock(path)
         try:
             with disk_errors(path, "read"):
@@ -178,7 +179,8 @@ class JournalReader:
     """Follows how many evaluations a run has asked for, in the journal that another process writes."""
 
     def __init__(self, path: Path, budget: int) -> None:
-        self._path, self._budget = path, budget
+        self._path = path
+        self._budget = budget
         self._end = self._asked = 0
         self.is_finished = False
 
@@ -195,7 +197,8 @@ class JournalReader:
                 if progress.evaluation:
                     self._asked = min(progress.evaluation[-1] + 1, self._budget)
                 elif progress.budget == self._budget:
-                    self.is_finished, self._asked = True, self._budget
+                    self.is_finished = True
+                    self._asked = self._budget
         return self._asked
 
 
@@ -215,7 +218,9 @@ def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = Fa
     """The contents of a journal; with `until_failure`, without the first batch that failed and all that came after
     it.
     """
-    positions, batches, results = [], [], {}
+    positions = []
+    batches = []
+    results = {}
     first, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(first)
     has_checksums = owner.get("format") != FORMAT_WITHOUT_CHECKSUMS

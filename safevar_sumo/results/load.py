@@ -94,9 +94,13 @@ def load_runs(directory: str | Path) -> StoredResults:
     if "imported" in manifest:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
-    evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], [], []
+    evaluations_of_runs = []
+    solutions_of_runs = []
+    all_positions = []
+    failures = []
     has_checksums = True
-    search, digest = manifest["study"]["search"], identity_digest(manifest)
+    search = manifest["study"]["search"]
+    digest = identity_digest(manifest)
     budget = search["evaluations"]
     for algorithm, run in product(dict.fromkeys(map(label_of, search["algorithms"])), range(search["runs"])):
         path = journal_file(folder, run_name(algorithm, run))

@@ -151,7 +151,9 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
 
 def evaluation_keys(tables: Tables) -> JsonObject:
     """Those of a study's tables that affect evaluations."""
-    vehicle, search, scenario = tables["vehicle"], tables["search"], tables["scenario"]
+    vehicle = tables["vehicle"]
+    search = tables["search"]
+    scenario = tables["scenario"]
     searched = {}
     if "search" in scenario:
         searched["scenario"] = {**scenario, "search": _without_descriptions(scenario["search"])}
@@ -238,7 +240,8 @@ def read_manifest(directory: Path) -> JsonObject:
     file = directory / MANIFEST
     try:
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
-        written_by, format_number = manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
+        written_by = manifest["versions"]["safevar_sumo"]
+        format_number = manifest.get("format", 1)
     except (FileNotFoundError, NotADirectoryError):
         likely_path = Path("results") / directory.name
         hint = f"; did you mean {likely_path}?" if likely_path != directory and likely_path.is_dir() else ""

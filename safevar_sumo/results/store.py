@@ -66,7 +66,8 @@ class ResultsDirectory:
     def __init__(
         self, path: Path, study: Study, identity: Tables = MappingProxyType({}), scoring: Scoring = PUBLISHED_SCORING
     ) -> None:
-        self.path, self._study = path, study
+        self.path = path
+        self._study = study
         folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
         self.manifest = {**manifest_of(study, identity), "folders": folders}
         if scoring != PUBLISHED_SCORING:
@@ -94,7 +95,8 @@ class ResultsDirectory:
         """Remarks on earlier results: runs of another length, and runs that the study, with runs of these names, no
         longer has.
         """
-        earlier_manifest, remarks = self._earlier_manifest(), []
+        earlier_manifest = self._earlier_manifest()
+        remarks = []
         if not earlier_manifest:
             return []
         (_, _, before), (_, _, now) = search_extent_of(earlier_manifest), search_extent_of(self.manifest)
@@ -113,7 +115,8 @@ class ResultsDirectory:
         """
         if not (self.path / MANIFEST).exists():
             return {}
-        stored, problem = read_manifest(self.path), "holds results of another study"
+        stored = read_manifest(self.path)
+        problem = "holds results of another study"
         if "imported" in stored:
             raise InputError(self.path, f"{problem}: they are imported", "another `out`")
         for layer, text, _ in differences(stored, self.manifest):

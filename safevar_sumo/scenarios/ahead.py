@@ -82,8 +82,10 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The target: a body that the vehicle's path touches first where the gap ends, and then moves ahead."""
-        target, direction = self.parameter("target"), self.direction
-        body, speeds = BODIES[target], self.target_speed_at(times)
+        target = self.parameter("target")
+        direction = self.direction
+        body = BODIES[target]
+        speeds = self.target_speed_at(times)
         y = direction.left * body.length / 2 - self.offset
         at_gap = Track("target", target, *body, self.gap, y, *direction, speeds)
         first = first_in_strip(at_gap._replace(x=0.0), self.vut_width / 2)
@@ -244,7 +246,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     @property
     def target_speed_at(self) -> Callable[[Any], Any]:
         """The target's speed [m/s] as a function of the time [s]."""
-        first_speed, brakes_at, deceleration = self._target_speed, self.brakes_at, self.target_deceleration
+        first_speed = self._target_speed
+        brakes_at = self.brakes_at
+        deceleration = self.target_deceleration
         if not self._target_brakes:
             return lambda time: first_speed
         last_speed = np.minimum(first_speed, self.final_speed * KMH)
@@ -257,14 +261,16 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until
         it stops braking.
         """
-        closing_speed, gap = self.test_speed - self._target_speed, self.gap
+        closing_speed = self.test_speed - self._target_speed
+        gap = self.gap
         if not self._target_brakes:
             if np.any(closing_speed <= 0):
                 problem = f"speed = {np.min(self.speed):g} km/h never reaches the target"
                 raise InputError("scenario.parameters", problem, "a slower target")
             return gap / closing_speed
         gap_at_braking = gap - closing_speed * self.brakes_at
-        b, speed_lost = self.target_deceleration, self._target_speed - self.target_speed_at(math.inf)
+        b = self.target_deceleration
+        speed_lost = self._target_speed - self.target_speed_at(math.inf)
         closed_by_braking = (closing_speed + speed_lost / 2) * speed_lost / b
         gap_after_braking = gap_at_braking - closed_by_braking
         after_braking = self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)

@@ -223,7 +223,8 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The target, which moves past the place of the impact, and the parked cars, if any."""
-        start, target = _Start.of(self), self.parameter("target")
+        start = _Start.of(self)
+        target = self.parameter("target")
         way = start.profile.travelled(times)
         end = start.distance_to_impact + self.stop - start.side * start.impact_left if self.is_on_foot else np.inf
         path = np.minimum(way, end) - start.distance_to_impact

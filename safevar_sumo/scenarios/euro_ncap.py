@@ -45,7 +45,8 @@ class Direction(NamedTuple):
 
     def extent(self, body: BodySize) -> BodySize:
         """Size along the lane and across it of a body that faces in this direction [m]."""
-        along, left = abs(self.along), abs(self.left)
+        along = abs(self.along)
+        left = abs(self.left)
         return BodySize(body.length * along + body.width * left, body.length * left + body.width * along)
 
 
@@ -189,7 +190,8 @@ class ProtocolTest(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unkn
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
-        row, remarks = TESTS[self.test], []
+        row = TESTS[self.test]
+        remarks = []
         if not row.slowest <= self.speed <= row.fastest:
             tested = f"{row.slowest:g} to {row.fastest:g} km/h"
             remarks.append(f"speed = {self.speed:g} km/h is outside the protocol's {tested}")

@@ -62,7 +62,10 @@ class OpenScenario(TrackScenario):
     """
 
     def __init__(self, file: str, ego: str = "Ego", **values: Any) -> None:
-        self.name, self.file, self.ego, self.values = file, os.path.abspath(file), ego, values
+        self.name = file
+        self.file = os.path.abspath(file)
+        self.ego = ego
+        self.values = values
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, OpenScenario) and self._key == other._key

@@ -187,7 +187,8 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         InputError
             If the leader is too slow sideways to get past the standing car.
         """
-        speed, apart = self.start_speed, self.gap / self.start_speed * self.lateral_speed
+        speed = self.start_speed
+        apart = self.gap / self.start_speed * self.lateral_speed
         if np.any(apart < CAR.width):
             problem = f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the standing car"
             raise InputError("scenario.parameters", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")

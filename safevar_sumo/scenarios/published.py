@@ -149,10 +149,12 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        frame, times = approach(roads), np.arange(samples)[:, np.newaxis]
+        frame = approach(roads)
+        times = np.arange(samples)[:, np.newaxis]
         speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
         start = LATERAL_START if self.lateral_start is None else self.lateral_start
-        lateral, turned = speed * step * times - start, np.zeros((samples, 1), dtype=bool)
+        lateral = speed * step * times - start
+        turned = np.zeros((samples, 1), dtype=bool)
         if self.turns_after is not None:
             beyond = lateral > self.turns_after + ROUNDING
             first = np.where(beyond[-1], np.argmax(beyond, axis=0), samples)  # he is back at his place two steps before
@@ -266,11 +268,13 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             yield from next_lane(speed, HEADWAYS)
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        frame, still = Frame.of(roads.lane("road_0")), np.zeros((samples, 1))
+        frame = Frame.of(roads.lane("road_0"))
+        still = np.zeros((samples, 1))
         return Layout(frame, self._front, None, PARKED_VEHICLE, still + PARKED_POSITION, still, still)
 
     def begin(self, world: World) -> _Parked:
-        frame, length = Frame.through_origin(world.lane_of(VUT)), world.vehicle_length(PARKED_VEHICLE)
+        frame = Frame.through_origin(world.lane_of(VUT))
+        length = world.vehicle_length(PARKED_VEHICLE)
         return _Parked(frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - length, np.array(length))
 
     def observe(self, world: World, step: float, memory: _Parked) -> tuple[Scene, _Parked]:

@@ -129,7 +129,8 @@ def first_in_strip(body: Track, half_width: float) -> Quantity:
 
 def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
     """The four corners of a body, once around it [m]."""
-    half_length, half_width = body.length / 2, body.width / 2
+    half_length = body.length / 2
+    half_width = body.width / 2
     return [
         (
             body.x + end * half_length * body.along - side * half_width * body.left,

@@ -38,7 +38,8 @@ class Problem:
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Unfiltered settings, drawn uniformly in the domains and feasible after the filter; shape (number, n)."""
-        lower, upper = self.characteristics.lower, self.characteristics.upper
+        lower = self.characteristics.lower
+        upper = self.characteristics.upper
 
         def draw(count: int) -> FloatArray:
             return rng.uniform(lower, upper, (count, len(lower)))
@@ -59,7 +60,9 @@ def check_search(code: UserCode, method: str, search: Any, problem: Problem, rng
     """A user's search, whose settings and result are checked."""
     if not hasattr(search, "send"):
         raise code.wrong(method, quoted(search), "a generator: a method that yields settings and returns its result")
-    yielded, budget, answer = set[bytes](), problem.evaluations, None
+    yielded = set[bytes]()
+    budget = problem.evaluations
+    answer = None
     while True:
         with user_errors(code.source), np.errstate():
             try:

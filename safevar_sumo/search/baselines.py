@@ -90,9 +90,12 @@ class _Ranges:
     """Ranges from which values are drawn, and the largest number of characteristics changed."""
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._characteristics, self._scoring = problem, problem.characteristics, problem.scoring
+        self._problem = problem
+        self._characteristics = problem.characteristics
+        self._scoring = problem.scoring
         self._original_objective = problem.scoring.values(problem.original)[0, 0]
-        self.lower, self.upper = problem.characteristics.lower.copy(), problem.characteristics.upper.copy()
+        self.lower = problem.characteristics.lower.copy()
+        self.upper = problem.characteristics.upper.copy()
         self.max_changes = len(problem.characteristics.vehicle)
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
@@ -126,7 +129,8 @@ class _Ranges:
         The filter replaces values within a threshold of the original by the original, which is drawn if no others are
         in the range.
         """
-        original, threshold = self._characteristics.original[i], self._characteristics.threshold[i]
+        original = self._characteristics.original[i]
+        threshold = self._characteristics.threshold[i]
         width_below = max(original - threshold - self.lower[i], 0.0)
         width_above = max(self.upper[i] - original - threshold, 0.0)
         if width_below + width_above <= 0:
@@ -180,5 +184,6 @@ def _normalise(values: FloatArray) -> FloatArray:
     """Scale values to [0, 1] by their minimum and maximum; NaN stays NaN."""
     if np.all(np.isnan(values)):
         return values
-    minimum, value_range = np.nanmin(values), np.nanmax(values) - np.nanmin(values)
+    minimum = np.nanmin(values)
+    value_range = np.nanmax(values) - np.nanmin(values)
     return (values - minimum) / value_range if value_range > 0 else values - minimum

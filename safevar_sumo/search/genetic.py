@@ -77,7 +77,9 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         reproduction = Reproduction(self, problem, rng)
         first = problem.uniform(min(problem.population, problem.evaluations), rng)
-        offspring, survivors, used = [*map(Individual, first.tolist())], list[Individual](), 0
+        offspring = [*map(Individual, first.tolist())]
+        survivors = list[Individual]()
+        used = 0
         while offspring:
             used += yield from request_evaluations(offspring, problem)
             alive = survivors + [individual for individual in offspring if not individual.has_failed]
@@ -92,12 +94,15 @@ class Reproduction:
     """Draws offspring of one run. DEAP draws from the global `random`: see `_randomness`."""
 
     def __init__(self, operators: Nsga2, problem: Problem, rng: np.random.Generator) -> None:
-        characteristics, self._problem = problem.characteristics, problem
-        self._operators, self._random_state = operators, random.Random(int(rng.integers(2**63))).getstate()
+        characteristics = problem.characteristics
+        self._problem = problem
+        self._operators = operators
+        self._random_state = random.Random(int(rng.integers(2**63))).getstate()
         self._misses = 0
         probability = operators.mutation_probability
         self._mutation_probability = 1 / len(characteristics) if probability is None else probability
-        self._lower, self._upper = characteristics.lower.tolist(), characteristics.upper.tolist()
+        self._lower = characteristics.lower.tolist()
+        self._upper = characteristics.upper.tolist()
 
     @contextmanager
     def _randomness(self) -> Iterator[None]:
@@ -114,7 +119,9 @@ class Reproduction:
 
     def draw_offspring(self, population: list[Individual], number: int) -> list[Individual]:
         """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
-        offspring, operators, domains = list[Individual](), self._operators, (self._lower, self._upper)
+        offspring = list[Individual]()
+        operators = self._operators
+        domains = (self._lower, self._upper)
         with self._randomness():
             while population and len(offspring) < number:
                 pair = [Individual(run_tournament(population, operators.tournament_size)) for _ in range(2)]
@@ -145,12 +152,15 @@ class Reproduction:
 def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
-    scoring, fitness = problem.scoring, fitness_class(len(problem.scoring.objectives))
+    scoring = problem.scoring
+    fitness = fitness_class(len(problem.scoring.objectives))
     violations = scoring.violation(evaluated)
     failed = ~np.where(violations > 0, np.isfinite(violations), scoring.valid(evaluated))
     columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
     for row, (individual, values, violation, has_failed) in enumerate(zip(individuals, *columns, strict=True)):
-        individual.evaluation, individual.violation, individual.has_failed = (evaluated, row), violation, has_failed
+        individual.evaluation = (evaluated, row)
+        individual.violation = violation
+        individual.has_failed = has_failed
         individual.fitness = fitness(tuple(values))
     return len(individuals)
 

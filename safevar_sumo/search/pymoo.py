@@ -98,13 +98,16 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
     name: ClassVar[str]
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        randomness, left, seen = _Randomness(self.name, rng), problem.evaluations, [problem.original.take([])]
+        randomness = _Randomness(self.name, rng)
+        left = problem.evaluations
+        seen = [problem.original.take([])]
         with randomness:
             from pymoo.core.individual import Individual
             from pymoo.core.population import Population
             from pymoo.util.optimum import filter_optimum
 
-            algorithm, optimum = self.begin(problem, randomness.seed), Population()
+            algorithm = self.begin(problem, randomness.seed)
+            optimum = Population()
         while left > 0 and algorithm.has_next():
             with randomness:
                 asked = algorithm.ask()
@@ -112,7 +115,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
             if group is None or not len(group):
                 break
             new = [individual for individual in group if not individual.evaluated]
-            batch, left = Population.create(*new[:left]), left - len(new)
+            batch = Population.create(*new[:left])
+            left = left - len(new)
             if new:
                 evaluations = yield _settings(batch, problem)
                 seen.append(evaluations)
@@ -191,7 +195,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                 given["ref_dirs"] = get_reference_directions("das-dennis", objectives, n_partitions=partitions)
             if given.get("pop_size", np.inf) < len(given["ref_dirs"]):
                 raise ValueError(f"pop_size is less than the {len(given['ref_dirs'])} reference directions")
-        lower, upper = problem.characteristics.lower, problem.characteristics.upper
+        lower = problem.characteristics.lower
+        upper = problem.characteristics.upper
         constraints = 0 if self.name.endswith("MOEAD") else 1  # it refuses constraints
         task = PymooProblem(len(lower), objectives, n_ieq_constr=constraints, xl=lower, xu=upper)
         algorithm = copy.deepcopy(_class_of(self.name)(**given))  # runs share the defaults of pymoo's classes
@@ -208,7 +213,8 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
 
 def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
     """Made-up evaluations of settings, shape (k, n): the nearer to the lower ends of the domains, the safer."""
-    characteristics, scoring = problem.characteristics, problem.scoring
+    characteristics = problem.characteristics
+    scoring = problem.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     degree = np.add.accumulate(share**2, axis=1)[:, -1]
     names = [metric.name for metric in scoring.metrics]
@@ -225,7 +231,8 @@ def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
 def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:
     """Give pymoo's individuals their objectives and violations."""
     scoring = problem.scoring
-    valid, violations = scoring.valid(evaluations), scoring.violation(evaluations)
+    valid = scoring.valid(evaluations)
+    violations = scoring.violation(evaluations)
     values = np.where(valid[:, np.newaxis], scoring.values(evaluations), FAILED)[:, : algorithm.problem.n_obj]
     violations = np.where(valid | (violations > 0), np.minimum(violations, FAILED), FAILED)
     population.set("F", values, "G", violations[:, np.newaxis])
@@ -240,7 +247,9 @@ class _Randomness:
     """
 
     def __init__(self, name: str, rng: np.random.Generator) -> None:
-        self._name, self._unseeded, self.seed = name, rng.spawn(1)[0], int(rng.integers(2**31))
+        self._name = name
+        self._unseeded = rng.spawn(1)[0]
+        self.seed = int(rng.integers(2**31))
         self._inside = np.random.RandomState(self.seed).get_state()
 
     def default_rng(self, seed: int | None) -> np.random.Generator:

@@ -144,8 +144,10 @@ def stated_values(distribution: Distribution) -> dict[str, float]:
 
 
 def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:
-    unit, stated = unit_text(row.unit), stated_values(distribution)
-    lower, upper = stated.get("lower", row.lower), stated.get("upper", row.upper)
+    unit = unit_text(row.unit)
+    stated = stated_values(distribution)
+    lower = stated.get("lower", row.lower)
+    upper = stated.get("upper", row.upper)
     mode = stated.get("mode", row.original)
     for field, value in stated.items():
         if field not in ("deviation", "sigma") and not row.lower <= value <= row.upper:
@@ -267,7 +269,8 @@ def limits_of(
         match = LIMIT_FORM.fullmatch(text)
         if match is None:
             raise InputError(source, repr(text), FORMS)
-        name, side = match[1], "at_least" if match[2] == ">=" else "at_most"
+        name = match[1]
+        side = "at_least" if match[2] == ">=" else "at_most"
         if side in sides.setdefault(name, {}):
             raise InputError(source, f"{name} {match[2]} is given twice", "each limit once")
         sides[name][side] = float(match[3])
@@ -285,7 +288,8 @@ def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], source
     """Refuse limits of unknown characteristics, outside the domain, or that exclude the original."""
     for name, limit in limits.items():
         check_name(source, f"{table}{name}: there is no such characteristic", name, rows)
-        row, unit = rows[name], unit_text(rows[name].unit)
+        row = rows[name]
+        unit = unit_text(rows[name].unit)
         for side, lower, upper in (("at_least", row.lower, row.original), ("at_most", row.original, row.upper)):
             value = getattr(limit, side)
             if value is not None and not lower <= value <= upper:

@@ -109,7 +109,8 @@ def _converted(raw: _RawStudy) -> Study:
         raise InputError("", "origin: there is no such key")
     tables = with_file(raw.source, raw.tables, raw.origin.places)
     tables = _with_parameters(_with_parameters(tables, "search", SearchTable), "repair", RepairTable)
-    matrix, vehicle = tables.get("matrix"), tables.get("vehicle")
+    matrix = tables.get("matrix")
+    vehicle = tables.get("vehicle")
     if isinstance(matrix, dict) and matrix.get("tests") == [] and not matrix.get("protocol"):
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:

@@ -60,7 +60,9 @@ def with_file(source: object, tables: Raw, places: Sequence[str]) -> Parameters:
             raise InputError(
                 source, f"scenario.{key} beside scenario.file", "one of the two; values stand in [scenario.values]"
             )
-    name, values, search = scenario["file"], scenario.get("values", {}), scenario.get("search", {})
+    name = scenario["file"]
+    values = scenario.get("values", {})
+    search = scenario.get("search", {})
     for key, value, kind in (("file", name, str), ("values", values, dict), ("search", search, dict)):
         if not isinstance(value, kind):
             raise InputError(source, f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
@@ -73,7 +75,8 @@ def with_file(source: object, tables: Raw, places: Sequence[str]) -> Parameters:
 
 def _expanded(source: object, tables: Raw, offered: Source, places: Sequence[str]) -> Parameters:
     scenario: Parameters = tables["scenario"]
-    values, search = scenario.get("values", {}), scenario.get("search", {})
+    values = scenario.get("values", {})
+    search = scenario.get("search", {})
     for name in (*values, *(name for name in search if name not in WEATHER)):
         if name not in offered.values:
             raise unknown_name("scenario", f"the file declares no parameter {name}", name, offered.values)
@@ -105,7 +108,8 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
     """The domain of a searched parameter: what the study leaves out comes from the file."""
     if not isinstance(table, dict):
         raise InputError("scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty")
-    numbers, ends = originals(offered), offered.range_of(name)
+    numbers = originals(offered)
+    ends = offered.range_of(name)
     if name not in numbers:
         raise InputError("scenario", f"{name} = {offered.values[name]!r} is no number", "a number to search")
     if ends is None and not {"lower", "upper"} <= table.keys():

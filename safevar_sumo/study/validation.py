@@ -54,15 +54,20 @@ NO_KEY = "origin"
 def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     """The error for a message of msgspec, which ends with the place of the mistake."""
     problem, _, location = message.partition(" - at `$")
-    path, value, kinds, siblings = [prefix] if prefix else [], raw, [table], ()
+    path = [prefix] if prefix else []
+    value = raw
+    kinds = [table]
+    siblings = ()
     for name, index in re.findall(r"\.(\w+)|\[([\d.]+)\]", location):
         inner = _inner_type(_meant(kinds[-1], value), name)
         siblings = tuple(value) if isinstance(value, dict) else ()
         key: Any = name or (_wrong_key(value, inner) if index == "..." else int(index))
-        path, value = [*path, key], value[key]
+        path = [*path, key]
+        value = value[key]
         kinds.append(inner)
     kind = _meant(kinds[-1], value)
-    text, quoted = _path_text(path), _short_text(value)
+    text = _path_text(path)
+    quoted = _short_text(value)
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
         return _unknown_key(_path_text([*path, field[1]]), field[1], kind, table)
     if field := re.match(r"Object missing required field `(.*)`", problem):

@@ -137,7 +137,8 @@ def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> O
 
 def stage_of(system: System, settings: FloatArray) -> Stage | None:
     """The bodies around N settings, shape (N, n), at every point; None if the scenario observes a world itself."""
-    n, size = len(settings), len(settings)
+    n = len(settings)
+    size = len(settings)
     scenarios = [point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)]
     if len(scenarios) < len(system.points):
         return None
@@ -167,7 +168,8 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
 def open_points_world(system: System, settings: FloatArray, stage: Stage | None) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
     (point,), step, n = system.points, system.scenes.step, len(settings)
-    encounters, scenarios = system.characteristics.scenario, [point.scenario]
+    encounters = system.characteristics.scenario
+    scenarios = [point.scenario]
     if len(encounters):
         rows = settings[:, ~system.characteristics.of_vehicle].tolist()
         scenarios = [encounter(point, dict(zip(encounters.names, row, strict=True))).scenario for row in rows]
@@ -189,9 +191,13 @@ def drive(
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
-    vehicle, step, n, outcomes = system.vehicle, world.step_length, len(settings), _Outcomes(len(settings))
+    vehicle = system.vehicle
+    step = world.step_length
+    n = len(settings)
+    outcomes = _Outcomes(len(settings))
     prepared, ads, motion = enter(system, settings, world)
-    vehicle_length, frame = world.vehicle_length(VUT), world.frame
+    vehicle_length = world.vehicle_length(VUT)
+    frame = world.frame
     state = vehicle.at_start(prepared, motion.speeds)
     ads_memory = ads.start(n, system.nominal, step)
     size = n // len(system.points)
@@ -200,10 +206,12 @@ def drive(
     log = _Log(n, int(last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     fronts_only = np.repeat([point.scenario.is_hit_in_front for point in system.points], size)
-    contacts, warning_ttc = Contacts(n, fronts_only), np.full(n, np.nan)
+    contacts = Contacts(n, fronts_only)
+    warning_ttc = np.full(n, np.nan)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.length):
-            speed, scene = motion.speeds, observer.observe(motion, outcomes.is_open)
+            speed = motion.speeds
+            scene = observer.observe(motion, outcomes.is_open)
             if system.sees_nobody:  # the run ends at the place of the encounter
                 scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
             collisions = contacts.count(world, motion.hits, scene)
@@ -243,7 +251,8 @@ def drive(
 
 def enter(system: System, settings: FloatArray, world: World) -> tuple[Prepared, Ads, Motion]:
     """Put the vehicles of settings onto the road; returns their constants, their ADS and their first motion."""
-    vehicle, n = system.vehicle, len(settings)
+    vehicle = system.vehicle
+    n = len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
@@ -291,7 +300,8 @@ def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, ...]:
     """
     size = n // len(points)
     friction = per_vehicle([point.weather.road_friction for point in points], size)
-    grades, water = [point.scenario.grade for point in points], [point.weather.water for point in points]
+    grades = [point.scenario.grade for point in points]
+    water = [point.weather.water for point in points]
     slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
     if any(water):
         return friction, step, slope, np.repeat(water, size)
@@ -311,7 +321,9 @@ class _Log:
     """T samples of N runs in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
     def __init__(self, n: int, length: int, frame: Frame) -> None:
-        self.length, self._frame, self._positions = length, frame, np.zeros((length, n, 2))
+        self.length = length
+        self._frame = frame
+        self._positions = np.zeros((length, n, 2))
         names = (
             field.name for field in fields(Trace) if field.name not in ("step", "vehicle_length", "time", "position")
         )
@@ -341,7 +353,8 @@ class _Outcomes:
     """
 
     def __init__(self, n: int) -> None:
-        self.is_open, self.is_checked = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
+        self.is_open = np.ones(n, dtype=bool)
+        self.is_checked = np.ones(n, dtype=bool)
         self.collision_speed = np.full(n, np.nan)
         self._has_moved = np.zeros(n, dtype=bool)
         self._has_stopped = np.zeros(n, dtype=bool)

@@ -142,7 +142,8 @@ class Contacts:
     """
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
-        self._is_tested, self._was_inside = is_tested, np.zeros(n, dtype=bool)
+        self._is_tested = is_tested
+        self._was_inside = np.zeros(n, dtype=bool)
         self.first = Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n))
 
     def count(self, world: World, hits: Mapping[int, float], scene: Scene) -> dict[int, float]:
@@ -196,16 +197,19 @@ def distance_between(body: Track, middle: FloatArray, length: float, width: floa
     squares = [_square_outside(x - middle, y, length, width) for x, y in corners_of(body)]
     # In the body's axes the four corners of a vehicle are its middle plus what all vehicles share.
     x = middle - body.x
-    lengthwise, across = x * body.along - body.y * body.left, -x * body.left - body.y * body.along
+    lengthwise = x * body.along - body.y * body.left
+    across = -x * body.left - body.y * body.along
     for end, side in (
         (length / 2, width / 2),
         (length / 2, -width / 2),
         (-length / 2, width / 2),
         (-length / 2, -width / 2),
     ):
-        ahead, left = end * body.along + side * body.left, side * body.along - end * body.left
+        ahead = end * body.along + side * body.left
+        left = side * body.along - end * body.left
         squares.append(_square_outside(lengthwise + ahead, across + left, body.length, body.width))
-    cosine, sine = np.abs(body.along), np.abs(body.left)
+    cosine = np.abs(body.along)
+    sine = np.abs(body.left)
     # Bodies that cross each other have no corner in the other one.
     overlaps = (
         (np.abs(x) < (length + body.length * cosine + body.width * sine) / 2)
@@ -240,7 +244,8 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     """
     axes, extent, distance = _along_axes(own, other)
     speed = _dot(own.velocity - other.velocity, axes)
-    overlap, closing_speed = extent - np.abs(distance), np.copysign(1.0, distance) * speed
+    overlap = extent - np.abs(distance)
+    closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
     ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)
     approaches = is_closing.any(axis=0)

@@ -131,7 +131,8 @@ def parse_seconds(text: str) -> float | None:
     time.
     """
     try:
-        total, fields = 0.0, text.split(":")
+        total = 0.0
+        fields = text.split(":")
         for seconds, field in zip((86400, 3600, 60, 1)[-len(fields) :], fields, strict=True):  # seconds are last
             total += seconds * float(field)
     except ValueError:

@@ -39,7 +39,8 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
                 part = f"[{widest.lower:g}, {widest.upper:g}]{unit_text(widest.unit)}"
                 raise InputError("", problem, f"a part of {part}")
-            first, other = points[0].weather, point.weather
+            first = points[0].weather
+            other = point.weather
             if name in WEATHER_PARAMETERS and getattr(first, name) != getattr(other, name):
                 problem = f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
                 raise InputError("", problem, "a domain, or values in the weathers")
@@ -72,7 +73,9 @@ def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) 
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
     layout = scenario.layout(recording, recording.step_length, samples)
-    frame, track, along = layout.frame, recording.tracks[layout.target], layout.along
+    frame = layout.frame
+    track = recording.tracks[layout.target]
+    along = layout.along
     if along is None:  # on a footpath, whose place along the lane SUMO knows where it crosses the lane
         at_lane = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
         along = frame.along(track.motion[[at_lane], :2])

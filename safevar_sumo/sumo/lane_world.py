@@ -23,8 +23,12 @@ class LaneWorld:
     frame = LANE
 
     def __init__(self, stage: Stage, start_speeds: FloatArray, step: float) -> None:
-        self.n, self.step_length, self._stage = stage.n, step, stage
-        self._front, self._speed, self._sample = np.zeros(stage.n), start_speeds, 0
+        self.n = stage.n
+        self.step_length = step
+        self._stage = stage
+        self._front = np.zeros(stage.n)
+        self._speed = start_speeds
+        self._sample = 0
 
     def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
         return self._motion(np.ones(self.n, dtype=bool))

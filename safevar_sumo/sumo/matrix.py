@@ -50,7 +50,8 @@ def point_record(result: PointResult) -> JsonObject:
     speed before the ADS acted [km/h]; the time to collision at the first warning [s]; the side of the contact, and the
     position along that side [%].
     """
-    evaluations, runs = result.evaluations, result.runs
+    evaluations = result.evaluations
+    runs = result.runs
     test_speed_error, warning_ttc, side, place = (
         np.broadcast_to(column, len(evaluations))[0]
         for column in (runs.test_speed_error, runs.warning_ttc, runs.contact.side, runs.contact.place)
@@ -75,7 +76,8 @@ def point_record(result: PointResult) -> JsonObject:
 
 def vehicle_remarks(system: System) -> list[str]:
     """Remarks for the user on a vehicle that is tested at higher speeds than its model was fitted to."""
-    fitted_speed, speeds = system.vehicle.FITTED_UP_TO, [point.scenario.test_speed or 0.0 for point in system.points]
+    fitted_speed = system.vehicle.FITTED_UP_TO
+    speeds = [point.scenario.test_speed or 0.0 for point in system.points]
     if max(speeds) <= fitted_speed:
         return []
     tables = system.nominal.tables()
@@ -129,7 +131,8 @@ def evaluate_matrix(system: System, settings: FloatArray, engine: Engine, *, eac
         for result in group
     }
     at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
-    cells, evaluations = join_cells(quantities), evaluations_at_worst_points(system, at_points)
+    cells = join_cells(quantities)
+    evaluations = evaluations_at_worst_points(system, at_points)
     if system.rater is not None:
         metrics = {**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
         evaluations = replace(evaluations, metrics=metrics)
@@ -162,7 +165,8 @@ def batch_size(system: System, engine: Engine) -> int:
 
 def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]) -> Evaluations:
     """The evaluation of each of N settings at its worst point; `at_points` are their evaluations at all points."""
-    numbers, n = worst_points(system, at_points), len(at_points[0])
+    numbers = worst_points(system, at_points)
+    n = len(at_points[0])
     rows = numbers * n + np.arange(n)
     return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
@@ -222,7 +226,8 @@ def at_point(study: Study, name: str, source: object) -> Study:
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
         raise InputError(source, repr(name), legal if points else "a study with a matrix")
     search = replace_in(study.search, objectives=[*OBJECTIVES]) if study.matrix.protocol else study.search
-    matrix, origin = replace_in(study.matrix, point=name), replace_in(study.origin, point=name)
+    matrix = replace_in(study.matrix, point=name)
+    origin = replace_in(study.origin, point=name)
     return replace_in(study, matrix=matrix, origin=origin, search=search)
 
 

@@ -68,11 +68,13 @@ class Moving(NamedTuple):
     @classmethod
     def of(cls, track: Track, step: float, path: float) -> Moving:
         """What follows from a track with columns; `path` is the width of the vehicle [m]."""
-        cosine, sine = np.abs(track.along), np.abs(track.left)
+        cosine = np.abs(track.along)
+        sine = np.abs(track.left)
         half_length = (track.length * cosine + track.width * sine) / 2
         half_width = (track.length * sine + track.width * cosine) / 2
         rear = track.x - half_length
-        edge, is_lengthwise = rear, _rotated(track) & (cosine > sine)
+        edge = rear
+        is_lengthwise = _rotated(track) & (cosine > sine)
         if is_lengthwise.any():
             edge = np.where(is_lengthwise, first_in_strip(track, path / 2), rear)
         vx = slim(track.speed * track.along)
@@ -103,7 +105,8 @@ class Moving(NamedTuple):
 
     def covers(self, other: Moving) -> bool:
         """Whether another body that stands is always inside this one, which then hides all that the other one does."""
-        mine, its = self.track, other.track
+        mine = self.track
+        its = other.track
         return (
             self.faces_along
             and other.faces_along

@@ -176,7 +176,8 @@ def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
     """A copy of one network for each of N traffics, whose file exists until the end; raises the errors of
     `copied_network`.
     """
-    files, traffic_file = copied_network(networks[0], len(networks)), networks[0].path(TRAFFIC_FILE)
+    files = copied_network(networks[0], len(networks))
+    traffic_file = networks[0].path(TRAFFIC_FILE)
     with TemporaryDirectory() as folder:
         file = Path(folder, TRAFFIC_FILE)
         roots = [_changed(traffic_file, network.traffic_changes) for network in networks]

@@ -151,7 +151,8 @@ def _check_files(network: Network) -> None:
     if vut is None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>')
     routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
-    type_name, depart = vut.get("type"), vut.get("depart", "")
+    type_name = vut.get("type")
+    depart = vut.get("depart", "")
     others = sum(actor is not vut and actor.get("type") == VUT for actor in traffic)
     has_stop = any(route.find("stop") is not None for route in routes)
     if type_name != VUT or others or parse_seconds(depart) != 0 or has_stop:
@@ -168,7 +169,8 @@ def _check_lanes(file: Path, routes: Iterable[ElementTree.Element], roads: Eleme
     for lane in (lane for edge in roads.iter("edge") if edge.get("id") in names for lane in edge.iter("lane")):
         coordinates = [(*point.split(","), "0") for point in lane.get("shape", "").split()]  # x,y or x,y,z
         heights = [float(z) for _, _, z, *_ in coordinates]
-        climb, friction = max(heights, default=0.0) - min(heights, default=0.0), float(lane.get("friction", 1))
+        climb = max(heights, default=0.0) - min(heights, default=0.0)
+        friction = float(lane.get("friction", 1))
         problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
         if climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1:
             raise InputError(file, f"vehicle {VUT!r} {problem}", LEGAL_ROAD)
@@ -178,7 +180,8 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
     """Refuse types whose drivers are random: two copies of traffic that reacts to the vehicle may not show it yet."""
     names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {VUT}
     for vtype in (vtype for vtype in traffic.findall("vType") if vtype.get("id") in names):
-        model, speed_dev = vtype.get("carFollowModel", "Krauss"), vtype.get("speedDev", "0.1")
+        model = vtype.get("carFollowModel", "Krauss")
+        speed_dev = vtype.get("speedDev", "0.1")
         sigma = vtype.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
         problem = f"vType {vtype.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}"
         if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):

@@ -47,7 +47,8 @@ class RecordedWorld:
         self._size = size
         self._scene = recording
         self._motion, self._sizes = _joined_tracks(recording)
-        self.n, self.step_length = size * self._motion.shape[1], self._scene.step_length
+        self.n = size * self._motion.shape[1]
+        self.step_length = self._scene.step_length
         self.sample: Any = 0
         self._speeds = np.repeat(recording.speed, size)
         self._lane_number = np.zeros(self.n, dtype=np.intp)
@@ -56,7 +57,8 @@ class RecordedWorld:
         self._fronts: FloatArray | None = None
         self._struck: dict[int, int] = {}
         """The bodies that vehicles strike in this step, by vehicle: numbers among `_others`, all bodies beside them."""
-        self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
+        self._last_fronts = self.vehicle_positions(VUT)
+        self._last_speeds = self._speeds
         self._met_persons = self._lanes.meets_persons != 0
         self._last_coordinates = self._last_fronts @ self._scene.along
         self._starts, self._ends = self._extents()
@@ -73,13 +75,17 @@ class RecordedWorld:
         SimulationError
             If a vehicle leaves its last lane.
         """
-        self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
+        self._last_fronts = self.vehicle_positions(VUT)
+        self._last_speeds = self._speeds
         self._met_persons = self._lanes.meets_persons != 0
         distances = distance_covered(self._speeds, speeds, self.step_length)
         if np.count_nonzero(is_open) < self.n:
-            speeds, distances = np.where(is_open, speeds, self._speeds), np.where(is_open, distances, 0.0)
+            speeds = np.where(is_open, speeds, self._speeds)
+            distances = np.where(is_open, distances, 0.0)
         self._lane_position = self._lane_position + distances
-        self._speeds, self._fronts, self.sample = speeds, None, self.sample + 1
+        self._speeds = speeds
+        self._fronts = None
+        self.sample = self.sample + 1
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
             if (self._lane_number[is_beyond] == len(self._scene.way.end) - 1).any():
                 raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
@@ -165,9 +171,14 @@ class RecordedWorld:
         """
         if not np.count_nonzero(candidates):
             return candidates
-        direction, length, width, others = self._scene.along, self._scene.length, self._scene.width, self._others
-        normal, other_normals = _left_of(direction), _left_of(others.along)
-        cosine, sine = np.abs(others.along @ direction), np.abs(other_normals @ direction)
+        direction = self._scene.along
+        length = self._scene.length
+        width = self._scene.width
+        others = self._others
+        normal = _left_of(direction)
+        other_normals = _left_of(others.along)
+        cosine = np.abs(others.along @ direction)
+        sine = np.abs(other_normals @ direction)
         min_overlap = np.where(is_person | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
         # From a vehicle's front to where it is if the vehicle's middle is the other body's middle.
         to_other = (others.middle + direction * (length / 2))[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scenes]
@@ -190,7 +201,8 @@ class RecordedWorld:
         x, y, east, north, _ = self._motion.T
         length, width, _ = self._sizes.T[..., np.newaxis]
         along_x, along_y = self._scene.along
-        cosine, sine = along_x * east + along_y * north, along_x * north - along_y * east
+        cosine = along_x * east + along_y * north
+        sine = along_x * north - along_y * east
         middle = along_x * x + along_y * y - cosine * (length / 2)
         half = (np.abs(cosine) * length + np.abs(sine) * width) / 2 + EXTENT_MARGIN
         return np.array([(middle - half).T, (middle + half + self._scene.length).T])
@@ -199,10 +211,12 @@ class RecordedWorld:
         """Numbers (scene, actor), shape (M, 2), of the actors that vehicles of open runs are beside, now or one step
         ago.
         """
-        coordinates, last_coordinates = self.vehicle_positions(VUT) @ self._scene.along, self._last_coordinates
+        coordinates = self.vehicle_positions(VUT) @ self._scene.along
+        last_coordinates = self._last_coordinates
         self._last_coordinates = coordinates
         sample = min(self.sample, len(self._starts) - 1)
-        starts, ends = self._starts[sample], self._ends[sample]
+        starts = self._starts[sample]
+        ends = self._ends[sample]
         # In most steps no vehicle has come as far as an actor, which is found faster than below.
         if not np.count_nonzero(starts < np.maximum.reduce(coordinates.reshape(-1, self._size), axis=1)[:, np.newaxis]):
             return np.empty((0, 2), dtype=np.intp)
@@ -215,15 +229,20 @@ class RecordedWorld:
         return self._own_bodies(np.asarray(vehicles)), Body._make(column[struck] for column in self._others)
 
     def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        scenes, n_actors = np.asarray(vehicles) // self._size, self._motion.shape[2]
-        motion, sizes = self._motion[self.sample, scenes].reshape(-1, 5), self._sizes[scenes].reshape(-1, 3)
+        scenes = np.asarray(vehicles) // self._size
+        n_actors = self._motion.shape[2]
+        motion = self._motion[self.sample, scenes].reshape(-1, 5)
+        sizes = self._sizes[scenes].reshape(-1, 3)
         owners = np.repeat(vehicles, n_actors)
         others = Body.behind(motion[:, :2], motion[:, 2:4], sizes[:, 0], sizes[:, 1], motion[:, 4])
         return owners, self._own_bodies(owners), others
 
     def _own_bodies(self, vehicles: IntArray) -> Body:
-        scene, n = self._scene, len(vehicles)
-        along, length, width = np.tile(scene.along, (n, 1)), np.full(n, scene.length), np.full(n, scene.width)
+        scene = self._scene
+        n = len(vehicles)
+        along = np.tile(scene.along, (n, 1))
+        length = np.full(n, scene.length)
+        width = np.full(n, scene.width)
         return Body.behind(self.vehicle_positions(VUT)[vehicles], along, length, width, self._speeds[vehicles])
 
 

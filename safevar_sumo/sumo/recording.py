@@ -193,7 +193,9 @@ def _play(scenario: WorldScenario, network: Network, step: float | None) -> Reco
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
-        api, vehicle, vut = world.api, world.api.vehicle, copied_id(0, VUT)
+        api = world.api
+        vehicle = world.api.vehicle
+        vut = copied_id(0, VUT)
         way = _way_of(api, vut)
         if way is None:
             return NOT_STRAIGHT
@@ -214,7 +216,9 @@ def _play(scenario: WorldScenario, network: Network, step: float | None) -> Reco
 
 def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
     """How all actors except the vehicle under test move."""
-    length, tracks, memory = round(scenario.duration / world.step_length) + 1, dict[str, Film](), world.begin(scenario)
+    length = round(scenario.duration / world.step_length) + 1
+    tracks = dict[str, Film]()
+    memory = world.begin(scenario)
     for sample in range(length):
         world.film(tracks, sample, length)
         _, memory = scenario.observe(world, world.step_length, memory)
@@ -241,10 +245,12 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     if api.vehicle.getLateralLanePosition(vut) or any(len(shape) != 2 for shape in shapes):
         return None
     starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
-    vector, lengths = ends - starts, np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
+    vector = ends - starts
+    lengths = np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
-    largest_turn, largest_gap = np.abs(direction - direction[0]).max(), np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
+    largest_turn = np.abs(direction - direction[0]).max()
+    largest_gap = np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:
         return None
     is_junction = np.array([float(copy_and_name(lane)[1].startswith(":")) for lane in lanes])

@@ -33,11 +33,14 @@ class Stage:
 
     def __init__(self, scenarios: Sequence[TrackScenario], n: int, size: int, *, n_samples: int, step: float) -> None:
         first = scenarios[0]
-        self.length, self.width, self.setback = first.vut_length, first.vut_width, first.sensor_setback
+        self.length = first.vut_length
+        self.width = first.vut_width
+        self.setback = first.sensor_setback
         times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
         own = self._own(np.zeros(1), np.zeros(1))
         self.cast = cast_of(scenarios, times, n // size if len(scenarios) == 1 else 1, step, own)
-        self.n, self.step = n, step
+        self.n = n
+        self.step = step
         self.group: IntArray | None = np.repeat(np.arange(n // size), size) if 1 < size < n else None
         bodies = [Moving.of(track, step, self.width) for track in self.cast]
         level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
@@ -62,11 +65,14 @@ class Stage:
 
     def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
         """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches a body sees it."""
-        front, speed = motion.fronts[:, 0], motion.speeds
-        over, seen = ALL_TRUE, []
+        front = motion.fronts[:, 0]
+        speed = motion.speeds
+        over = ALL_TRUE
+        seen = []
         for k in self._met:
             body = self._bodies[k]
-            gap, closing = self._row(body.edge) - front, speed - self._row(body.vx)
+            gap = self._row(body.edge) - front
+            closing = speed - self._row(body.vx)
             is_passed = (self._row(body.far) < front - self.length) & (speed >= self._row(body.most_vx))
             ended = np.asarray(is_passed | self._row(body.is_cleared))
             if self._is_avoidable[k]:
@@ -81,7 +87,8 @@ class Stage:
 
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
         """Whether nobody is on the line from the sensors to a body's middle."""
-        track, visible = self._bodies[number].track, ALL_TRUE
+        track = self._bodies[number].track
+        visible = ALL_TRUE
         for k in self._hides:
             if k != number:
                 line = (front - self.setback, 0.0, self._row(track.x), self._row(track.y))
@@ -90,22 +97,28 @@ class Stage:
 
     def _blocks(self, other: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity) -> BoolArray:
         """Whether a body is on the line between two points: the slab test in the body's own axes."""
-        dx, dy, rx, ry = to_x - x, to_y - y, x - self._row(other.track.x), y - self._row(other.track.y)
+        dx = to_x - x
+        dy = to_y - y
+        rx = x - self._row(other.track.x)
+        ry = y - self._row(other.track.y)
         if not other.faces_along:
-            along, left = self._row(other.track.along), self._row(other.track.left)
+            along = self._row(other.track.along)
+            left = self._row(other.track.left)
             dx, dy = dx * along + dy * left, dy * along - dx * left
             rx, ry = rx * along + ry * left, ry * along - rx * left
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
         for position, change, size in ((rx, dx, other.track.length), (ry, dy, other.track.width)):
             half = self._row(size) / 2 + TIE
-            first, second = (-half - position) / change, (half - position) / change
+            first = (-half - position) / change
+            second = (half - position) / change
             enter = np.maximum(enter, np.minimum(first, second))
             leave = np.minimum(leave, np.maximum(first, second))
         return np.asarray((enter < leave) & (leave > 0) & (enter < 1))
 
     def _scene_of(self, seen: _Seen, over: BoolArray) -> Scene:
-        body, zeros = self._bodies[seen.body], np.zeros(self.n)
+        body = self._bodies[seen.body]
+        zeros = np.zeros(self.n)
         return Scene(
             gap=seen.gap,
             lateral=zeros + self._row(body.lateral),
@@ -145,8 +158,10 @@ class Stage:
 
     def hits(self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray) -> dict[int, float]:
         """Speeds of the vehicles of open runs that touch a body at a sample, by number."""
-        self._sample, self._struck = sample, np.full(self.n, -1)
-        foremost, rear = front.max(), front - self.length
+        self._sample = sample
+        self._struck = np.full(self.n, -1)
+        foremost = front.max()
+        rear = front - self.length
         for k in self._met:
             body = self._bodies[k]
             if foremost <= body.edge[sample if len(body.edge) > 1 else 0].min():
@@ -189,8 +204,11 @@ class Stage:
         """The distance to the nearest body that still counts, and how fast it shrinks, at all samples of a trace whose
         positions are those of the vehicles' fronts.
         """
-        shape, n_rows = trace.speed.shape, max(BLOCK // trace.speed.shape[1], 1)
-        distance, closing, in_conflict = np.full(shape, np.inf), np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+        shape = trace.speed.shape
+        n_rows = max(BLOCK // trace.speed.shape[1], 1)
+        distance = np.full(shape, np.inf)
+        closing = np.full(shape, np.nan)
+        in_conflict = np.zeros(shape, dtype=bool)
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
             for k in self._met:
@@ -211,7 +229,8 @@ class Stage:
             self._table(column, samples)
             for column in (body.edge, body.far, body.vx, body.vy, body.track.y, body.half_width)
         )
-        ahead, behind = edge - front, front - self.length - far
+        ahead = edge - front
+        behind = front - self.length - far
         dx = np.maximum(np.maximum(ahead, behind), 0.0)
         dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
         apart = np.sqrt(dx * dx + dy * dy) if dy.any() else dx

@@ -76,7 +76,9 @@ class StageWorld(SumoWorld):
 
     def __init__(self, api: Api, n: int, stage: Stage, start_speeds: FloatArray, start: Frame) -> None:
         super().__init__(api, n)
-        self._stage, self._start, self._sample = stage, start, 0
+        self._stage = stage
+        self._start = start
+        self._sample = 0
         self._lane = LaneWorld(stage, start_speeds, self.step_length)
         self._actors = [Placed.of(track, self.ids(track.name), start) for track in stage.cast if track.kind != SCREEN]
         self._move_person, self._move_vehicle, self._set_previous_speed = (
@@ -115,8 +117,10 @@ class StageWorld(SumoWorld):
 
     def _add(self, actor: Placed) -> None:
         """Add an actor to every copy, wherever it may be put."""
-        types, track = self.api.vehicletype, actor.track
-        lengths, widths = self._of_copies(track.length), self._of_copies(track.width)
+        types = self.api.vehicletype
+        track = actor.track
+        lengths = self._of_copies(track.length)
+        widths = self._of_copies(track.width)
         for id_, route, length, width in zip(actor.ids, self._routes, lengths, widths, strict=True):
             types.copy("DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE", id_)
             types.setLength(id_, length)
@@ -166,6 +170,7 @@ class StageWorld(SumoWorld):
             wanted[f"actor {actor.track.name!r}"] = here, np.array([*map(get_position, actor.ids)])
         for name, (here, there) in wanted.items():
             if not (np.abs(there - here) <= PLACE_TOLERANCE).all():
-                off, time = np.abs(there - here).max(), self._sample * self.step_length
+                off = np.abs(there - here).max()
+                time = self._sample * self.step_length
                 raise SimulationError(f"SUMO has the {name} {off:.2g} m beside its track at {time:g} s")
         return motion

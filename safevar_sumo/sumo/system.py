@@ -251,7 +251,8 @@ def _assemble(study: Study) -> System:
         original = {name: domain.original for name, domain in study.scenario.search.items()}
         scenario, weather, *_ = encounter(points[0], original)
         matrix = tuple(encounter(point, original) for point in matrix)
-    region, scenes = region_of(study), Scenes(study.step_length)
+    region = region_of(study)
+    scenes = Scenes(study.step_length)
     if study.scenario.search:
         measuring = _with_safe_original(study, measuring, scenes, scenario)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
@@ -329,7 +330,8 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
     name = f"ads.model = {table.model!r}"
     with substitute_traci():
         member = lookup.find({}, table.model, "ads.model")
-        controller, parameters = member.target, lookup.with_paths(member, table.parameters, "ads.parameters")
+        controller = member.target
+        parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
         is_class = inspect.isclass(controller)
         step: Any = getattr(controller, "step", None) if is_class else controller
         try:

@@ -50,8 +50,11 @@ class CommandedSpeed:
     BEYOND_LIMIT = 64
 
     def __init__(self, step: float) -> None:
-        self._step, self.mode = step, self.DEFAULT_MODE
-        self._target, self._rate, self._end = 0.0, math.inf, -math.inf
+        self._step = step
+        self.mode = self.DEFAULT_MODE
+        self._target = 0.0
+        self._rate = math.inf
+        self._end = -math.inf
 
     def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
         """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no legal number."""
@@ -69,7 +72,9 @@ class CommandedSpeed:
         if name == "setSpeedMode":
             self.mode = self.DEFAULT_MODE if value == SUMO_CONTROL else int(value)
         elif name == "setSpeed":
-            self._target, self._rate, self._end = value, math.inf, -math.inf if value == SUMO_CONTROL else math.inf
+            self._target = value
+            self._rate = math.inf
+            self._end = -math.inf if value == SUMO_CONTROL else math.inf
         elif durations:
             duration = math.floor(durations[0] * TICKS + 0.5) / TICKS
             self._target = value if name == "slowDown" else max(speed + value * duration, 0.0)

@@ -48,15 +48,18 @@ class TraciController(Ads):
     def in_world(self, world: Any, sensors: Sensors) -> TraciController:
         """The controller in SUMO's world, with the vehicles' sensors in their weather."""
         controller = copy.copy(self)
-        controller._world, controller._sensors = world, sensors
+        controller._world = world
+        controller._sensors = sensors
         return controller
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        world, drivers = self._world, []
+        world = self._world
+        drivers = []
         traffic = SensedTraffic(world, self._sensors, step)
         with substitute_traci():
             for vehicle in range(n):
-                view, controller = TraciView(world, vehicle, traffic), self._create()
+                view = TraciView(world, vehicle, traffic)
+                controller = self._create()
                 if hasattr(controller, "start"):
                     self._call(view, controller.start)
                 drivers.append((view, getattr(controller, "step", controller)))
@@ -69,7 +72,8 @@ class TraciController(Ads):
         return SumoType(mass, accel, decel, max_speed, lag, types.tau)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        initial_trim, accelerations = memory.initial_trim, np.zeros(len(memory.drivers))
+        initial_trim = memory.initial_trim
+        accelerations = np.zeros(len(memory.drivers))
         if initial_trim is None:  # `start` recorded the first step
             initial_trim = trim_at(memory.nominal, seen)
         else:
@@ -77,7 +81,8 @@ class TraciController(Ads):
         with substitute_traci():
             for i, (view, step) in enumerate(memory.drivers):
                 if memory.traffic.is_on_road(i):
-                    view.time, speed = seen.time, float(seen.speed[i])
+                    view.time = seen.time
+                    speed = float(seen.speed[i])
                     self._call(view, step)
                     accelerations[i] = view.commanded_acceleration(speed)
         command = pedals_for(memory.nominal, seen.speed, accelerations, initial_trim)
@@ -139,9 +144,12 @@ class _Substitute(ModuleType):
 
     def __init__(self, real: Value, domain: str = "") -> None:
         super().__init__("traci", real.__doc__)
-        self._real, self._domain = real, domain
+        self._real = real
+        self._domain = domain
         if not domain:
-            self.__path__, self.__file__, self.__spec__ = real.__path__, real.__file__, real.__spec__
+            self.__path__ = real.__path__
+            self.__file__ = real.__file__
+            self.__spec__ = real.__spec__
 
     def __getattr__(self, name: str) -> Value:
         if name == "TraCIException":

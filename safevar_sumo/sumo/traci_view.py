@@ -150,7 +150,8 @@ def refused(domain: str, name: str, problem: str) -> InputError:
     legal = "the body of your script's loop, without this call, as a function step(traci, vehicle_id), with calls of "
     legal += ", ".join(CALLS.get(domain, CALLS))
     if (domain, name) == ("vehicle", "setType"):
-        problem, legal = "makes it another vehicle, but the study's vehicle drives", ", ".join(DRIVER_COMMANDS)
+        problem = "makes it another vehicle, but the study's vehicle drives"
+        legal = ", ".join(DRIVER_COMMANDS)
     return InputError(f"traci.{domain}.{name}".replace("..", "."), problem, legal)
 
 
@@ -173,7 +174,8 @@ class SensedTraffic:
     """
 
     def __init__(self, world: SumoWorld, sensors: Sensors, step: float) -> None:
-        self._world, self._sensors = world, sensors
+        self._world = world
+        self._sensors = sensors
         ages = (sensors.latency / step).tolist()
         # Rounded twice, so that the last bits of a quotient do not decide about half a step:
         self._past = [deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS))) for age in ages]
@@ -185,7 +187,8 @@ class SensedTraffic:
         for domain in SENSED:
             for copy, name in map(copy_and_name, getattr(self._world.api, domain).getIDList()):
                 names[copy, domain].append(name)
-        self.seen, sensors = list[Snapshot](), self._sensors
+        self.seen = list[Snapshot]()
+        sensors = self._sensors
         for copy, (past, reach, scale) in enumerate(zip(self._past, sensors.reach, sensors.scale, strict=True)):
             past.append(self._snapshot(copy, names))
             self.seen.append(_limit_to_range(past[0], float(reach), float(scale)))
@@ -195,7 +198,8 @@ class SensedTraffic:
         return bool(self._past[copy][-1].own)
 
     def _snapshot(self, copy: int, names: Mapping[tuple[int, str], list[str]]) -> Snapshot:
-        api, vut = self._world.api, copied_id(copy, VUT)
+        api = self._world.api
+        vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
         actors = {}
@@ -204,7 +208,8 @@ class SensedTraffic:
             actors[domain] = {
                 actor: {name: get(copied_id(copy, actor)) for name, get in getters} for actor in names[copy, domain]
             }
-        own, leader = actors["vehicle"].pop(VUT), api.vehicle.getLeader(vut, LEADER_RANGE)
+        own = actors["vehicle"].pop(VUT)
+        leader = api.vehicle.getLeader(vut, LEADER_RANGE)
         if not leader or not leader[0]:  # without a leader, libsumo and traci return None or ("", -1)
             return Snapshot(own, actors, None)
         leader_id, gap = leader
@@ -221,8 +226,10 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
         actors[domain] = {}
         for name, values in members.items():
             # A position is that of the front; of a vehicle, the rear may be nearer.
-            length, heading = values["getLength"] if domain == "vehicle" else 0.0, math.radians(values["getAngle"])
-            front, position = values["getPosition"], own["getPosition"]
+            length = values["getLength"] if domain == "vehicle" else 0.0
+            heading = math.radians(values["getAngle"])
+            front = values["getPosition"]
+            position = own["getPosition"]
             rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
             if min(math.dist(position, front), math.dist(position, rear)) <= reach:
                 actors[domain][name] = values if scale == 1 else {**values, **_scaled(own, values, scale)}
@@ -242,8 +249,12 @@ class TraciView:
     """TraCI's functions for one vehicle, with the ids of the traffic file."""
 
     def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic) -> None:
-        self._api, self._copy, self._vut, self._traffic = world.api, copy, copied_id(copy, VUT), traffic
-        self._step, self._commands = world.step_length, CommandedSpeed(world.step_length)
+        self._api = world.api
+        self._copy = copy
+        self._vut = copied_id(copy, VUT)
+        self._traffic = traffic
+        self._step = world.step_length
+        self._commands = CommandedSpeed(world.step_length)
         self._steps_of_action = round(self._api.vehicle.getActionStepLength(self._vut) / self._step)
         self._last_speed = 0.0
         self._subscriptions: dict[tuple[str, str], Variables] = {}
@@ -253,8 +264,12 @@ class TraciView:
 
     def commanded_acceleration(self, speed: float) -> float:
         """The acceleration by the commands and SUMO's driver at a speed [m/s] of the vehicle [m/s^2]."""
-        vehicle, vut, last_speed, self._last_speed = self._api.vehicle, self._vut, self._last_speed, speed
-        accel, decel = vehicle.getAccel(vut), vehicle.getDecel(vut)
+        vehicle = self._api.vehicle
+        vut = self._vut
+        last_speed = self._last_speed
+        self._last_speed = speed
+        accel = vehicle.getAccel(vut)
+        decel = vehicle.getDecel(vut)
         sumo_speed = 2 * speed - last_speed  # between two actions the driver keeps his acceleration
         if round(self.time / self._step) % self._steps_of_action == 0:
             sumo_speed = self._speed_of_sumo(speed, accel, decel)
@@ -268,7 +283,8 @@ class TraciView:
         sumo_speed = min(speed + accel * self._step, max(limit, speed - decel * self._step))
         if leader is not None:
             name, gap = leader
-            id_, leader_speed = copied_id(self._copy, name), actors["vehicle"][name]["getSpeed"]
+            id_ = copied_id(self._copy, name)
+            leader_speed = actors["vehicle"][name]["getSpeed"]
             follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getApparentDecel(id_), id_)
             sumo_speed = min(sumo_speed, follow_speed)
         return float(sumo_speed)
@@ -336,7 +352,8 @@ class TraciView:
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
         """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping distance."""
-        vehicle, vut = self._api.vehicle, self._vut
+        vehicle = self._api.vehicle
+        vut = self._vut
         dist = dist or vehicle.getSpeed(vut) ** 2 / (2 * vehicle.getDecel(vut))
         leader = self._traffic.seen[self._copy].leader
         return leader if leader and leader[1] <= dist else None

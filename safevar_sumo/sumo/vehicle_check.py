@@ -19,7 +19,8 @@ MIN_HEADWAY = 0.5
 
 def check_units(study: Study, vehicle: Vehicle) -> None:
     """Refuse characteristics that the vehicle does not have, in other units, or missing."""
-    table, units = study.vehicle.characteristics, vehicle.UNITS
+    table = study.vehicle.characteristics
+    units = vehicle.UNITS
     if (
         "actuatorLag" in units
         and "tau" in table

@@ -33,7 +33,8 @@ def drive_again(
     Returns the quantities that `COMPARED` names, shape (T, N), and the `collision` speeds [m/s], NaN without a
     collision, shape (T, N). `watch` is called with SUMO's world at every sample.
     """
-    trace, n = runs.trace, len(runs.outcome)
+    trace = runs.trace
+    n = len(runs.outcome)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
     fleet, vehicles = system.at_encounters(settings)
     point = fleet.points[0]
@@ -41,7 +42,8 @@ def drive_again(
     with user_errors(system.source), open_points_world(system, settings, stage) as world:
         _, _, motion = enter(fleet, vehicles, world)
         observer = observer_of(point.scenario, world, stage)
-        is_open, frame = np.ones(n, dtype=bool), world.frame
+        is_open = np.ones(n, dtype=bool)
+        frame = world.frame
         contacts = Contacts(n, np.full(n, point.scenario.is_hit_in_front))
         for sample in range(len(trace.time)):
             watch(world)
@@ -71,7 +73,9 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
     points = system.points
     if system.rater is not None:
         points = tuple(points[k] for k in np.linspace(0, len(points) - 1, RATED_POINTS).astype(int))
-    reduced, remark, size = replace(system, matrix=points, rater=None), "", batch_size(system, Engine.RECORDED)
+    reduced = replace(system, matrix=points, rater=None)
+    remark = ""
+    size = batch_size(system, Engine.RECORDED)
     for batch in (settings[start : start + size] for start in range(0, len(settings), size)):
         for result in chain.from_iterable(simulate_groups(reduced, batch)):
             try:
@@ -83,7 +87,8 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
 
 def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
     """Verify runs at the only point; runs of similar length together, so that few copies wait for the longest."""
-    order, size = np.argsort(np.count_nonzero(runs.trace.active, axis=0)), batch_size(system, Engine.LIBSUMO)
+    order = np.argsort(np.count_nonzero(runs.trace.active, axis=0))
+    size = batch_size(system, Engine.LIBSUMO)
     for rows in (order[start : start + size] for start in range(0, len(order), size)):
         chosen = runs.of(rows)
         _compare(system, settings[rows], chosen, drive_again(system, settings[rows], chosen))

@@ -40,7 +40,8 @@ class SumoWorld:
     """N copies of a network in a running simulation, created by `open_world`. Arrays have shape (N,) or (N, 2)."""
 
     def __init__(self, api: Api, n: int) -> None:
-        self.api, self.n = api, n
+        self.api = api
+        self.n = n
         self.step_length: float = api.simulation.getDeltaT()
         self._set_speed, self._get_speed, self._get_position = (
             function_of(api, "vehicle", name) for name in ("setSpeed", "getSpeed", "getPosition")
@@ -49,7 +50,8 @@ class SumoWorld:
         self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
         self.driving = dict(self._copy_of)
         """Copies whose vehicle under test is on the road, by the vehicle's id."""
-        self._speeds, self._fronts = np.zeros(n), np.zeros((n, 2))
+        self._speeds = np.zeros(n)
+        self._fronts = np.zeros((n, 2))
         """Speeds and fronts of the vehicles under test; the last ones of those that have left the road."""
         self._persons: dict[str, FloatArray] = {}
         """Places of persons by actor; beside vehicles that have left the road the last ones, if a person has left, too.
@@ -79,7 +81,9 @@ class SumoWorld:
         SimulationError
             If SUMO cannot insert a vehicle under test.
         """
-        vehicletype, ids, least = self.api.vehicletype, self.ids(VUT), np.full(self.n, INSERTION_DECELERATION)
+        vehicletype = self.api.vehicletype
+        ids = self.ids(VUT)
+        least = np.full(self.n, INSERTION_DECELERATION)
         decelerations = (least if types is None else types.decel,) * 2
         if keeps_drivers:
             planned = [(vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in ids]
@@ -143,7 +147,8 @@ class SumoWorld:
         return self._motion(is_open)
 
     def _motion(self, is_open: BoolArray) -> Motion:
-        self._speeds, self._fronts = self._speeds.copy(), self._fronts.copy()
+        self._speeds = self._speeds.copy()
+        self._fronts = self._fronts.copy()
         copies = [*self.driving.values()]
         self._speeds[copies] = [*map(self._get_speed, self.driving)]
         self._fronts[copies] = [*map(self._get_position, self.driving)]
@@ -155,7 +160,8 @@ class SumoWorld:
         On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under
         test may be either.
         """
-        self._struck_ids, speeds = {}, {}
+        self._struck_ids = {}
+        speeds = {}
         for collision in self.api.simulation.getCollisions():
             pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
             if collision.type == "junction":
@@ -172,7 +178,8 @@ class SumoWorld:
         )
 
     def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        own_ids, wanted = self.ids(VUT), {*vehicles}
+        own_ids = self.ids(VUT)
+        wanted = {*vehicles}
         ids = [id_ for domain in (self.api.vehicle, self.api.person) for id_ in domain.getIDList()]
         pairs = [(copy, id_) for id_ in ids if (copy := copy_and_name(id_)[0]) in wanted and id_ != own_ids[copy]]
         copies = [copy for copy, _ in pairs]
@@ -181,7 +188,8 @@ class SumoWorld:
 
     def _body_of(self, id_: str) -> Body:
         domain, (_, length, width) = self._domain_of(id_), self.actor_size(id_)
-        front, along = np.array(domain.getPosition(id_)), direction_of(domain.getAngle(id_))
+        front = np.array(domain.getPosition(id_))
+        along = direction_of(domain.getAngle(id_))
         return Body.behind(front, along, length, width, domain.getSpeed(id_))
 
     def _domain_of(self, id_: str) -> Api:
@@ -197,7 +205,8 @@ class SumoWorld:
         return np.array([*map(self._get_position, self.ids(actor))])
 
     def person_positions(self, actor: str) -> FloatArray:
-        ids, copies = self.ids(actor), [*self.driving.values()]
+        ids = self.ids(actor)
+        copies = [*self.driving.values()]
         try:
             positions = np.array([*map(self._get_person_position, ids)])
         except self.api.TraCIException:  # one has left the road
@@ -247,7 +256,8 @@ class SumoWorld:
             self.api.person.setSpeed(id_, value)
 
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
-        api, ids = self.api.person, self.ids(person)
+        api = self.api.person
+        ids = self.ids(person)
         for id_ in ids if copies is None else (ids[copy] for copy in copies):
             back = [api.getRoadID(id_), api.getEdges(id_)[0]]
             api.appendWalkingStage(id_, back, 0.0, speed=api.getSpeed(id_))

@@ -69,7 +69,8 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
     braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)
     # With time reversed, decelerations are accelerations:
-    coasting, braking = _accelerations(coasting_speeds[::-1]), _accelerations(braking_speeds[::-1])
+    coasting = _accelerations(coasting_speeds[::-1])
+    braking = _accelerations(braking_speeds[::-1])
     tables = PedalTables(
         speeds=SPEEDS,
         full_throttle=_accelerations(launch),

@@ -106,7 +106,8 @@ class DelayedSignal(NamedTuple):
         InputError
             If a delay is longer than any run.
         """
-        longest, age = float(np.max(delay)), delay / step
+        longest = float(np.max(delay))
+        age = delay / step
         if not longest <= LONGEST_DELAY:
             raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s")
         whole_steps = np.floor(age)
@@ -119,7 +120,8 @@ class DelayedSignal(NamedTuple):
 
     def delayed(self) -> FloatArray:
         """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (..., N)."""
-        newer, older = self.samples.take(self.newer), self.samples[1:].take(self.newer)
+        newer = self.samples.take(self.newer)
+        older = self.samples[1:].take(self.newer)
         with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
             signal = newer * (1 - self.share) + older * self.share
         np.copyto(signal, newer, where=np.isnan(signal))
@@ -273,7 +275,8 @@ class Vehicle:
 
     def at_start(self, prepared: Prepared, speed: FloatArray) -> State:
         """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
-        rest, is_rolling = self.at_rest(prepared), speed > 0
+        rest = self.at_rest(prepared)
+        is_rolling = speed > 0
         if not is_rolling.any():
             return rest
         steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))  # any speed for those that stand

@@ -175,7 +175,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             standstill=np.zeros_like(radius),
         )
         rows = np.array(constants)
-        car, pull = Car(*rows), c["mass"] * slope.back
+        car = Car(*rows)
+        pull = c["mass"] * slope.back
         creep_speed, _ = self._rim_at(car, np.abs(pull), np.zeros_like(radius))
         rows[Car._fields.index("standstill")] = HOLD_SPEED + creep_speed  # `car` has it, too
         return _Prepared(
@@ -214,7 +215,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
-        car, mass = prepared.car, prepared.mass
+        car = prepared.car
+        mass = prepared.mass
         drive = self.engine_torque * TORQUE_PEAK * OVERALL_RATIOS[1] / car.radius
         lag = prepared.law.substep * prepared.substeps + 1 / self.brake_rise
         return SumoType(
@@ -238,7 +240,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """
         from safevar_sumo.vehicles.carla_step import CarlaState, full_torque
 
-        p, law = prepared.car, prepared.law
+        p = prepared.car
+        law = prepared.law
         rim, force = self._rim_at(p, prepared.pull, speed)
         wheel_speed = rim / p.radius
         resistance = p.wheel_damping * wheel_speed + p.radius * force
@@ -295,7 +298,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         from safevar_sumo.vehicles.compiled import is_compiled
 
         def step() -> None:
-            cars, states = np.ones((len(Car._fields), 1)), np.zeros((len(CarlaState._fields), 1))
+            cars = np.ones((len(Car._fields), 1))
+            states = np.zeros((len(CarlaState._fields), 1))
             advance(cars, self._law(1.0, 1.0), states, np.zeros((2, 1)), 1)
 
         if only_load:

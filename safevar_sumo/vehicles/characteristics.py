@@ -90,8 +90,10 @@ class Characteristic:
 
     def rounded(self, value: float, *, upwards: bool) -> float:
         """A limit rounded to the digits of `text`, upwards or downwards; never beyond the original."""
-        scaled, original = value * 10**self.digits, self.original
-        up, down = math.ceil(scaled - ROUNDING), math.floor(scaled + ROUNDING)
+        scaled = value * 10**self.digits
+        original = self.original
+        up = math.ceil(scaled - ROUNDING)
+        down = math.floor(scaled + ROUNDING)
         rounded = (up if upwards else down) / 10**self.digits
         is_beyond = rounded > original >= value if upwards else rounded < original <= value
         return original if is_beyond else rounded

@@ -152,7 +152,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         slope: Slope = LEVEL,
         water: float | FloatArray = 0.0,
     ) -> _Prepared:
-        c, substep = characteristics, step / SUBSTEPS
+        c = characteristics
+        substep = step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
         prepared = _Prepared(
             step=np.array(step),
@@ -193,7 +194,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
-        p, zeros = prepared, np.zeros_like(prepared.mass)
+        p = prepared
+        zeros = np.zeros_like(prepared.mass)
         first_ratio = zeros + GEAR_RATIOS[0]
         return LgsvlState(
             speed=zeros,
@@ -215,7 +217,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
         The vehicle keeps its lane without error; the gearbox has shifted up to the gear for this speed.
         """
-        p, zeros = prepared, np.zeros_like(prepared.mass)
+        p = prepared
+        zeros = np.zeros_like(prepared.mass)
         force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.slope_deceleration
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius

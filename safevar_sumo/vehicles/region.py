@@ -41,7 +41,8 @@ class _Bounds(NamedTuple):
     @classmethod
     def of(cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet) -> _Bounds:
         """The computation of a study's constraint."""
-        table, widths = study.domains, characteristics.upper - characteristics.lower
+        table = study.domains
+        widths = characteristics.upper - characteristics.lower
         weights = tuple((characteristics.names.index(name), weight) for name, weight in constraint.sum.items())
         return cls(
             constraint,
@@ -119,7 +120,8 @@ class FeasibleRegion:
         """Settings moved towards the original until they are feasible, shape (N, n); if `filtered`, feasible after the
         filter.
         """
-        repaired, original = settings.copy(), self.characteristics.original
+        repaired = settings.copy()
+        original = self.characteristics.original
         infeasible = np.flatnonzero(~self._are_accepted(settings, filtered))
         for share in np.arange(N_REPAIR_SHARES - 1, -1, -1) / N_REPAIR_SHARES:
             if not len(infeasible):
@@ -132,7 +134,8 @@ class FeasibleRegion:
         """The first `number` feasible settings that `draw` draws, shape (number, n); if `filtered`, feasible after the
         filter. They are fewer if `REJECTIONS` draws for each do not suffice.
         """
-        batches, draws = [np.zeros((0, len(self.characteristics)))], 0
+        batches = [np.zeros((0, len(self.characteristics)))]
+        draws = 0
         while (shortage := number - sum(map(len, batches))) and draws < REJECTIONS * number:
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))  # as many as all draws before
             draws += len(settings)

@@ -83,7 +83,8 @@ class SensingVehicle(Vehicle):
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
         """The steady state: the pedals balance the slope, the only resistance."""
-        rest, back = self.at_rest(prepared), prepared.slope.back
+        rest = self.at_rest(prepared)
+        back = prepared.slope.back
         throttle, brake = (
             np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / prepared.drive, -back / prepared.brake)
         )
@@ -383,7 +384,8 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         return lifted_friction(prepared.grip, prepared.lift, speed)
 
     def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
-        p, ones = prepared, np.ones_like(prepared.mass)
+        p = prepared
+        ones = np.ones_like(prepared.mass)
         grip = self.friction(p, 0 * ones)
         limits = np.minimum(p.drive, grip * p.slope.down), self._deceleration(p, ones, grip)
         return SumoType(p.mass, *limits, self.max_speed * ones, p.brake_delay + p.step)
@@ -398,7 +400,8 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 
     def _deceleration(self, p: _PreparedWorn, pedal: FloatArray, grip: FloatArray) -> FloatArray:
         """Deceleration by the brakes of both axles together [m/s^2]; `grip` is the friction coefficient now."""
-        demand, grip_limit = pedal * p.brake, grip * p.slope.down
+        demand = pedal * p.brake
+        grip_limit = grip * p.slope.down
         lever = grip * (self.centre_height / self.wheelbase)
         rear_limit = (self.front_share * demand + grip_limit * p.rear_load) / (1 + lever)
         front_limit = ((1 - self.front_share) * demand + grip_limit * p.front_load) / (1 - lever)

@@ -62,7 +62,8 @@ def name(request: pytest.FixtureRequest) -> str:
 
 def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> FloatArray:
     """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals are."""
-    memory, pedals = ads.start(len(speed), nominal, STEP), []
+    memory = ads.start(len(speed), nominal, STEP)
+    pedals = []
     for step in range(80):
         command, memory = ads.drive(seen(step * STEP, speed, gap - speed * step * STEP, lateral_speed=1.8), memory)
         pedals.append(np.stack(command))
@@ -98,7 +99,8 @@ class Timid(ScalarAds):
     """Brakes in front of everything, and counts its calls."""
 
     def __init__(self, distance: float = 10.0) -> None:
-        self.distance, self.calls = distance, 0
+        self.distance = distance
+        self.calls = 0
 
     def drive(self, seen: Observation) -> tuple[float, float]:
         self.calls += 1
@@ -106,7 +108,8 @@ class Timid(ScalarAds):
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
-    ads, nominal = PerVehicleAds(Timid, UserCode("it.toml", "ads")), SYSTEMS["krauss"].nominal
+    ads = PerVehicleAds(Timid, UserCode("it.toml", "ads"))
+    nominal = SYSTEMS["krauss"].nominal
     memory = ads.start(3, nominal, STEP)
     gap = np.array([5.0, 50.0, 50.0])
     for expected in ([0.0, 0.1, 0.1], [0.0, 0.2, 0.2]):
@@ -226,7 +229,8 @@ def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_plac
     lateral: float, speed: float, gap: float
 ) -> None:
     ads = world_on_rails(brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0)
-    short, past = max(-0.4 - lateral, 0.0), max(lateral + 0.4, 0.0)
+    short = max(-0.4 - lateral, 0.0)
+    past = max(lateral + 0.4, 0.0)
     limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
     assume(abs(gap - limit) > 1e-9)
     now = seen(1.0, speed, gap, lateral, 0.9)
@@ -241,7 +245,8 @@ def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_plac
 
 def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> None:
     ads = world_on_rails(first_command=0.2, latency=0.1)
-    memory, throttle = ads.start(1, KNOWN, STEP), []
+    memory = ads.start(1, KNOWN, STEP)
+    throttle = []
     for k in range(9):
         command, memory = ads.drive(seen(k * STEP, 0.0, FAR), memory)
         throttle.append(float(command.throttle[0]))
@@ -292,7 +297,8 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
 
 def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     speed = np.repeat([30, 40, 60], 2) / 3.6
-    deceleration, jerk = np.tile([3.0, 2.5], 3), np.tile([3.0, 1.5], 3)
+    deceleration = np.tile([3.0, 2.5], 3)
+    jerk = np.tile([3.0, 1.5], 3)
     ads = copy.copy(AutowareAeb())
     force_setattr(ads, "target_acceleration", deceleration)
     force_setattr(ads, "target_jerk", jerk)
@@ -302,12 +308,14 @@ def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     stop = speed * ads.command_delay + while_ramp + after**2 / (2 * deceleration)
     margins = speed * ads.t_response + speed**2 / (2 * ads.a_ego_min) + ads.longitudinal_offset_margin - stop
     assert margins == pytest.approx([3.6, -1.3, 4.5, -3.2, 6.1, -8.5], abs=0.06)
-    gap, step = ads.distance(speed, np.zeros(6)) - 1e-9, 0.001
+    gap = ads.distance(speed, np.zeros(6)) - 1e-9
+    step = 0.001
     memory = ads.start(6, KNOWN, step)
     for sample in range(12_000):
         now = seen(sample * step, speed, gap, throttle=COASTING / (FULL + COASTING))
         command, memory = ads.drive(now, memory)
         pull = command.throttle * (FULL + COASTING) - COASTING - command.brake * BRAKING
         following = np.maximum(speed + pull * step, 0.0)
-        gap, speed = gap - (speed + following) / 2 * step, following
+        gap = gap - (speed + following) / 2 * step
+        speed = following
     assert gap == pytest.approx(margins, abs=0.01)

@@ -94,7 +94,9 @@ def small(in_tmp: Path) -> Make:
 
 def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     """Commands of two vehicles, the second one 10 m farther, shape (T, 2, 2)."""
-    memory, commands, one = system.ads.start(2, NOMINAL, step), [], np.ones(2)
+    memory = system.ads.start(2, NOMINAL, step)
+    commands = []
+    one = np.ones(2)
     for sample, gap in enumerate(gaps):
         seen = Observation(sample * step, 10 * one, gap + np.array([0.0, 10.0]), 10 * one, one, one, 1.0)
         command, memory = system.ads.drive(seen, memory)
@@ -137,7 +139,8 @@ class Law(Ads):
     law = assemble(load_study("law.toml"), "law.toml")
     members = law.characteristics
     settings = np.random.default_rng(5).uniform(members.lower, members.upper, (12, len(members)))
-    expected, results = evaluate(law, settings), evaluate(fmu, settings)
+    expected = evaluate(law, settings)
+    results = evaluate(fmu, settings)
     np.testing.assert_array_equal(results.outcome, expected.outcome)
     np.testing.assert_array_equal(results.f_safe, expected.f_safe)
     assert len({*expected.outcome}) > 1

@@ -72,7 +72,8 @@ def sumo_accelerations(sumo: Any, model: str, net_of: float) -> np.ndarray:
 
 
 def test_idm_is_sumos(sumo: Any) -> None:
-    expected, accelerations = sumo_accelerations(sumo, "IDM", 2.5), Idm().acceleration_at(GAPS, SPEEDS, LEADERS)
+    expected = sumo_accelerations(sumo, "IDM", 2.5)
+    accelerations = Idm().acceleration_at(GAPS, SPEEDS, LEADERS)
     stops = SPEEDS + accelerations * STEP <= 0  # nobody drives backwards
     assert accelerations[~stops] == pytest.approx(expected[~stops], abs=1e-6)
     assert expected[stops] == pytest.approx(-SPEEDS[stops] / STEP, abs=1e-6)
@@ -80,7 +81,8 @@ def test_idm_is_sumos(sumo: Any) -> None:
 
 
 def test_acc_is_sumos(sumo: Any) -> None:
-    expected, accelerations = sumo_accelerations(sumo, "ACC", 2.5), Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
+    expected = sumo_accelerations(sumo, "ACC", 2.5)
+    accelerations = Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
     compared = (SPEEDS + accelerations * STEP > 0) & (np.abs(expected - accelerations) < 1e-6)
     braked = expected < accelerations - 1e-6  # in danger, SUMO's emergency override brakes harder than the control law
     assert np.all(compared | braked | (SPEEDS + accelerations * STEP <= 0))
@@ -91,7 +93,9 @@ def braking(
     driver: Any, speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0, lateral_speed: float = 0.0
 ) -> tuple[float, np.ndarray]:
     """Gap at which a driver first brakes, at constant speed towards an obstacle, and the decelerations from then on."""
-    memory, first, decelerations = driver.start(1, KNOWN, STEP), np.nan, []
+    memory = driver.start(1, KNOWN, STEP)
+    first = np.nan
+    decelerations = []
     for k in range(400):
         now = gap - (speed - leader) * k * STEP
         if now <= 0:
@@ -119,15 +123,19 @@ def test_who_reacts_releases_the_accelerator_and_brakes_by_what_is_missing(drive
     """The vehicle coasts with 1 m/s^2; the tables are those of a gear in which the original coasts with 3 m/s^2."""
     first_gear = KNOWN.tables()._replace(coasting=np.full(len(TABLE), 3.0))
     memory = driver.start(1, KNOWN._replace(tables=lambda: first_gear), STEP)
-    speed, gap, commands = 12.0, 40.0, []
+    speed = 12.0
+    gap = 40.0
+    commands = []
     for k in range(80):
         command, memory = driver.drive(seen(k * STEP, speed, gap, throttle=0.25), memory)
         commands.append((float(command.throttle[0]), float(command.brake[0])))
-        gap, speed = gap - speed * STEP, max(speed - (0.0 if commands[-1][0] else 1 + 10 * commands[-1][1]) * STEP, 0.0)
+        gap = gap - speed * STEP
+        speed = max(speed - (0.0 if commands[-1][0] else 1 + 10 * commands[-1][1]) * STEP, 0.0)
         if not speed or gap <= 0:
             break
     throttle, brake = np.array(commands).T
-    released, braking = np.argmax(throttle == 0), np.argmax(brake > 0)
+    released = np.argmax(throttle == 0)
+    braking = np.argmax(brake > 0)
     assert released > 0
     assert (braking - released) * STEP == pytest.approx(driver.reaction_time, abs=2 * STEP)
     assert not throttle[released:].any()
@@ -179,7 +187,8 @@ def test_the_safe_distance_of_rss_allows_for_what_is_gained_while_reacting() -> 
 
 def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     """v = 20, u = 10: d_safe = 15 + 50 - 50/7 + 2 = 59.857, d_unsafe = 15 + 33.333 - 7.143 = 41.190, at gap - 2."""
-    model, one = FuzzySafety(), np.ones(1)
+    model = FuzzySafety()
+    one = np.ones(1)
     for gap, pfs in ((62.0, 0.0), (43.1, 1.0), (52.523809, 0.5)):
         assert model.proactive_metric(gap * one, 20 * one, 10 * one)[0] == pytest.approx(pfs, abs=1e-3)
     # a = 0: v' = 20; closing = 7.5, d_safe = 7.5 + 12.5 = 20, d_unsafe = 7.5 + 8.333 = 15.833
@@ -201,7 +210,8 @@ def by_the_rule(
     deceleration rises at 12.65 m/s^3 up to 0.774 g; each of them `delay` later.
     """
     t = np.arange(0.0, 60.0, 1e-3)
-    hardest, jerk = 0.774 * 9.81, 12.65
+    hardest = 0.774 * 9.81
+    jerk = 12.65
     rise = (hardest - lets_go) / jerk
     reacting, braking, held = (np.maximum(t - delay - begin, 0.0) for begin in (0.4, 1.15, 1.15 + rise))
     rising = np.minimum(braking, rise)
@@ -219,8 +229,11 @@ def follow(driver: Any, leader: FloatArray, headway: float) -> tuple[FloatArray,
     """A driver in a vehicle without delays behind a leader with these speeds [m/s], from the same speed: his gaps [m]
     and speeds up to a collision, and the closing speed at the end.
     """
-    memory, v, gap = driver.start(1, KNOWN, STEP), leader[0], leader[0] * headway
-    gaps, speeds = [gap], [v]
+    memory = driver.start(1, KNOWN, STEP)
+    v = leader[0]
+    gap = leader[0] * headway
+    gaps = [gap]
+    speeds = [v]
     for k, (u, next_u) in enumerate(pairwise(leader)):
         command, memory = driver.drive(seen(k * STEP, v, gap, leader=u), memory)
         next_v = max(v + (3 * float(command.throttle[0]) - 10 * float(command.brake[0])) * STEP, 0.0)
@@ -304,7 +317,8 @@ def test_a_leader_who_drives_on_after_gentle_braking_is_a_danger_at_a_ttc_of_two
 @pytest.mark.parametrize("speed", range(30, 80, 7))
 def test_below_5_two_conventions_differ(speed: int) -> None:
     """CCRb: 4 m/s^2 from a headway of 1 s. By the letter nothing is a danger; any braking is one for the other."""
-    letter, anyone = CompetentDriver(lets_go=0.0), CompetentDriver(lets_go=0.0, leader_braking=0.5)
+    letter = CompetentDriver(lets_go=0.0)
+    anyone = CompetentDriver(lets_go=0.0, leader_braking=0.5)
     assert behind_a_braking_leader(letter, speed / 3.6, 1.0, 4.0) < 0
     assert behind_a_braking_leader(letter, speed / 3.6, 1.0, 5.0) < 0, "which does not exceed 5"
     assert behind_a_braking_leader(anyone, speed / 3.6, 1.0, 4.0) > 0

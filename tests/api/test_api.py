@@ -46,7 +46,8 @@ def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) 
 
 def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
     weather = {"name": "wet", "road_friction": 0.5, "visibility": 1.0, "recognition_delay": 0.0}
-    search, plain = {"runs": np.int64(2), "seed": np.array(7)}, {"runs": 2, "seed": 7}
+    search = {"runs": np.int64(2), "seed": np.array(7)}
+    plain = {"runs": 2, "seed": 7}
     theirs = {**weather, "road_friction": np.float64(0.5), "visibility": np.array(1.0)}
     assert sv.load_study("smoke", weather=theirs, search=search) == sv.load_study(
         "smoke", weather=weather, search=plain

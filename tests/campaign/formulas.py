@@ -81,7 +81,8 @@ def carried_out(
     progress: Progress = show_no_progress,
 ) -> Campaign:
     """Carry out a study whose results are not verified in SUMO."""
-    pool, warnings = pool or FormulaPool(), list[str]()
+    pool = pool or FormulaPool()
+    warnings = list[str]()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "evaluate_batch", pool.evaluate)
         return run_campaign(

@@ -50,7 +50,8 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: St
 
 def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
     large = with_search(study, population=40, evaluations=400, runs=10, algorithms=["rs"])
-    together, alone = FormulaPool(workers=2), FormulaPool(workers=2)
+    together = FormulaPool(workers=2)
+    alone = FormulaPool(workers=2)
     carried_out(large, tmp_path / "together", together)
     carried_out(large, tmp_path / "alone", alone, keys=[RunKey("rs", 3)])
     assert np.mean(together.sizes[1:]) > 3 * large.search.population
@@ -102,19 +103,22 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     study: Study, tmp_path: Path, budgets: tuple[int, int]
 ) -> None:
     first, second = (with_search(study, evaluations=budget, runs=1) for budget in budgets)
-    before, after = FormulaPool(), FormulaPool()
+    before = FormulaPool()
+    after = FormulaPool()
     carried_out(first, tmp_path / "out", before)
     carried_out(second, tmp_path / "out", after)
     carried_out(second, tmp_path / "fresh")
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
-    results, fresh = load_runs(tmp_path / "out"), load_runs(tmp_path / "fresh")
+    results = load_runs(tmp_path / "out")
+    fresh = load_runs(tmp_path / "fresh")
     pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
     assert not {*before.simulated[1:]} & {*after.simulated[1:]}, "the original apart"
     carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 
 
 def test_progress_has_its_total_from_the_start_and_begins_with_the_journals(study: Study, tmp_path: Path) -> None:
-    study, shown = with_search(study, algorithms=["rs"]), list[tuple[str, int, int]]()
+    study = with_search(study, algorithms=["rs"])
+    shown = list[tuple[str, int, int]]()
     carried_out(study, tmp_path, keys=[RunKey("rs", 0)])
     carried_out(study, tmp_path, progress=lambda *values: shown.append(values))
     assert shown[0] == ("smoke: 1/2 runs, evaluations", 100, 200)
@@ -150,7 +154,8 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
 
 @pytest.mark.parametrize("workers", [1, 4])
 def test_the_speed_of_a_study_is_that_of_all_workers(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    pool, seconds = FormulaPool(workers), iter([10.0, 14.0])
+    pool = FormulaPool(workers)
+    seconds = iter([10.0, 14.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
     monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
     assert measure_speed(Task(study=load_study("smoke"), batch_size=200), pool) == workers * 200 / 4
@@ -211,7 +216,8 @@ def functions_on_the_stack(frame: FrameType | None) -> list[tuple[str, str]]:
     """The package's functions on the stack, up to the campaign, which a worker may carry out elsewhere."""
     functions = []
     while frame is not None:
-        file, name = frame.f_code.co_filename, frame.f_code.co_qualname
+        file = frame.f_code.co_filename
+        name = frame.f_code.co_qualname
         if file.startswith(PACKAGE) and not frame.f_code.co_name.startswith("<"):
             functions.append((file.removeprefix(PACKAGE), name))
         frame = frame.f_back
@@ -233,7 +239,8 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         if event == "call":
-            file, name = frame.f_code.co_filename, frame.f_code.co_qualname
+            file = frame.f_code.co_filename
+            name = frame.f_code.co_qualname
             if file.startswith(PACKAGE) and name in ENDS.get(file.removeprefix(PACKAGE), ()):
                 functions = functions_on_the_stack(frame)
                 names = [name for _, name in functions]

@@ -190,7 +190,10 @@ class Disk:
     """Lets the `fails`-th step on the disk fail, and with `stays` all after it."""
 
     def __init__(self, fails: int, kind: int, *, stays: bool = False) -> None:
-        self._fails, self._kind, self._stays, self.steps = fails, kind, stays, 0
+        self._fails = fails
+        self._kind = kind
+        self._stays = stays
+        self.steps = 0
 
     def step(self) -> bool:
         """One step; raises if it fails, or tells that it is to be done by half."""
@@ -217,7 +220,8 @@ class File:
     """A file whose steps may fail."""
 
     def __init__(self, inner: Any, disk: Disk) -> None:
-        self._inner, self._disk = inner, disk
+        self._inner = inner
+        self._disk = disk
 
     def write(self, content: Any) -> int:
         half = self._disk.step() and isinstance(content, memoryview) and len(content) > 1
@@ -265,7 +269,8 @@ def broken(study: Study, path: Path, disk: Disk) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("stays", [False, True])
 def test_every_step_on_the_disk_may_fail(stays: bool, tiny: Study, tmp_path: Path) -> None:
-    expected, errors = carried_out(tiny, tmp_path / "whole"), 0
+    expected = carried_out(tiny, tmp_path / "whole")
+    errors = 0
     for number in range(1, MOST_STEPS):
         disk = Disk(number, KINDS[number % len(KINDS)], stays=stays)
         out = tmp_path / str(number)

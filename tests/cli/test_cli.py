@@ -138,7 +138,8 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     hit, stop = sweep["tables"]["sweep"]["rows"]
     assert (hit["outcome"], hit["gap"]) == ("collision", 0), "the vehicle is 4.7 m long"
     assert (stop["outcome"], stop["gap"]) == ("stopped", pytest.approx(stop["safety_degree"] - 4.7))
-    lead, gap = simulate("native", "--set", "decel=8").stdout, stop["gap"]
+    lead = simulate("native", "--set", "decel=8").stdout
+    gap = stop["gap"]
     assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): less safe" in lead
     assert f"gap {gap:.2f} against " in lead
     remark = sweep["tables"]["remarks"]["rows"][-1]["remark"]

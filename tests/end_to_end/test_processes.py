@@ -30,7 +30,8 @@ OUT = Path("out")
 
 @SLOW
 def test_killed_six_times_at_random_moments_and_resumed(whole: Path) -> None:
-    moments, out = random.Random(4), Path("out")
+    moments = random.Random(4)
+    out = Path("out")
     for _ in range(6):
         before = written(out)
         process = started("study", "small.toml", "--out", "out", "--jobs", "1", "--batch", "1")

@@ -220,7 +220,8 @@ def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_sec
 def test_rms_agrees_with_scipys_filters() -> None:
     rng = np.random.default_rng(1)
     speed = np.cumsum(rng.normal(size=(200, 3)), axis=0)
-    high, corner = 2 * np.pi * 0.4, 2 * np.pi * 2
+    high = 2 * np.pi * 0.4
+    corner = 2 * np.pi * 2
     first = signal.bilinear(*signal.butter(2, high, "high", analog=True), fs=1 / SAMPLED)
     second = signal.bilinear([corner, corner**2], [1, corner / 0.63, corner**2], fs=1 / SAMPLED)
     expected = np.diff(speed, axis=0) / SAMPLED

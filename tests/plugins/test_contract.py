@@ -145,7 +145,8 @@ def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder
 
 def test_ctrl_c_passes(mine: Mine) -> None:
     pressed = "    def drive(self, seen):\n        import signal\n        signal.raise_signal(signal.SIGINT)\n"
-    ctrl_c, handler = mine(SCALAR + pressed), signal.signal(signal.SIGINT, signal.default_int_handler)
+    ctrl_c = mine(SCALAR + pressed)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
             evaluate(ctrl_c, original_of(ctrl_c))
@@ -271,7 +272,8 @@ def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:
     """The package divides by closing speeds of 0."""
     strict = "import numpy as np\n\nnp.seterr(all='raise')\n" + CONSTANT.format(0.2)
     strict = strict.replace("def drive(self, seen):\n", "def drive(self, seen):\n        np.seterr(all='raise')\n")
-    before, expected = np.geterr(), evaluate(system := mine(CONSTANT.format(0.2)), original_of(system))
+    before = np.geterr()
+    expected = evaluate(system := mine(CONSTANT.format(0.2)), original_of(system))
     found = evaluate(mine(strict), original_of(system))
     assert not [*differences(expected.results, found.results)]
     assert np.geterr() == before

@@ -148,7 +148,9 @@ class Diverges(Vehicle):
     """The heavy vehicle has this speed from so many steps on."""
 
     def __init__(self, speed: float, steps: int = LENGTH) -> None:
-        self._inner, self.speed, self.steps = NATIVE.vehicle, speed, steps
+        self._inner = NATIVE.vehicle
+        self.speed = speed
+        self.steps = steps
 
     UNITS = NATIVE.vehicle.UNITS
     sumo_type, at_rest, at_speed, sense = (
@@ -156,7 +158,8 @@ class Diverges(Vehicle):
     )
 
     def prepare(self, characteristics: Any, *arguments: Any) -> Any:
-        self._is_heavy, self._calls = characteristics["mass"] == HEAVY[MASS], 0
+        self._is_heavy = characteristics["mass"] == HEAVY[MASS]
+        self._calls = 0
         return self._inner.prepare(characteristics, *arguments)
 
     def advance(self, prepared: Any, state: Any, command: Command) -> Any:
@@ -174,7 +177,8 @@ BOTH = np.stack([HEAVY, ORIGINAL])
 @pytest.mark.parametrize("vehicle", [Diverges(np.nan), *map(USERS, (np.nan, -3.0, 900.0))])
 def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_has_alone(vehicle: Vehicle) -> None:
     system = replace(NATIVE, ads=BRAKES, vehicle=vehicle)
-    alone, together = evaluate(system, BOTH[:1]), evaluate(system, BOTH)
+    alone = evaluate(system, BOTH[:1])
+    together = evaluate(system, BOTH)
     assert len(simulate(system, BOTH).trace.time) > LENGTH, "the other vehicle drives longer"
     assert not [*differences(together.take([0]).results, alone.results)]
     assert alone.collided.all()

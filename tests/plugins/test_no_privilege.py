@@ -51,7 +51,8 @@ def results_of(study: Study) -> Mapping[str, np.ndarray]:
 
 
 def assert_equal(ours: Study, theirs: Study) -> None:
-    expected, found = results_of(ours), results_of(theirs)
+    expected = results_of(ours)
+    found = results_of(theirs)
     assert expected.keys() == found.keys()
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
@@ -65,7 +66,8 @@ def with_scenario(name: str, model: str, **tables: Any) -> Study:
 
 @pytest.mark.parametrize("name", each(sorted(SCENARIOS.keys() - {"openscenario"})))  # a file is no class
 def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(name: str, in_tmp: Path) -> None:
-    own, free = copied(SCENARIOS[name], in_tmp), free_parameters(SCENARIOS[name])
+    own = copied(SCENARIOS[name], in_tmp)
+    free = free_parameters(SCENARIOS[name])
     assert_equal(with_scenario(name, name), with_scenario(name, own))
     if not free:
         return

@@ -92,7 +92,8 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
 def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     study = load_study("sun")
     characteristics = assemble(study).characteristics
-    width, rng = characteristics.upper - characteristics.lower, np.random.default_rng(1)
+    width = characteristics.upper - characteristics.lower
+    rng = np.random.default_rng(1)
     settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
     settings[:, 3] = characteristics.original[3]
     slopes = np.where(np.arange(12) == 3, np.nan, np.arange(12) - 5.0)  # one does not vary
@@ -168,7 +169,8 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 @pytest.mark.slow
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)
-    gap, gaps = "ads.parameters.brake_gap", [6.8978, 6.4, 7.4]
+    gap = "ads.parameters.brake_gap"
+    gaps = [6.8978, 6.4, 7.4]
     study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
 
     def low_end(one: Study) -> float:

@@ -60,7 +60,8 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
 def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Comparison]:
     study, point = SCENES[request.param]
     results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
-    out, chosen = results.with_name("out"), ("--point", point) if point else ()
+    out = results.with_name("out")
+    chosen = ("--point", point) if point else ()
     run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
     there = assemble(at_point(load_study(study), point, "")) if point else system
     return out, compare_setting(load_study(study), there, setting)
@@ -69,14 +70,16 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:
     xosc = pytest.importorskip("scenariogeneration.xosc")
     out, comparison = exported
-    scenario, row = xosc.ParseOpenScenario(str(out / "scenario.xosc")), comparison.rows[-1]
+    scenario = xosc.ParseOpenScenario(str(out / "scenario.xosc"))
+    row = comparison.rows[-1]
     samples = slice(0, comparison.moments[row].end + 1)
     boxes = {item.name: item.entityobject.boundingbox for item in scenario.entities.scenario_objects}
     groups = scenario.storyboard.stories[0].acts[0].maneuvergroup
     assert {group.actors.actors[0].entity for group in groups} == {"Ego", *comparison.tracks} - {"vut"}
     for group in groups:
         name = group.actors.actors[0].entity
-        track, box = comparison.tracks["vut" if name == "Ego" else name], boxes[name]
+        track = comparison.tracks["vut" if name == "Ego" else name]
+        box = boxes[name]
         trajectory = group.maneuvers[0].events[0].action[0].action.trajectory
         places = trajectory.shapes.positions
         x, y, heading = (np.array([getattr(place, axis) for place in places], dtype=float) for axis in "xyh")
@@ -89,8 +92,10 @@ def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Co
 def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[Path, Comparison]) -> None:
     carla = pytest.importorskip("carla")
     out, comparison = exported
-    road, row = carla.Map("road", (out / "road.xodr").read_text()), comparison.rows[-1]
-    track, lanes = comparison.tracks["vut"], [lane for lane in comparison.road if lane.kind == "road"]
+    road = carla.Map("road", (out / "road.xodr").read_text())
+    row = comparison.rows[-1]
+    track = comparison.tracks["vut"]
+    lanes = [lane for lane in comparison.road if lane.kind == "road"]
     for sample in range(comparison.moments[row].end + 1):
         x, y, heading = (float(values[sample, row]) for values in (track.x, track.y, track.heading))
         place = carla.Location(x, -y, 0.0)
@@ -107,7 +112,8 @@ def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
         pytest.skip("make .venv/installed-asam installs ASAM's checks")
     out, _ = exported
     for kind, program, file in (("xodr", "qc_opendrive", "road.xodr"), ("xosc", "qc_openscenario", "scenario.xosc")):
-        report, config = out.with_name(f"{kind}.xqar"), out.with_name(f"{kind}.xml")
+        report = out.with_name(f"{kind}.xqar")
+        config = out.with_name(f"{kind}.xml")
         config.write_text(
             f'<Config><Param name="InputFile" value="{out / file}"/><CheckerBundle application="{kind}Bundle">'
             f'<Param name="resultFile" value="{report}"/></CheckerBundle></Config>'
@@ -162,7 +168,8 @@ def test_carla_gets_pedals_places_and_walker(for_carla: ForCarla) -> None:
 
     script, scene, setting = for_carla
     comparison = compare_setting(load_study("rain"), assemble(load_study("rain")), setting)
-    control, end = script.pedals(scene, 3), comparison.moments[-1].end
+    control = script.pedals(scene, 3)
+    end = comparison.moments[-1].end
     assert control.throttle == pytest.approx(comparison.runs.trace.throttle[3, -1])
     assert script.pedals(scene, end + 9).brake == pytest.approx(comparison.runs.trace.brake[end, -1])
     vut, (walker,) = comparison.tracks["vut"], scene["actors"]
@@ -180,7 +187,9 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
     import carla
 
     script, scene, _ = for_carla
-    vehicle, walker, world = MagicMock(), MagicMock(), MagicMock()
+    vehicle = MagicMock()
+    walker = MagicMock()
+    world = MagicMock()
     world.spawn_actor.side_effect = [vehicle, walker, MagicMock()]
     vehicle.get_physics_control.return_value = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl()] * 4)
     vehicle.get_velocity.return_value = carla.Vector3D()

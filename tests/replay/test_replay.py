@@ -143,7 +143,8 @@ def test_a_gif_lasts_as_long_as_the_drive_and_has_the_same_bytes_twice(
 ) -> None:
     """Of few frames."""
     monkeypatch.setattr(animation, "SECONDS_PER_FRAME", 0.25)
-    first, again = tmp_path / "a.gif", tmp_path / "b.gif"
+    first = tmp_path / "a.gif"
+    again = tmp_path / "b.gif"
     for path in (first, again):
         animate(comparison, path)
     assert first.read_bytes() == again.read_bytes()
@@ -154,7 +155,8 @@ def test_a_gif_lasts_as_long_as_the_drive_and_has_the_same_bytes_twice(
 
 
 def test_the_page_holds_every_place_to_the_centimetre(comparison: Comparison) -> None:
-    page, scene = animation_page(lay_out_scene(comparison)), lay_out_scene(comparison)
+    page = animation_page(lay_out_scene(comparison))
+    scene = lay_out_scene(comparison)
     data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
     assert data["step"] == scene.step
     vuts = [body for body in data["bodies"] if body["drive"] is not None]

@@ -113,7 +113,8 @@ SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)
 @given(x=SAMPLES, y=SAMPLES)
 def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[float], y: list[float]) -> None:
     won = sum((a > b) + 0.5 * (a == b) for a in x for b in y)
-    there, back = compare_samples(x, y), compare_samples(y, x)
+    there = compare_samples(x, y)
+    back = compare_samples(y, x)
     assert there.effect_size == pytest.approx(won / (len(x) * len(y)))
     assert back.reversed().effect_size == pytest.approx(there.effect_size)
     assert 0 <= there.p_value <= 1
@@ -170,7 +171,9 @@ def test_the_interval_against_one_value_is_wilsons_of_a_share(count: int) -> Non
 
 def test_the_interval_of_samples_apart_has_a_width() -> None:
     low, high = effect_interval(1.0, 10, 10, 0.05)
-    q1, q2 = low / (2 - low), 2 * low**2 / (1 + low)  # Hanley and McNeil's (1982), for exponential values
+    # Hanley and McNeil's (1982), for exponential values
+    q1 = low / (2 - low)
+    q2 = 2 * low**2 / (1 + low)
     variance = (low * (1 - low) + 9 * (q1 - low**2) + 9 * (q2 - low**2)) / 100
     assert (1 - low) / math.sqrt(variance) == pytest.approx(scipy.stats.norm.ppf(0.975))
     assert high == 1

@@ -124,7 +124,8 @@ RUNS = 12
 def three_algorithms() -> Case:
     """The second finds more severe solutions than the first, the third as the first; run 3 of the third finds none."""
     study = made_up_study(algorithms=["nsga2", "rs", "safe_fuzzer"], runs=RUNS)
-    rng, rows = np.random.default_rng(1), []
+    rng = np.random.default_rng(1)
+    rows = []
     for (name, worse), run in itertools.product((("nsga2", 0.0), ("rs", 1.0), ("safe_fuzzer", 0.0)), range(RUNS)):
         if (name, run) != ("safe_fuzzer", 3):
             rows += [
@@ -211,7 +212,8 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the 8 against 8 that
     there are.
     """
-    ours, theirs = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2], [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
+    ours = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2]
+    theirs = [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
     case = made_up(
         *(
             row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
@@ -405,7 +407,8 @@ def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
 def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> None:
     """Equal ones of two runs are not equal solutions of a run."""
     rows = [row("nsga2", run) for run in (0, 0, 0, 1)] + [row("rs", 0)]
-    answer, twice = answer_questions([made_up(*rows)]), "2 of 5 solutions equal an earlier one of their run"
+    answer = answer_questions([made_up(*rows)])
+    twice = "2 of 5 solutions equal an earlier one of their run"
     for name in ("rq1", "rq2", "collisions"):
         assert twice in " ".join(answer.only(name).tables["remarks"]["remark"])
     assert twice not in " ".join(answer.only("rq1-runs").tables["remarks"]["remark"])

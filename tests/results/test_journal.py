@@ -245,7 +245,8 @@ def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(tmp_path: Path
 
 def test_a_reader_follows_a_journal_that_grows_line_by_line(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
-    ends, whole = write(path), path.read_bytes()
+    ends = write(path)
+    whole = path.read_bytes()
     path.unlink()
     reader = JournalReader(path, BUDGET)
     assert reader.asked() == 0

@@ -270,7 +270,8 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
 def test_altered_journals_are_simulated_again_and_those_without_checksums_are_read_with_a_note(
     copied: Path, slippery: Path
 ) -> None:
-    journal, whole = copied / "runs/nsga2-00.jsonl", (slippery / "runs/nsga2-00.jsonl").read_bytes()
+    journal = copied / "runs/nsga2-00.jsonl"
+    whole = (slippery / "runs/nsga2-00.jsonl").read_bytes()
     journal.write_bytes(whole.replace(b'"collision"', b'"exploded"', 1))
     assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout
     run("study", str(slippery.parent / "slippery.toml"), "--out", str(copied))
@@ -307,7 +308,8 @@ def test_the_status_of_a_study_agrees_with_its_journals(slippery: Path, case: Ca
 
 
 def test_a_study_under_way(copied: Path) -> None:
-    nsga2, rs = copied / "runs/nsga2-00.jsonl", copied / "runs/rs-00.jsonl"
+    nsga2 = copied / "runs/nsga2-00.jsonl"
+    rs = copied / "runs/rs-00.jsonl"
     rs.unlink()
     (copied / "solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes

@@ -82,7 +82,8 @@ def moved(folder: Path, network: str, forth: tuple[float, float]) -> str:
     """A rotated copy of a network."""
 
     def place(match: re.Match[str]) -> str:
-        x, y = float(match[1]), float(match[2])
+        x = float(match[1])
+        y = float(match[2])
         return f'x="{x * forth[0] - y * forth[1]}" y="{x * forth[1] + y * forth[0]}"'
 
     shutil.copytree(NETWORKS / network, folder / "mine")
@@ -98,7 +99,8 @@ def test_a_turned_road_changes_nothing(study: str, forth: tuple[float, float], t
     mine = load_study(study, scenario={"parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}})
     system = assemble(ours)
     settings = np.vstack([system.characteristics.original, system.characteristics.lower])
-    here, there = simulate(system, settings), simulate(assemble(mine), settings)
+    here = simulate(system, settings)
+    there = simulate(assemble(mine), settings)
     assert here.outcome.tolist() == there.outcome.tolist()
     for name in ("gap", "lateral", "speed"):
         assert np.allclose(getattr(here.trace, name), getattr(there.trace, name), atol=0.02), name
@@ -113,7 +115,8 @@ class ArtificialWorld:
     """One vehicle and one pedestrian at positions that the test sets; the constants define lengths and widths."""
 
     def __init__(self, front: float, lateral: float) -> None:
-        self.front, self.lateral = front, lateral
+        self.front = front
+        self.lateral = lateral
         self.turned_at: float | None = None
 
     def vehicle_positions(self, actor: str) -> np.ndarray:
@@ -139,14 +142,16 @@ class ArtificialWorld:
 
 
 def test_the_gap_to_a_parked_vehicle_ends_at_its_rear() -> None:
-    scenario, world = LeadVehicleStopped(), ArtificialWorld(60.0, 0.0)
+    scenario = LeadVehicleStopped()
+    world = ArtificialWorld(60.0, 0.0)
     scene, _ = scenario.observe(world, STEP, scenario.begin(world))
     assert scene.gap[0] == 100.0 - 7.0 - 60.0
     assert not scene.over[0]
 
 
 def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
-    scenario, world = PedestrianCrossing(), ArtificialWorld(30.0, -5.0)
+    scenario = PedestrianCrossing()
+    world = ArtificialWorld(30.0, -5.0)
     memory = scenario.begin(world)
     world.lateral = -4.91
     scene, _ = scenario.observe(world, STEP, memory)
@@ -159,7 +164,8 @@ def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
     ("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)]
 )
 def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
-    scenario, world = PedestrianCrossing(), ArtificialWorld(front, 0.0)
+    scenario = PedestrianCrossing()
+    world = ArtificialWorld(front, 0.0)
     scene, _ = scenario.observe(world, STEP, scenario.begin(world))
     assert scene.over[0] == over
 
@@ -171,7 +177,8 @@ def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, o
 def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
     before: float, now: float, over: bool
 ) -> None:
-    scenario, world = PedestrianCrossing(turns_after=None, lane_width=3.5), ArtificialWorld(0.0, before)
+    scenario = PedestrianCrossing(turns_after=None, lane_width=3.5)
+    world = ArtificialWorld(0.0, before)
     memory = scenario.begin(world)
     world.lateral = now
     assert scenario.observe(world, STEP, memory)[0].over[0] == over
@@ -181,8 +188,10 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
     """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next would lead beyond
     0.7 m.
     """
-    scenario, world = PedestrianCrossing(), ArtificialWorld(0.0, 0.0)
-    memory, turns = scenario.begin(world), []
+    scenario = PedestrianCrossing()
+    world = ArtificialWorld(0.0, 0.0)
+    memory = scenario.begin(world)
+    turns = []
     for k in range(1, 12):
         world.lateral = 0.09 * k
         _, memory = scenario.observe(world, STEP, memory)

@@ -68,7 +68,8 @@ class Ideal(Vehicle):
 
 def by_the_driver(scenario: Any) -> SimulationRuns:
     """Runs of N encounters, whose parameters are arrays, with an ideal vehicle and the competent driver."""
-    n, vehicle = N, Ideal()
+    n = N
+    vehicle = Ideal()
     nominal = calibration_drive(vehicle, WEAR.characteristics)
     system = replace(WEAR, vehicle=vehicle, ads=CompetentDriver(), nominal=nominal, scenario=scenario)
     samples = round(float(np.max(scenario.duration)) / STEP) + 1
@@ -94,9 +95,15 @@ def rule(v: Any, gap: Any, u: Any, beside: Any, perceived: Any, deceleration: An
 
     `gap` and `u` are those at time 0, `beside` is how long the other car stays beside the path [s].
     """
-    n, step = len(v), 0.005
-    speed, left, danger, braking = v + np.zeros(n), gap + np.zeros(n), np.full(n, np.nan), np.zeros(n)
-    hits, impact, least = np.zeros(n, dtype=bool), np.zeros(n), np.full(n, np.inf)
+    n = len(v)
+    step = 0.005
+    speed = v + np.zeros(n)
+    left = gap + np.zeros(n)
+    danger = np.full(n, np.nan)
+    braking = np.zeros(n)
+    hits = np.zeros(n, dtype=bool)
+    impact = np.zeros(n)
+    least = np.full(n, np.inf)
     for time in np.arange(0.0, 30.0, step):
         other = np.maximum(u - deceleration * np.maximum(time - arrives, 0.0), 0.0)
         closing = speed - other
@@ -112,7 +119,8 @@ def rule(v: Any, gap: Any, u: Any, beside: Any, perceived: Any, deceleration: An
         impact = np.where(touches, after - other, impact)
         hits |= touches
         least = np.where(is_in_path & (then > -LENGTH - CAR.length), np.minimum(least, then), least)
-        speed, left = after, then
+        speed = after
+        left = then
     return Rule(hits, impact, least, gap - (v - u) * beside > 0)
 
 
@@ -159,7 +167,8 @@ def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
     perceived = 0.375 / scenario.lateral_speed + 0.4
     expected = rule(v / 3.6, scenario.gap, scenario.target_speed / 3.6, beside, perceived)
     same, late = agreement(by_the_driver(scenario), expected)
-    is_ahead, closing = expected.is_ahead, (v - scenario.target_speed) / 3.6
+    is_ahead = expected.is_ahead
+    closing = (v - scenario.target_speed) / 3.6
     assert 0.1 < expected.hits.mean() < 0.9
     assert_near(same[is_ahead], late[is_ahead & same], closing[is_ahead & same])
     assert same[~is_ahead].mean() >= 0.98
@@ -168,7 +177,8 @@ def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
 @pytest.mark.slow
 def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
     """At the regulation's headway of 2 s."""
-    v, lateral_speed = draw(20.0, 130.0), draw(0.5, 1.8)
+    v = draw(20.0, 130.0)
+    lateral_speed = draw(0.5, 1.8)
     gap = v / 3.6 * CAR.width / lateral_speed * draw(1.0, 2.0)
     scenario = CutOut(speed=v, headway=2.0, gap=gap, lateral_speed=lateral_speed, **BODY)
     perceived = np.maximum(0.375 / lateral_speed + 0.4, CAR.width / 2 / lateral_speed)

@@ -62,7 +62,8 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
     system = assemble(mine(in_tmp, SEARCH))
     settings = drawn(system, 6, 4)
     found = evaluate(system, settings)
-    names, of_vehicle = system.characteristics.scenario.names, system.characteristics.of_vehicle
+    names = system.characteristics.scenario.names
+    of_vehicle = system.characteristics.of_vehicle
     assert names == ("scooter", "gap")
     for row, setting in enumerate(settings):
         parameters = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))

@@ -68,7 +68,8 @@ def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
         *({"target_speed": row.speed + increase} for increase in row.speed_changes),
     ]
     for layer in layers:
-        share, target_speed_ms = layer.get("start_share", 1.0), layer.get("target_speed", row.speed) * KMH
+        share = layer.get("start_share", 1.0)
+        target_speed_ms = layer.get("target_speed", row.speed) * KMH
         arrival = 6.0 * share
         if row.start is not None:
             distance = (row.start + (location / 100 - 0.5) * width) * share
@@ -96,7 +97,8 @@ def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
     steady speed.
     """
     for headway, deceleration in ((1, 4), (1.5, 4), (0.5, 4), (1, 6), (1, 2)):
-        gap, speed_loss = headway * speed * KMH, (speed - 2) * KMH
+        gap = headway * speed * KMH
+        speed_loss = (speed - 2) * KMH
         closing = min(math.sqrt(2 * deceleration * gap), speed_loss)
         braking_time = closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
         scenario = CarToCar(
@@ -141,7 +143,8 @@ def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
     for cell, there in zip(cells, simulate_all_points(system, original_of(system)), strict=True):
-        run, scenario = there.runs, cell.scenario
+        run = there.runs
+        scenario = cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
         assert set(run.contact.side) == {"front"}, scenario
         late = at_contact(run, run.trace.time) - cell.arrival
@@ -182,7 +185,8 @@ def test_targets_are_hit_on_a_lane_as_in_sumo_to_the_last_bit(scenario: Any) -> 
 
 def hit_at_any_time(scenario: Any) -> list[str]:
     """The outcomes of such vehicles, which are the same in SUMO."""
-    n, unbraked = 30, driven(scenario)
+    n = 30
+    unbraked = driven(scenario)
     arrival = unbraked.trace.time[-1]
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))

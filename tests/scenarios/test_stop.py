@@ -42,7 +42,8 @@ def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(brake_response: 
 
 def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> None:
     study = {"extends": "sun", "name": "some", "scenario": {"model": "stop", "parameters": {"speed": 30}}}
-    stop, other = sv.simulate(study), sv.simulate({**study, "ads": {"model": "aeb"}})
+    stop = sv.simulate(study)
+    other = sv.simulate({**study, "ads": {"model": "aeb"}})
     assert stop.metrics == pytest.approx(other.metrics, nan_ok=True)
     assert (stop.outcome, stop.no_verdict) == ("stopped", "")
     assert stop.to_dict()["stopping_distance"] == stop.metrics["stopping_distance"] > 0

@@ -28,7 +28,11 @@ class Cast(TrackScenario):
     """Bodies that a test names, around a vehicle at 72 km/h."""
 
     def __init__(self, *cast: Any, duration: float = 6.0, test_speed: float | None = None) -> None:
-        self.cast, self.duration, self.speed, self.test_speed = cast, duration, 72.0, test_speed  # type: ignore[misc]
+        # type: ignore[misc]
+        self.cast = cast
+        self.duration = duration
+        self.speed = 72.0
+        self.test_speed = test_speed
 
     def tracks(self, times: np.ndarray) -> list[Track]:
         return [one(times) for one in self.cast]
@@ -99,7 +103,8 @@ def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
 
 def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     """From 80 km/h, 2 m/s^2: a vehicle as fast as its leader is not safe while the leader still brakes."""
-    speed, wear = 80 / 3.6, load_study("wear", matrix=None)
+    speed = 80 / 3.6
+    wear = load_study("wear", matrix=None)
     scenario = {"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 80.0, "target_deceleration": 2.0}}
     system = assemble(load_study(wear, scenario=scenario))
     assert system.scenario.duration >= 3 + (speed - 2 / 3.6) / 2

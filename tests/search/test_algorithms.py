@@ -55,7 +55,8 @@ def sphere(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluati
 
 def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
     """The sphere, where a part of the domain cannot be simulated."""
-    good, fails = sphere(characteristics, settings), settings[:, 0] < 5600
+    good = sphere(characteristics, settings)
+    fails = settings[:, 0] < 5600
     outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
     metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
     return dataclasses.replace(good, outcome=outcome, metrics=metrics)
@@ -198,7 +199,8 @@ def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
 def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]], number: int) -> None:
     """Identical survivors in identical order, with ties of all kinds."""
-    ours, deaps = individuals(*objectives), individuals(*objectives)
+    ours = individuals(*objectives)
+    deaps = individuals(*objectives)
     fronts = tools.sortLogNondominated(deaps, number) if deaps else []
     expected = []
     for front in fronts:
@@ -210,7 +212,8 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
 
 def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> None:
     worst_feasible, best, slightly, badly = individuals((9, 9, 9), (0, 1, 0), (-9, 0, 0), (-99, 0, 0))
-    slightly.violation, badly.violation = 0.1, 5.0
+    slightly.violation = 0.1
+    badly.violation = 5.0
     assert select_survivors([badly, slightly, worst_feasible, best], 4) == [best, worst_feasible, slightly, badly]
     assert select_survivors([badly, slightly], 1) == [slightly]
     assert 0 < slightly.standing[0] < badly.standing[0], "no solution of a run"

@@ -48,7 +48,8 @@ def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str)
     """
 
     def formula(sun: CharacteristicSet, settings: FloatArray) -> Evaluations:
-        evaluations, share = sphere(sun, settings), (settings[:, 0] - sun.lower[0]) / (sun.upper[0] - sun.lower[0])
+        evaluations = sphere(sun, settings)
+        share = (settings[:, 0] - sun.lower[0]) / (sun.upper[0] - sun.lower[0])
         return dataclasses.replace(evaluations, metrics={**evaluations.metrics, ORIGINAL_DEGREE: share})
 
     scoring = msgspec.structs.replace(PUBLISHED_SCORING, safe_original=0.5)
@@ -64,7 +65,9 @@ def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
     from pymoo.core.problem import Problem as PymooProblem
     from pymoo.optimize import minimize
 
-    standard, evaluations, population = PROBLEMS["dtlz2"], 364, 91
+    standard = PROBLEMS["dtlz2"]
+    evaluations = 364
+    population = 91
     problem = standard_problem(standard, evaluations, population)
 
     class Theirs(PymooProblem):

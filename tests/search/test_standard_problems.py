@@ -26,12 +26,14 @@ EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 
 
 def zdt3(x: FloatArray) -> FloatArray:
-    first, g = x[:, 0], 1 + 9 * x[:, 1:].mean(axis=1)
+    first = x[:, 0]
+    g = 1 + 9 * x[:, 1:].mean(axis=1)
     return np.stack([first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))], axis=1)
 
 
 def dtlz2(x: FloatArray) -> FloatArray:
-    g, angles = 1 + ((x[:, 2:] - 0.5) ** 2).sum(axis=1), x[:, :2] * np.pi / 2
+    g = 1 + ((x[:, 2:] - 0.5) ** 2).sum(axis=1)
+    angles = x[:, :2] * np.pi / 2
     return np.stack(
         [
             g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]),
@@ -116,7 +118,8 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> FloatArray:
     class Theirs(FloatProblem):
         def __init__(self) -> None:
             super().__init__()
-            self.lower_bound, self.upper_bound = [0.0] * standard.variables, [1.0] * standard.variables
+            self.lower_bound = [0.0] * standard.variables
+            self.upper_bound = [1.0] * standard.variables
             self.obj_directions = [self.MINIMIZE] * len(standard.reference)
 
         def number_of_objectives(self) -> int:

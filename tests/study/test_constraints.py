@@ -106,7 +106,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
 
 def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_feasible() -> None:
     region = region_of(load_study("rain_realistic"))
-    lower, upper, rng = region.characteristics.lower, region.characteristics.upper, np.random.default_rng(1)
+    lower = region.characteristics.lower
+    upper = region.characteristics.upper
+    rng = np.random.default_rng(1)
     drawn = region.draw_feasible(lambda some: rng.uniform(lower, upper, (some, len(lower))), 200, filtered=True)
     assert len(np.unique(drawn, axis=0)) == 200
     assert region.feasible(region.characteristics.filter(drawn)).all()

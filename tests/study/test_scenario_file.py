@@ -56,7 +56,8 @@ def test_a_path_counts_from_the_study(tmp_path: Path) -> None:
 
 def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None:
     study = study_of(LOGICAL, values={"ego_kmh": 80}, search={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}})
-    gap, slower = study.scenario.search["gap_m"], study.scenario.search["slower_kmh"]
+    gap = study.scenario.search["gap_m"]
+    slower = study.scenario.search["slower_kmh"]
     assert (gap.lower, gap.upper, gap.original) == (5, 45, 20)
     assert (slower.lower, slower.upper, slower.original, slower.unit) == (10, 25, 25, "km/h")
     assert study.matrix is not None
@@ -83,7 +84,8 @@ def test_encounters_of_a_search_are_those_of_single_files() -> None:
     values = {"sideways_mps": 1.5, "side": -1, "body": "hatchback", "ego_kmh": 80}
     study = study_of(LOGICAL, values=values, search={"gap_m": {}, "slower_kmh": {}})
     (point,) = assemble(study).points
-    gaps, slower = np.array([8.0, 20.0, 33.5]), np.array([12.0, 25.0, 30.0])
+    gaps = np.array([8.0, 20.0, 33.5])
+    slower = np.array([12.0, 25.0, 30.0])
     searched = encounter(point, {"gap_m": gaps, "slower_kmh": slower}).scenario
     assert isinstance(searched, OpenScenario)
     times = (np.arange(200) * 0.05)[:, np.newaxis]

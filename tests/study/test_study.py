@@ -213,7 +213,8 @@ def test_the_first_mistake_is_told_with_file_key_and_value(text: str, told: str,
 )
 def test_another_system_inherits_neither_title_nor_published_values(text: str, inherits: bool, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "sun"\n{text}\n')
-    study, sun = load_study(str(tmp_path / "mine.toml")), load_study("sun")
+    study = load_study(str(tmp_path / "mine.toml"))
+    sun = load_study("sun")
     assert study.name == "mine", "a study without a name is called as its file"
     assert (study.title == sun.title) == inherits
     assert (study.published == sun.published) == inherits

@@ -57,7 +57,8 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
     """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision
     speed).
     """
-    outcomes, active = _Outcomes(1), []
+    outcomes = _Outcomes(1)
+    active = []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
         verdicts = outcomes.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
@@ -149,7 +150,8 @@ def test_an_obstacle_that_appears_is_not_interpolated_from_infinity() -> None:
 
 def pressed(hesitation: float, wanted: list[float]) -> list[float]:
     """The brake of one vehicle over time, if its driver wants these brakes."""
-    late, brakes = DelayLine.by(hesitation, STEP), []
+    late = DelayLine.by(hesitation, STEP)
+    brakes = []
     for brake in wanted:
         sure, late = late.delayed(np.array([brake]))
         brakes.append(float(np.minimum(brake, sure)[0]))

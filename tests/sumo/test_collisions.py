@@ -89,7 +89,7 @@ def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> 
     scenario = {"model": "crossing", "parameters": parameters}
     system = assemble(sv.load_study("sun", scenario=scenario, ads={"model": "aeb"}))
     weak = {"maxBrakeTorque": 400.0, "tireFric": 0.3}
-    (setting,) = (system.characteristics.setting(weak, "changes", beyond=True)[np.newaxis],)
+    setting = system.characteristics.setting(weak, "changes", beyond=True)[np.newaxis]
     ((_, evaluations, runs),) = simulate_all_points(system, setting)
     assert evaluations.outcome[0] == "collision"
     # The car crosses at right angles: what closes is the vehicle's own speed.

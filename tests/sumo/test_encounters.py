@@ -99,7 +99,8 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
     system = assemble(joint)
     settings = drawn(system, 4, 3)
     evaluations = evaluate(system, settings)
-    names, of_vehicle = system.characteristics.scenario.names, system.characteristics.of_vehicle
+    names = system.characteristics.scenario.names
+    of_vehicle = system.characteristics.of_vehicle
     for row, setting in enumerate(settings):
         values = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))
         weather = {name: values.pop(name) for name in WEATHER}
@@ -246,7 +247,8 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=500, top=2)
     for cause in answer.tables["causes"].to_dict("records"):
         assert [*cause["changes"]] == ["brakes"]
-        speed, friction = cause["encounter"]["speed"] * KMH, cause["encounter"]["road_friction"]
+        speed = cause["encounter"]["speed"] * KMH
+        friction = cause["encounter"]["road_friction"]
         stop = speed**2 / (2 * BRAKING * friction)
         assert stop <= GAP - MARGIN + 0.5, "the original is safe there"
         assert cause["boundary"]["brakes"] == pytest.approx(stop / GAP, rel=0.03)

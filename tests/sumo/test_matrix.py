@@ -116,9 +116,11 @@ def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_b
 @pytest.mark.parametrize(("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)])
 def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(error: float, invalid: bool) -> None:
     """Euro NCAP's tolerance applies until the ADS acts."""
-    vehicle, original = SUN.vehicle, SUN.characteristics.original
+    vehicle = SUN.vehicle
+    original = SUN.characteristics.original
     prepared = vehicle.prepare(dict(zip(SUN.characteristics.names, original[:, np.newaxis], strict=True)), 1.0, 0.05)
-    state, all_open = vehicle.at_speed(prepared, np.array([50 / 3.6])), np.ones(1, dtype=bool)
+    state = vehicle.at_speed(prepared, np.array([50 / 3.6]))
+    all_open = np.ones(1, dtype=bool)
     robot = DrivingRobot([Point(CarToCar(speed=50), SUN.weather)], vehicle, prepared, state, 0.05)
     robot.drive(Command(state.throttle, state.brake), state._replace(speed=np.array([(50 + error) / 3.6])), all_open)
     assert robot.invalid.tolist() == [invalid]
@@ -167,7 +169,8 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
 def test_bodies_touch_at_the_side_where_the_overlap_began_last(
     middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]
 ) -> None:
-    own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
+    own = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0)
+    other = Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
     side, age, distance_behind_front = find_touches(Body.columns([own]), Body.columns([other]))
     assert side == contact[0]
     assert age == pytest.approx(contact[1])

@@ -44,7 +44,8 @@ def assert_same(system: System, settings: FloatArray) -> list[str]:
     """Assert that recorded scenes and SUMO give the same bits, or what is computed of a scene the same to `ROUNDING`;
     returns all outcomes.
     """
-    outcomes, tolerance = [], ROUNDING if len(system.characteristics.scenario) else 0.0
+    outcomes = []
+    tolerance = ROUNDING if len(system.characteristics.scenario) else 0.0
     results = (simulate_all_points(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
     for recorded, copies in zip(*results, strict=True):
         assert not [*differences(recorded.evaluations.results, copies.evaluations.results, tolerance)]
@@ -70,7 +71,8 @@ def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
     """The mean of both speeds gave positions 1.4e-14 m off for 2 of 7,168 settings: their positions before and after a
     step in SUMO.
     """
-    before, after = np.array([0.0, 0.49783446695015615]), np.array([0.4348049848410796, 1.0073508794958133])
+    before = np.array([0.0, 0.49783446695015615])
+    after = np.array([0.4348049848410796, 1.0073508794958133])
     there = np.array([28.196, 28.208445861673756]) + distance_covered(before, after, 0.05)
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
 

@@ -102,7 +102,8 @@ def bare_sumo(traffic: Path, step: Callable[[Any, str], None], n: int = 161) -> 
 def refuse_difference(runs: System, traffic: Path, step: Callable[[Any, str], None], speed_error: float = 1e-6) -> None:
     """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its end."""
     trace = simulate(runs, changed(runs)).trace
-    n, bare = np.count_nonzero(trace.active), bare_sumo(traffic, step)
+    n = np.count_nonzero(trace.active)
+    bare = bare_sumo(traffic, step)
     assert n > 70
     assert trace.speed[:n, 0] == pytest.approx(bare[:n, 0], abs=speed_error)
     assert trace.gap[n - 1, 0] == pytest.approx(bare[n - 1, 1], abs=0.1)
@@ -131,7 +132,8 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in
     network = in_tmp / "net"
     shutil.copytree(NET, network)
     traffic = network / "traffic.rou.xml"
-    old, new = 'speedDev="0" sigma="0" color="0,0.45,0.7"', f'speedDev="0" mass="900" tau="0.3" {attributes}'
+    old = 'speedDev="0" sigma="0" color="0,0.45,0.7"'
+    new = f'speedDev="0" mass="900" tau="0.3" {attributes}'
     traffic.write_text(traffic.read_text().replace(old, new))
     runs = system("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario={"parameters": {"network": str(network)}})
     unused = f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"

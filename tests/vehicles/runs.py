@@ -87,7 +87,8 @@ def original(model: str, n: int = 1) -> FloatArray:
 def ends(model: str, name: str, points: int = 5) -> FloatArray:
     """`points` settings of the original vehicle with one characteristic spread over its domain."""
     characteristics = SYSTEMS[model].characteristics
-    settings, column = original(model, points), characteristics.names.index(name)
+    settings = original(model, points)
+    column = characteristics.names.index(name)
     settings[:, column] = np.linspace(characteristics.lower[column], characteristics.upper[column], points)
     return settings
 

@@ -44,7 +44,8 @@ def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(n: int, plain: Mod
     """From rest through all gears, with held gears, to a standstill with locked wheels; the first and the last of n."""
     names = SYSTEMS["carla"].characteristics.names
     values = dict(zip(names, np.ascontiguousarray(drawn("carla", n, 3).T), strict=True))
-    p, rng = CARLA.prepare(values, 0.6, STEP), np.random.default_rng(5)
+    p = CARLA.prepare(values, 0.6, STEP)
+    rng = np.random.default_rng(5)
     state = CARLA.at_rest(p)
     cars = [Car(*map(float, p.rows[:, i])) for i in (0, n - 1)]
     alone = [CarlaState(*[0.0] * 8) for _ in cars]
@@ -100,7 +101,8 @@ def test_without_a_cache_functions_are_compiled_in_silence(capfd: pytest.Capture
 
 @pytest.mark.parametrize("is_ready", [False, True])
 def test_progress_says_that_the_vehicle_is_compiled_once_a_pool(is_ready: bool, monkeypatch: Any) -> None:
-    asked, shown = list[bool](), list[str]()
+    asked = list[bool]()
+    shown = list[str]()
 
     def compile_model(self: Any, *, only_load: bool = False) -> bool:
         asked.append(only_load)

@@ -72,7 +72,8 @@ def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> 
     """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no
     latency afterwards.
     """
-    p, one = prepared("carla"), np.ones(1)
+    p = prepared("carla")
+    one = np.ones(1)
     rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
     state = CARLA.at_rest(p)._replace(
         gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one, engine_speed=rim * 2.85 * 4 * one
@@ -147,7 +148,9 @@ def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(
 @pytest.mark.parametrize(("slip", "share"), [(0.2, 0.75), (0.4, 1.0), (0.6, 0.75), (0.8, 0.5), (0.95, 0.5)])
 def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
     """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2 N of downforce."""
-    p, rim, one = prepared("lgsvl"), 10.0, np.ones(1)
+    p = prepared("lgsvl")
+    rim = 10.0
+    one = np.ones(1)
     speed = rim * (1 - slip)
     stiffness = _tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)
     force = float(stiffness[0]) * (rim - speed)
@@ -156,7 +159,8 @@ def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
 
 @pytest.mark.parametrize(("visibility", "is_seen"), [(1.0, True), (0.8, True), (0.7, False)])
 def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, is_seen: bool) -> None:
-    vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo")
+    vehicle = SYSTEMS["sumo"].vehicle
+    p = prepared("sumo")
     result, _ = vehicle.sense(p, vehicle.at_rest(p), seen(0.0, 1.0, 60.0, visibility=visibility))
     assert bool(np.isfinite(result.gap[0])) == is_seen, "80 m in clear sight"
 
@@ -165,7 +169,8 @@ def test_who_brakes_sumos_vehicle_does_not_go_on_speeding_up_until_the_lag_of_it
     """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the brake ends it at
     once.
     """
-    vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo", actuatorLag=0.5, brakeDelay=0.0)
+    vehicle = SYSTEMS["sumo"].vehicle
+    p = prepared("sumo", actuatorLag=0.5, brakeDelay=0.0)
     state = vehicle.at_rest(p)
     for _ in range(40):
         state = vehicle.advance(p, state, Command(np.ones(1), np.zeros(1)))
@@ -193,8 +198,11 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
     """
     values = dict(zip(SYSTEMS["carla"].characteristics.names, setting, strict=True))
     run = drive("carla", setting[np.newaxis], braking_after(1.4), 2.8)
-    radius, mass, limit = values["radius"] / 100, values["mass"], values["max_rpm"] * RPM
-    ratio, friction = GEAR_RATIOS[1] * FINAL_RATIO, CARLA.tyre_friction * values["tireFric"]
+    radius = values["radius"] / 100
+    mass = values["mass"]
+    limit = values["max_rpm"] * RPM
+    ratio = GEAR_RATIOS[1] * FINAL_RATIO
+    friction = CARLA.tyre_friction * values["tireFric"]
 
     def changes(time: float, state: np.ndarray) -> list[float]:
         speed, wheel, engine = state

@@ -45,7 +45,8 @@ MODELS = sorted(VEHICLES)
 
 def kinetic_energy(model: str, run: Drive) -> FloatArray:
     """Kinetic energy of all moving parts [J], shape (T, N)."""
-    p, states = run.prepared, run.states
+    p = run.prepared
+    states = run.states
     if isinstance(SYSTEMS[model].vehicle, Carla):
         wheels_and_engine = [
             WHEELS * 0.5 * WHEEL_MASS * p.car.radius**2 * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2
@@ -62,8 +63,10 @@ def test_energy_is_never_created(model: str) -> None:
     """With pedals that change at random every second, the energy grows at most by the power of the engine; with the
     throttle closed it does not grow.
     """
-    n, rng = 300, np.random.default_rng(12)
-    throttle, brake = rng.choice([0.0, 0.4, 1.0], (8, n)), rng.choice([0.0, 0.0, 0.3, 1.0], (8, n))
+    n = 300
+    rng = np.random.default_rng(12)
+    throttle = rng.choice([0.0, 0.4, 1.0], (8, n))
+    brake = rng.choice([0.0, 0.0, 0.3, 1.0], (8, n))
     run = drive(model, drawn(model, n, 13), lambda time: (throttle[int(time)], brake[int(time)]), 8)
     energy = kinetic_energy(model, run)
     gained = np.diff(energy, axis=0)
@@ -100,7 +103,8 @@ def stopping_distance(brake: float, road: float = 1.0, water: float = 0.0) -> Ca
 def coasting_loss(start: float, duration: float) -> Callable[..., FloatArray]:
     def measured(model: str, population: FloatArray) -> FloatArray:
         run = drive(model, population, coasting_after(start), start + duration + 0.5)
-        before, after = run.speed[run.at(start + 0.5)], run.speed[-1]
+        before = run.speed[run.at(start + 0.5)]
+        after = run.speed[-1]
         return np.asarray((before - after) / before)
 
     return measured
@@ -182,9 +186,11 @@ def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
     """Five values of a characteristic, and the gaps that such vehicles report while an obstacle comes nearer at 10 m/s;
     shape (T, 5).
     """
-    vehicle, population = SYSTEMS[model].vehicle, ends(model, name)
+    vehicle = SYSTEMS[model].vehicle
+    population = ends(model, name)
     prepared = prepare(model, population)
-    state, gaps = vehicle.at_rest(prepared), []
+    state = vehicle.at_rest(prepared)
+    gaps = []
     for k in range(240):
         gap = np.full(5, 130.0 - 10 * k * STEP)
         sensed, state = vehicle.sense(prepared, state, seen(k * STEP, 0.0, gap))
@@ -216,7 +222,8 @@ SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxe
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize(("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)])
 def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: float) -> None:
-    vehicle, prepared = SYSTEMS[model].vehicle, prepare(model, original(model), grade=grade)
+    vehicle = SYSTEMS[model].vehicle
+    prepared = prepare(model, original(model), grade=grade)
     before = state = vehicle.at_start(prepared, np.full(1, kmh / 3.6))
     assert state.speed == pytest.approx(kmh / 3.6)
     for _ in range(200):
@@ -228,7 +235,8 @@ def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: fl
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(model: str) -> None:
-    vehicle, prepared = SYSTEMS[model].vehicle, prepare(model, original(model), grade=12.0, road=0.03)
+    vehicle = SYSTEMS[model].vehicle
+    prepared = prepare(model, original(model), grade=12.0, road=0.03)
     state = vehicle.at_start(prepared, np.full(1, 10.0))
     assert vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1))).speed < 10
 
@@ -286,7 +294,8 @@ def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(model: str
 
 @pytest.mark.parametrize("model", MODELS)
 def test_a_thousand_times_too_much_is_another_unit(model: str) -> None:
-    study, vehicle = load_study(STUDY_OF[model]), SYSTEMS[model].vehicle
+    study = load_study(STUDY_OF[model])
+    vehicle = SYSTEMS[model].vehicle
     assert {*vehicle.UNITS} <= {*vehicle.PLAUSIBLE}
     for name in vehicle.PLAUSIBLE:
         row = study.vehicle.characteristics.get(name)

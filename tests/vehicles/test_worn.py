@@ -60,7 +60,9 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
     a.
     """
     p = prepared(road, **changes)
-    mass, mu, force = float(p.mass[0]), float(p.grip), float(p.brake[0] * p.mass[0])
+    mass = float(p.mass[0])
+    mu = float(p.grip)
+    force = float(p.brake[0] * p.mass[0])
     values = {**HEALTHY, **changes}
     centre = (CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]) / mass
 
@@ -72,7 +74,8 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
             - mass * a
         )
 
-    low, high = 0.0, 20.0
+    low = 0.0
+    high = 20.0
     for _ in range(80):
         middle = (low + high) / 2
         low, high = (middle, high) if excess_force(middle) > 0 else (low, middle)
@@ -83,7 +86,8 @@ def test_sumo_is_told_what_the_worn_car_can_do() -> None:
     """3900 N of engine on dry road, 1.079 of g times the road's friction on ice; the brakes respond after 0.1 s and a
     step.
     """
-    dry, icy = CAR.sumo_type(prepared(1.0)), CAR.sumo_type(prepared(0.1))
+    dry = CAR.sumo_type(prepared(1.0))
+    icy = CAR.sumo_type(prepared(0.1))
     assert dry.accel[0] == pytest.approx(3900 / (1500 + 75))
     assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.1079 * GRAVITY, 0.1079 * GRAVITY))
     assert dry.actuator_lag[0] == pytest.approx(0.1 + 0.05)
@@ -115,7 +119,8 @@ def stopping_distances(speed: float, water: float, grip: float, *treads: float) 
 def simulated_stop(row: dict[str, str]) -> float:
     """The distance of a published row [m], or its ratio to new tyres."""
     source = fit.source_of(row)
-    grip, new = fit.GRIPS.get(source), fit.NEW_TREADS.get(source, fit.NEW_TREAD)
+    grip = fit.GRIPS.get(source)
+    new = fit.NEW_TREADS.get(source, fit.NEW_TREAD)
     road = fit.water_of(row, FITTED), FITTED[f"grip {grip}"] if grip else CAR.tyre_friction
     worn, as_new = stopping_distances(float(row["speed_kmh"]), *road, float(row["tread_mm"]), new)
     return float(worn if row["distance_m"] else worn / as_new)
@@ -125,7 +130,9 @@ def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
     """Targets: a median error of at most 6 %, none above 25 %; the page has the row of every stop."""
     errors = []
     for row in fit.STOPS:
-        source, published, here = fit.source_of(row), fit.published_stop(row), simulated_stop(row)
+        source = fit.source_of(row)
+        published = fit.published_stop(row)
+        here = simulated_stop(row)
         errors.append(abs(here / published - 1))
         unit, digits = ("m", 1) if row["distance_m"] else ("times new", 2)
         values = f"{published:.{digits}f} {unit}|{here:.{digits}f}|{here - published:+.{digits}f}"
@@ -140,7 +147,8 @@ def test_the_handbooks_wet_rows_have_its_order() -> None:
     """Targets: a rank correlation of at least 0.95, a mean error of at most 0.08."""
     wet = [row for row in fit.HANDBOOK if float(row["water_mm"])]
     published, here = np.array([(float(row["friction"]), fit.model_friction(row, FITTED)) for row in wet]).T
-    rank, error = spearmanr(published, here).statistic, np.abs(here - published).mean()
+    rank = spearmanr(published, here).statistic
+    error = np.abs(here - published).mean()
     assert rank >= 0.95
     assert error <= 0.08
     assert f"mean error {error:.3f}, rank correlation {rank:.3f}" in PAGE
@@ -164,14 +172,16 @@ def test_a_millimetre_of_water_costs_worn_tyres_what_tests_measured(
 @pytest.mark.parametrize("speed", [30.0, 80.0, 120.0])
 def test_a_wet_stop_is_the_integral_of_speed_over_friction(speed: float) -> None:
     """The integral of v / (mu g) dv has a closed form."""
-    treads, energy = np.array([1.6, 3.0, 8.0]), (speed / KMH_PER_MS) ** 2
+    treads = np.array([1.6, 3.0, 8.0])
+    energy = (speed / KMH_PER_MS) ** 2
     lifted = lift_of(1.0, treads, CAR.water_lift, CAR.road_texture) * energy
     exact = energy * (np.sqrt(1 + lifted**2) + np.arcsinh(lifted) / lifted) / (4 * CAR.tyre_friction * GRAVITY)
     assert stopping_distances(speed, 1.0, CAR.tyre_friction, *treads) == pytest.approx(exact, rel=0.002)
 
 
 def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at_all() -> None:
-    speeds, treads = np.linspace(1, 60, 13)[:, np.newaxis], np.linspace(0, 9, 91)
+    speeds = np.linspace(1, 60, 13)[:, np.newaxis]
+    treads = np.linspace(0, 9, 91)
     dry, damp, wet = (
         lifted_friction(1.0, lift_of(water, treads, CAR.water_lift, CAR.road_texture), speeds)
         for water in (0.0, 0.5, 2.0)
@@ -360,10 +370,12 @@ def test_lost_frames_repeat_the_last_one_in_a_pattern_that_all_vehicles_share() 
 
 def test_a_study_without_them_drives_as_with_none() -> None:
     """`wear` keeps its bytes, and an original of 0 counts with the domain's width in f_diff."""
-    with_them, without = assemble(load_study("sensing", matrix=None)), assemble(load_study("wear", matrix=None))
+    with_them = assemble(load_study("sensing", matrix=None))
+    without = assemble(load_study("wear", matrix=None))
     settings = drawn(without, 6, 2)
     more = np.concatenate([settings, np.zeros((6, 2))], axis=1)
-    ours, theirs = evaluate(with_them, more), evaluate(without, settings)
+    ours = evaluate(with_them, more)
+    theirs = evaluate(without, settings)
     assert ours.f_safe.tolist() == theirs.f_safe.tolist()
     angled = with_them.characteristics.original.copy()
     angled[with_them.characteristics.names.index("sensorAngle")] = 2.5

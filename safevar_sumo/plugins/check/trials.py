@@ -66,7 +66,8 @@ def try_simulations(study: Study) -> Iterator[Failure]:
 
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     """Let an algorithm search twice, the second time after another run."""
-    outputs, repeated = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
+    outputs = _search(study, name, seeds=(1,))
+    repeated = _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
         yield Failure("repetition", f"{len(repeated)} settings instead of {len(outputs)} in another run", expected)
@@ -80,8 +81,10 @@ def _try(
     load: Callable[[], Callable[[Rows], Results]], characteristics: CharacteristicSet, settings: FloatArray
 ) -> Iterator[Failure]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
-    run, all_rows = load(), np.arange(len(settings))
-    outputs, run_anew = run(all_rows), load()
+    run = load()
+    all_rows = np.arange(len(settings))
+    outputs = run(all_rows)
+    run_anew = load()
     other_runs = [
         (run, "repetition", "in a second run", all_rows),
         (run_anew, "order", "in another order", all_rows[::-1]),
@@ -107,7 +110,9 @@ def _changes(characteristics: CharacteristicSet, setting: FloatArray) -> str:
 
 def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
     """The original, four corners of the domains, and random settings; shape (count, n)."""
-    lower, upper, is_odd = characteristics.lower, characteristics.upper, np.arange(len(characteristics)) % 2 == 1
+    lower = characteristics.lower
+    upper = characteristics.upper
+    is_odd = np.arange(len(characteristics)) % 2 == 1
     corners = [characteristics.original, lower, upper, np.where(is_odd, lower, upper), np.where(is_odd, upper, lower)]
     return np.concatenate([corners, np.random.default_rng(0).uniform(lower, upper, (count - len(corners), len(lower)))])
 
@@ -122,7 +127,9 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns;
     shape (k, n).
     """
-    system, lookup, label = _system(study), Lookup.of(study), label_of(name)
+    system = _system(study)
+    lookup = Lookup.of(study)
+    label = label_of(name)
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
     parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
     problem = Problem(
@@ -135,7 +142,8 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     )
     for seed in seeds:
         algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}")
-        search, settings = algorithm.search(problem, np.random.default_rng(seed)), []
+        search = algorithm.search(problem, np.random.default_rng(seed))
+        settings = []
         try:
             settings.append(next(search))
             while True:

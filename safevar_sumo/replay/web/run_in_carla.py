@@ -83,7 +83,8 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
     sensor = world.spawn_actor(
         world.get_blueprint_library().find("sensor.other.collision"), carla.Transform(), attach_to=vehicle
     )
-    touched, speed = [], 0.0
+    touched = []
+    speed = 0.0
     for _ in range(SETTLING):
         vehicle.apply_control(carla.VehicleControl(brake=1.0))
         world.tick()
@@ -99,7 +100,8 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
                 if actor["kind"] == "pedestrian":  # it moves its legs; the record places it
                     body.apply_control(walk(actor["places"], step, scene["step"], body.get_location()))
                 body.set_transform(place_at(actor, step))
-            before, speed = speed, math.hypot(vehicle.get_velocity().x, vehicle.get_velocity().y)
+            before = speed
+            speed = math.hypot(vehicle.get_velocity().x, vehicle.get_velocity().y)
             world.tick()
             if touched:
                 return max(before, speed)
@@ -125,12 +127,14 @@ def main() -> None:
     client.set_timeout(60.0)
     world = client.generate_opendrive_world((FOLDER / "road.xodr").read_text(encoding="utf-8"))
     settings = world.get_settings()
-    settings.synchronous_mode, settings.fixed_delta_seconds = True, scene["step"]
+    settings.synchronous_mode = True
+    settings.fixed_delta_seconds = scene["step"]
     world.apply_settings(settings)
     try:
         speed = play(world, scene, agent_class)
     finally:
-        settings.synchronous_mode, settings.fixed_delta_seconds = False, None
+        settings.synchronous_mode = False
+        settings.fixed_delta_seconds = None
         world.apply_settings(settings)
     print(f"safevar_sumo: {scene['verdict']}")
     print("CARLA: " + (f"collides at {speed:.1f} m/s" if speed is not None else "no collision"))
