@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,27 +56,81 @@ def attack(
     a difference of two others, as differential evolution does. After the first generation, half of each meets the
     judge to whom least is left, and half another one, in turn, the next worst first: few at once make large batches.
     """
+    return attack_all([box], judges, [known], budget, [rng])[0]
+
+
+def attack_all(
+    boxes: Sequence[Box],
+    judges: Sequence[Judge],
+    known: Sequence[Sequence[FloatArray]],
+    budget: int,
+    rngs: Sequence[np.random.Generator],
+    generation: int = GENERATION,
+) -> list[Attack]:
+    """Attack several boxes side by side, each with `budget` simulations, `generation` of them at once: a judge meets a
+    generation of all boxes together, as few large batches cost less than many small ones.
+    """
+    attacks = dict[int, Attack]()
+    steps = [
+        _steps(box, len(judges), of_box, budget, generation, rng)
+        for box, of_box, rng in zip(boxes, known, rngs, strict=True)
+    ]
+    waiting = dict[int, _Generation]()
+
+    def go_on(number: int, left: FloatArray | None) -> None:
+        try:
+            waiting[number] = next(steps[number]) if left is None else steps[number].send(left)
+        except StopIteration as end:
+            attacks[number] = end.value
+
+    for number in range(len(boxes)):
+        go_on(number, None)
+    while waiting:
+        numbers, generations = [*waiting], [*waiting.values()]
+        waiting.clear()
+        settings = np.concatenate([each.settings for each in generations])
+        met = np.concatenate([each.judges for each in generations])
+        left = np.full(len(settings), np.inf)
+        for judge in np.unique(met):
+            left[met == judge] = judges[judge](settings[met == judge])
+        ends = np.cumsum([len(each.settings) for each in generations])[:-1]
+        for number, of_box in zip(numbers, np.split(left, ends), strict=True):
+            go_on(number, of_box)
+    return [attacks[number] for number in range(len(boxes))]
+
+
+class _Generation(NamedTuple):
+    """Settings, shape (M, n), and the numbers of the judges that they are to meet."""
+
+    settings: FloatArray
+    judges: Rows
+
+
+def _steps(
+    box: Box, n_judges: int, known: Sequence[FloatArray], budget: int, size: int, rng: np.random.Generator
+) -> Generator[_Generation, FloatArray, Attack]:
+    """The generations of an attack, which takes what each leaves."""
     found = Attack(np.zeros((0, len(box.lower))), np.zeros(0, dtype=np.intp), np.zeros(0), 0)
-    seen, generations_left = set[tuple[int, bytes]](), 1 + MORE_GENERATIONS
+    seen = set[tuple[int, bytes]]()
+    generations_left = 1 + MORE_GENERATIONS
     settings = np.concatenate([found.settings, *known])
     numbers = np.repeat(np.arange(len(known)), [len(rows) for rows in known]).astype(np.intp)
-    least = np.full(len(judges), np.inf)
+    least = np.full(n_judges, np.inf)
     generation = 0
     while found.simulated < budget:
-        size = min(GENERATION, budget - found.simulated)
-        choice = np.arange(len(judges)) if generation == 0 else _pair(least, generation)
-        settings, numbers = _new_ones(box, settings, numbers, choice, size, seen, rng)
+        number = min(size, budget - found.simulated)
+        choice = np.arange(n_judges) if generation == 0 else _pair(least, generation)
+        settings, numbers = _new_ones(box, settings, numbers, choice, number, seen, rng)
         if not len(settings):
             break
-        left = np.full(len(settings), np.inf)
-        for number in np.unique(numbers):
-            left[numbers == number] = judges[number](settings[numbers == number])
+        left = yield _Generation(settings, numbers)
         np.minimum.at(least, numbers, left)
         found = _worst(found, settings, numbers, left)
         generations_left -= int((found.left < 0).any())
         if not generations_left:
             break
-        settings, generation = _children(box, found, rng), generation + 1
+        settings = _children(box, found, rng)
+        generation += 1
         numbers = _pair(least, generation)[np.arange(len(settings)) // 2 % 2]
     return found
 

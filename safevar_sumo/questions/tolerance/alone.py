@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.attack import attack
+from safevar_sumo.questions.attack import attack_all
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Interval
 from safevar_sumo.questions.models import Model
@@ -20,8 +20,12 @@ VALUES = 17
 """Number of values of what is safe alone in the study's own fit that are simulated in each model."""
 PARTS, ROUNDS = 8, 4
 """Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts."""
-ATTACKS, ATTACK_SHARE = 3, 0.1
-"""Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each."""
+MOVED_BEFORE = 8
+"""Number of failures, the nearest to the original, in whose encounters a limit is safe at once."""
+ATTACKS, ATTACK_SHARE, GENERATIONS = 3, 0.1, 5
+"""Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each, and its
+number of generations.
+"""
 ALONE_STAGE = "limits alone with each fit"
 
 
@@ -61,22 +65,6 @@ class _Ends:
                 nearest = min(outside, key=lambda value: abs(value - item.original))
                 self.beyond[side] = members.setting({item.name: nearest}, item.name), own
 
-    def move(self, model: Model, failure: FloatArray) -> None:
-        """Move an end between the original and a failure: to the last safe value before it, in that encounter."""
-        value = failure[self.column]
-        side = int(value > self.item.original)
-        safe, unsafe = self.item.original, value
-        for _ in range(ROUNDS):
-            values = safe + (unsafe - safe) * np.arange(1, PARTS + 1) / PARTS
-            settings = np.tile(failure, (PARTS, 1))
-            settings[:, self.column] = values
-            first = int(np.argmax([*model.are_unsafe(settings[:-1], ALONE_STAGE), True]))
-            safe, unsafe = (safe if first == 0 else values[first - 1]), values[first]
-        self.ends[side] = float(safe)
-        beyond = failure.copy()
-        beyond[self.column] = unsafe
-        self.beyond[side] = beyond, model
-
     def limit(self) -> AloneLimit:
         item, (low, high) = self.item, self.ends
         safe = (
@@ -84,6 +72,44 @@ class _Ends:
             high if high >= item.upper else item.rounded(high, upwards=False),
         )
         return AloneLimit(self.scan, safe, (self.beyond[0], self.beyond[1]))
+
+
+class _Move:
+    """The move of one end between the original and the nearest of some failures, shape (K, n): to the last value before
+    it that is safe in the encounters of them all.
+    """
+
+    def __init__(self, ends: _Ends, side: int, failures: FloatArray) -> None:
+        self.ends, self.side = ends, side
+        distances = np.abs(failures[:, ends.column] - ends.item.original)
+        self.encounters = failures[np.argsort(distances, kind="stable")[:MOVED_BEFORE]]
+        self.failure = self.encounters[0]
+        self.safe = ends.item.original
+
+    @property
+    def values(self) -> FloatArray:
+        unsafe = self.failure[self.ends.column]
+        return np.asarray(self.safe + (unsafe - self.safe) * np.arange(1, PARTS) / PARTS)
+
+    @property
+    def settings(self) -> FloatArray:
+        """The settings of a round, shape (K (`PARTS` - 1), n)."""
+        settings = np.repeat(self.encounters, PARTS - 1, axis=0)
+        settings[:, self.ends.column] = np.tile(self.values, len(self.encounters))
+        return settings
+
+    def narrow(self, are_unsafe: BoolArray) -> None:
+        """Take what a round gave."""
+        is_unsafe, values = are_unsafe.reshape(len(self.encounters), PARTS - 1), self.values
+        first = int(np.argmax(np.append(is_unsafe.any(axis=0), True)))
+        self.safe = self.safe if first == 0 else float(values[first - 1])
+        if first < len(values):
+            self.failure = self.encounters[np.argmax(is_unsafe[:, first])].copy()
+            self.failure[self.ends.column] = values[first]
+
+    def end(self, model: Model) -> None:
+        self.ends.ends[self.side] = self.safe
+        self.ends.beyond[self.side] = self.failure, model
 
 
 def limits_alone(
@@ -103,52 +129,90 @@ def limits_alone(
     encounters = models[0].evaluator.critical_encounters
     encounters = np.concatenate([models[0].evaluator.characteristics.original[np.newaxis], encounters])
     for model in models:
-        settings = [_settings_within(each, encounters) for each in ends]
-        lefts = np.split(model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1])
-        for each, rows, left in zip(ends, settings, lefts, strict=True):
-            _move(each, model, rows[left < 0])
-    for each in ends:
-        values = failures[:, each.column]
-        inside = failures[(values != each.item.original) & (values >= each.ends[0]) & (values <= each.ends[1])]
-        for model in met if len(inside) else ():
-            _move(each, model, inside[model.are_unsafe(inside, ALONE_STAGE)])
+        _move_before(ends, model, encounters, VALUES)
+        while _move_before(ends, model, encounters, 2):
+            pass
+    for model in met if len(failures) else ():
+        _move(ends, model, [_alone_in(each, failures, model) for each in ends])
     if len(models[0].evaluator.characteristics.scenario) and budget:
-        for each in ends:
-            _attack_alone(each, models, round(ATTACK_SHARE * budget))
+        _attack_alone(ends, models, round(ATTACK_SHARE * budget))
     return [each.limit() for each in ends]
 
 
-def _settings_within(ends: _Ends, encounters: FloatArray) -> FloatArray:
+def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, number: int) -> bool:
+    """Move ends before the failures at some values between them, the ends among them, in each of some encounters;
+    whether one has moved.
+    """
+    settings = [_settings_within(each, encounters, number) for each in ends]
+    lefts = np.split(model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1])
+    return _move(ends, model, [rows[left < 0] for rows, left in zip(settings, lefts, strict=True)])
+
+
+def _settings_within(ends: _Ends, encounters: FloatArray, number: int) -> FloatArray:
     """Settings at values between the ends, in each of some encounters, shape (K, n)."""
     low, high = ends.ends
-    values = np.linspace(low, high, VALUES)
+    values = np.linspace(low, high, number)
     settings = np.repeat(encounters, len(values), axis=0)
     settings[:, ends.column] = np.tile(values, len(encounters))
     return settings
 
 
-def _move(ends: _Ends, model: Model, failures: FloatArray) -> None:
-    """Move the ends before failures, the nearest to the original first; those that are outside then do not matter."""
-    order = np.argsort(np.abs(failures[:, ends.column] - ends.item.original), kind="stable")
-    for failure in failures[order]:
-        if ends.ends[0] <= failure[ends.column] <= ends.ends[1]:
-            ends.move(model, failure)
+def _alone_in(ends: _Ends, failures: FloatArray, model: Model) -> FloatArray:
+    """Those of some settings that change this characteristic, within its ends, and are unsafe in a model."""
+    values = failures[:, ends.column]
+    inside = failures[(values != ends.item.original) & (values >= ends.ends[0]) & (values <= ends.ends[1])]
+    return np.asarray(inside[model.are_unsafe(inside, ALONE_STAGE)]) if len(inside) else inside
 
 
-def _attack_alone(ends: _Ends, models: Sequence[Model], budget: int) -> None:
-    """Attack a limit in encounters that no scan met, until nothing is found."""
-    characteristics, column = models[0].evaluator.characteristics, ends.column
+def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -> bool:
+    """Move all ends before their failures in a model at once; those that are outside then do not matter. Whether any
+    end has moved.
+    """
+    has_moved = False
+    while moves := [
+        _Move(each, side, of_side)
+        for each, rows in zip(ends, failures, strict=True)
+        for side, of_side in enumerate(_by_side(each, rows))
+        if len(of_side)
+    ]:
+        for _ in range(ROUNDS):
+            settings = [each.settings for each in moves]
+            are_unsafe = model.are_unsafe(np.concatenate(settings), ALONE_STAGE)
+            parts = np.split(are_unsafe, np.cumsum([*map(len, settings)])[:-1])
+            for each, part in zip(moves, parts, strict=True):
+                each.narrow(part)
+        for each in moves:
+            each.end(model)
+        has_moved = True
+    return has_moved
+
+
+def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The failures within the ends, below and above the original."""
+    values, original = failures[:, ends.column], ends.item.original
+    below = failures[(values >= ends.ends[0]) & (values < original)]
+    above = failures[(values > original) & (values <= ends.ends[1])]
+    return below, above
+
+
+def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -> None:
+    """Attack the limits in encounters that no scan met, until nothing is found."""
+    members, seed = models[0].evaluator.characteristics, models[0].evaluator.study.search.seed
     judges = [partial(model.left, stage="attack on limits alone") for model in models]
+    waiting = [*ends]
     for number in range(ATTACKS):
-        lower = np.where(characteristics.of_vehicle, characteristics.original, characteristics.lower)
-        upper = np.where(characteristics.of_vehicle, characteristics.original, characteristics.upper)
-        limit = ends.limit().safe
-        assert limit is not None
-        lower[column], upper[column] = limit
-        rng = np.random.default_rng((models[0].evaluator.study.search.seed, 6, column, number))
-        found = attack(Box(models[0].evaluator.region, lower, upper), judges, [], budget, rng)
-        is_unsafe: BoolArray = found.left < 0
-        if not is_unsafe.any():
+        boxes = list[Box]()
+        for each in waiting:
+            lower = np.where(members.of_vehicle, members.original, members.lower)
+            upper = np.where(members.of_vehicle, members.original, members.upper)
+            limit = each.limit().safe
+            assert limit is not None
+            lower[each.column], upper[each.column] = limit
+            boxes.append(Box(models[0].evaluator.region, lower, upper))
+        rngs = [np.random.default_rng((seed, 6, each.column, number)) for each in waiting]
+        found = attack_all(boxes, judges, [()] * len(boxes), budget, rngs, max(budget // GENERATIONS, 1))
+        for judge, model in enumerate(models):
+            _move(waiting, model, [one.settings[(one.left < 0) & (one.judges == judge)] for one in found])
+        waiting = [each for each, one in zip(waiting, found, strict=True) if (one.left < 0).any()]
+        if not waiting:
             break
-        for judge in np.unique(found.judges[is_unsafe]):
-            _move(ends, models[judge], found.settings[is_unsafe & (found.judges == judge)])
