@@ -40,7 +40,7 @@ def main(path: str) -> None:
     speed, tread = members.names.index("speed"), members.names.index("treadDepth")
     speeds = np.linspace(members.lower[speed], FASTEST, SPEEDS)
     treads = np.linspace(members.lower[tread], members.upper[tread], TREADS)
-    worn = members.setting({**WORN, "impact_location": IMPACT_LOCATION}, "worn")
+    worn = members.setting({**WORN, "impact_location": IMPACT_LOCATION})
     settings = np.tile(worn, (SPEEDS * TREADS, 1))
     settings[:, speed], settings[:, tread] = np.tile(speeds, TREADS), np.repeat(treads, SPEEDS)
     evaluations = evaluate(system, settings)

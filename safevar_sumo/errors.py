@@ -129,10 +129,10 @@ def unknown_name(source: object, problem: str, name: object, names: Iterable[str
     return InputError(source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}")
 
 
-def check_whole(source: str, value: object, highest: int) -> None:
+def check_whole(option: str, value: object, highest: int) -> None:
     """Refuse what is no whole number from 1 to `highest`; raises an InputError."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= highest:
-        raise InputError(source, repr(value), f"a whole number from 1 to {highest:,}")
+        raise InputError(option, repr(value), f"a whole number from 1 to {highest:,}")
 
 
 def check_name(source: object, problem: str, name: object, names: Collection[str], otherwise: str = "") -> None:

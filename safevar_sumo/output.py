@@ -23,11 +23,11 @@ WRITABLE = "a file in a directory that can be written, with space for it"
 
 
 @contextmanager
-def whole_file(path: Path, source: str = "") -> Iterator[Path]:
+def whole_file(path: Path, option: str = "") -> Iterator[Path]:
     """Give the path of a temporary file to write, which then replaces `path`; after an error `path` is as it was.
 
     The temporary file lies beside `path` and has the same ending. Those that killed processes have left there are
-    removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an InputError that names `source`, if it
+    removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an InputError that names `option`, if it
     is given.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
@@ -44,8 +44,8 @@ def whole_file(path: Path, source: str = "") -> Iterator[Path]:
     except BaseException as error:
         if not is_stream:
             file.unlink(missing_ok=True)
-        if source and isinstance(error, OSError):
-            raise unwritable(path, source, error) from None
+        if option and isinstance(error, OSError):
+            raise unwritable(path, option, error) from None
         raise
 
 
@@ -70,24 +70,24 @@ def _remove_left_behind(file: Path) -> None:
             file.unlink()
 
 
-def check_writable(path: Path, source: str, endings: Sequence[str] = (), but: str = "") -> None:
+def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: str = "") -> None:
     """Refuse an output file that cannot be written, before the work begins, whose name has another ending, or that
     exists and is named `but`; raises InputError.
     """
     if endings and path.suffix.lower() not in endings:
-        raise InputError(source, str(path), f"a file that ends in {', '.join(endings)}")
+        raise InputError(option, str(path), f"a file that ends in {', '.join(endings)}")
     if path.name == but and path.exists():
-        raise InputError(source, f"{path} holds results", "another file")
+        raise InputError(option, f"{path} holds results", "another file")
     try:
         with path.open("a") if path.exists() else tempfile.TemporaryFile(dir=path.resolve().parent):
             pass
     except OSError as error:
-        raise unwritable(path, source, error) from None
+        raise unwritable(path, option, error) from None
 
 
-def unwritable(path: Path, source: str, error: Exception) -> InputError:
+def unwritable(path: Path, option: str, error: Exception) -> InputError:
     """The error for an output file that cannot be written."""
-    return InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}", WRITABLE)
+    return InputError(option, f"cannot write {path}: {getattr(error, 'strerror', None) or error}", WRITABLE)
 
 
 def file_beside(text: str, folders: Sequence[str]) -> str:

@@ -176,7 +176,7 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, 
             return
         try:
             study = load_study(str(file))
-            assemble(study, str(file))
+            assemble(study)
         except InputError:
             return
         assert isinstance(study, Study)

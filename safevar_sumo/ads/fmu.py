@@ -44,7 +44,6 @@ class Fmu:
     """
 
     def __init__(self, path: str, table: ModelTable, code: UserCode) -> None:
-        source = code.source
         self.code = code
         self._folder = TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True)
         expected = "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
@@ -54,15 +53,15 @@ class Fmu:
             extract(path, self._folder.name)
             self._model: Any = read_model_description(self._folder.name, validate=False)
         except ImportError:
-            raise InputError(source, f"{path} needs FMPy", "in the checkout: pip install '.[fmu]'") from None
+            raise InputError("", f"{path} needs FMPy", "in the checkout: pip install '.[fmu]'") from None
         except Exception as error:  # any error of FMPy about a user's file
-            raise InputError(source, f"{table.model}: {type(error).__name__}: {error}", expected) from None
+            raise InputError("", f"{table.model}: {type(error).__name__}: {error}", expected) from None
         kind = self._model.coSimulation
         if kind is None or self._model.fmiVersion < "2" or kind.canBeInstantiatedOnlyOncePerProcess:
-            raise InputError(source, f"{table.model} is another FMU", expected)
+            raise InputError("", f"{table.model} is another FMU", expected)
         if ("acceleration" in table.outputs) == bool({"throttle", "brake"} & table.outputs.keys()):
             expected = "throttle, brake or both; alternatively acceleration"
-            raise InputError(source, f"ads.outputs = {sorted(table.outputs)}", expected)
+            raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
         observed = [name for name in (*Observation._fields, "detected") if name in UNITS]
         self.inputs = {key: self._variable("input", key, name, observed) for key, name in table.inputs.items()}
         self.outputs = {key: self._variable("output", key, name, COMMANDS) for key, name in table.outputs.items()}
@@ -73,16 +72,14 @@ class Fmu:
     def _variable(self, causality: str, quantity: str, name: str, quantities: Any) -> Any:
         """The real variable of a causality that takes or holds a quantity, one of some quantities, in its SI unit."""
         key = f"ads.{causality}s.{quantity}"
-        check_name(self.code.source, f"{key}: there is no such quantity", quantity, quantities)
+        check_name("", f"{key}: there is no such quantity", quantity, quantities)
         variables = {one.name: one for one in self._model.modelVariables if one.causality == causality}
         if name not in variables or variables[name].type not in REAL_TYPES:
-            raise unknown_name(self.code.source, f"{key} = {name!r}: no real {causality} of the FMU", name, variables)
+            raise unknown_name("", f"{key} = {name!r}: no real {causality} of the FMU", name, variables)
         variable = variables[name]
         unit = (variable.unit or getattr(variable.declaredType, "unit", None) or "").replace("^", "").replace("-", "1")
         if unit and unit != UNITS.get(quantity, unit):
-            raise InputError(
-                self.code.source, f"{key} = {name!r}: its unit is {unit!r}", f"a variable in {UNITS[quantity]}"
-            )
+            raise InputError("", f"{key} = {name!r}: its unit is {unit!r}", f"a variable in {UNITS[quantity]}")
         return variable
 
     def new_instance(self, step: float) -> Any:
@@ -95,9 +92,7 @@ class Fmu:
         if not kind.canHandleVariableCommunicationStepSize and experiment:
             own = own or experiment.stepSize
         if own and float(own) != step:
-            raise InputError(
-                self.code.source, f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s"
-            )
+            raise InputError("", f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s")
         for file in Path(self._folder.name, "resources").glob("*.py"):
             sys.modules.pop(file.stem, None)  # an FMU in Python imports its own modules, not namesakes
         slave = instantiate_fmu(self._folder.name, self._model, "CoSimulation", logger=lambda *_: None)

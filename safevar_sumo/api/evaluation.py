@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import evaluations_frame
 from safevar_sumo.study import Study, StudyLike, plain_values
@@ -82,7 +82,8 @@ def evaluate(
     characteristics = system.characteristics
     requested, index = _read_settings(settings, characteristics, beyond)
     if not beyond:
-        system.check_feasible(requested, "settings", filtered=filtered)
+        with about("settings"):
+            system.check_feasible(requested, filtered=filtered)
     simulated = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
         evaluations = evaluate_settings(loaded_study, simulated, pool, jobs, report_progress)
@@ -135,5 +136,6 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
     is_legal = [row.is_legal(values, beyond=beyond) for row, values in zip(characteristics, array.T, strict=True)]
     for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:  # the first illegal value
-        characteristics.members[column].check(float(array[row, column]), f"settings, row {row}", beyond=beyond)
+        with about(f"settings, row {row}"):
+            characteristics.members[column].check(float(array[row, column]), beyond=beyond)
     return array, index

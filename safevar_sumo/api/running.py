@@ -91,15 +91,15 @@ def run(
     return results
 
 
-def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
-    """Load a study, assemble its system and check its algorithms; errors name the study `source`.
+def load_for_search(study: StudyLike) -> tuple[Study, System]:
+    """Load a study, assemble its system and check its algorithms.
 
     Raises
     ------
     InputError
         If one of its names or parameters cannot be used.
     """
-    loaded_study, system = load_and_assemble(study, source)
+    loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
     search = loaded_study.search
     if search.population > search.evaluations:

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from safevar_sumo.errors import about
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.questions.words import OUTCOME_VERBS
 from safevar_sumo.records import (
@@ -261,10 +261,11 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
     """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, after the filter if
     `filtered`, infeasible.
     """
-    setting = system.characteristics.setting({} if changes is None else changes, "changes", beyond=beyond)
-    if not beyond:
-        system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
-    return setting
+    with about("changes"):
+        setting = system.characteristics.setting({} if changes is None else changes, beyond=beyond)
+        if not beyond:
+            system.check_feasible(setting[np.newaxis], filtered=filtered)
+        return setting
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool) -> Simulation:
@@ -284,10 +285,10 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     )
 
 
-def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:
-    """Load a study and assemble its system; errors name the study `source`, by default as the caller named it."""
+def load_and_assemble(study: StudyLike) -> tuple[Study, System]:
+    """Load a study and assemble its system."""
     loaded_study = read_study(study)
-    return loaded_study, assemble(loaded_study, source or (str(study) if isinstance(study, str | Path) else ""))
+    return loaded_study, assemble(loaded_study)
 
 
 def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:

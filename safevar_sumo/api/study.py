@@ -125,7 +125,7 @@ def study(
         names = [name.strip() for name in algorithms.split(",")]
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
     changed = msgspec.structs.replace(as_written, search=msgspec.structs.replace(search, **changes))
-    loaded, system = load_for_search(changed, study)
+    loaded, system = load_for_search(changed)
     for remark in dict.fromkeys([*loaded.origin.remarks, *system.remarks, *vehicle_remarks(system)]):
         warn(remark)
     keys = _select_runs(all_runs(loaded), only, shard)

@@ -93,7 +93,7 @@ def system_of(study: Study) -> System:
 @lru_cache(maxsize=KNOWN_SYSTEMS)
 def _assemble_packed(packed_study: bytes) -> System:
     study = msgspec.msgpack.decode(packed_study, type=Study)
-    return assemble(study, study.source)
+    return assemble(study)
 
 
 def carry_out(

@@ -15,7 +15,7 @@ from safevar_sumo.campaign.cluster import has_caller
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of, verify_settings
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, problem_of, random_generator_of
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import (
@@ -81,7 +81,7 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
             "out", f"a worker does not see {share.directory}", "a directory on a disk that all workers share"
         )
     refuse_other_inputs(task, share)
-    with ExitStack() as stack:
+    with about(task.study.source), ExitStack() as stack:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
         while missing := [(run, setting) for run in runs for setting in run.look_up()]:
             for rows in np.array_split(np.arange(len(missing)), math.ceil(len(missing) / task.batch_size)):

@@ -119,11 +119,11 @@ def checked_measure(code: UserCode) -> Measure:
     expected = "a safevar_sumo.metrics.Measure(name=..., title=..., unit=..., function=...)"
     measure = code.target
     if not (isinstance(measure, Measure) and callable(measure.function)):
-        raise UserCodeError(code.source, f"{code.name} is {quoted(measure)}", expected, code.definition())
+        raise UserCodeError("", f"{code.name} is {quoted(measure)}", expected, code.definition())
     try:
         facts = msgspec.convert(msgspec.to_builtins(measure.facts), Measure)
     except (msgspec.ValidationError, TypeError) as error:
-        raise InputError(code.source, f"{code.name}: {error}", expected) from None
+        raise InputError("", f"{code.name}: {error}", expected) from None
     is_of_runs = facts.of == "runs"
     count = (lambda runs: len(runs.outcome)) if is_of_runs else len
     legal = Legal(undefined=True) if is_of_runs else FINITE

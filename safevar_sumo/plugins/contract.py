@@ -39,18 +39,18 @@ def user_errors(source: str) -> Iterator[None]:
     """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError`; errors are about the study
     `source`.
     """
-    try:
-        with about(source):
+    with about(source):
+        try:
             yield
-    except (UserCodeError, SimulationError, EnvironmentFault, KeyboardInterrupt):
-        raise
-    except BaseException as error:
-        if user_error := user_error_of(source, error):
-            raise user_error from error
-        raise
+        except (UserCodeError, SimulationError, EnvironmentFault, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            if user_error := user_error_of(error):
+                raise user_error from error
+            raise
 
 
-def user_error_of(source: str, error: BaseException) -> UserCodeError | None:
+def user_error_of(error: BaseException) -> UserCodeError | None:
     """The error with the innermost line of user code that raised an exception; None if there is no such line."""
     frames = [(frame.filename, frame.lineno, frame.name) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError) and error.filename:
@@ -60,7 +60,7 @@ def user_error_of(source: str, error: BaseException) -> UserCodeError | None:
             method = name.replace("<module>", "import")
             place = f"{file}:{line}"
             reason, legal = _reason_of(error)
-            return UserCodeError(source, f"user code raised in {method}: {reason} ({place})", legal, place)
+            return UserCodeError("", f"user code raised in {method}: {reason} ({place})", legal, place)
     return None
 
 
@@ -120,11 +120,10 @@ FINITE, POSITIVE, SHARE, TRUTH = Legal(), Legal(0.0, above=True), Legal(0.0, 1.0
 
 
 class UserCode(NamedTuple):
-    """User code as errors name it: the study, `source`; its key and name there, such as `ads.model = 'my_ads:Careful'`;
+    """User code as errors name it: its key and name in the study, such as `ads.model = 'my_ads:Careful'`;
     and the class, function or record itself.
     """
 
-    source: str
     name: str
     target: Any = None
 
@@ -141,7 +140,7 @@ class UserCode(NamedTuple):
         """The error for a wrong result of a method."""
         place = self.definition(method)
         problem = f"{self.name} returned {result} from {method}{f' ({place})' if place else ''}"
-        return UserCodeError(self.source, problem, expected, place)
+        return UserCodeError("", problem, expected, place)
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call an FMU, whose exceptions show no line of user code."""
@@ -151,7 +150,7 @@ class UserCode(NamedTuple):
             raise
         except BaseException as error:
             reason, legal = _reason_of(error)
-            raise UserCodeError(self.source, f"{self.name} raised in {method}: {reason}", legal) from error
+            raise UserCodeError("", f"{self.name} raised in {method}: {reason}", legal) from error
 
     def check_numbers(
         self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...] | None, legal: Legal = FINITE

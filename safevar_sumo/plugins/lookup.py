@@ -71,7 +71,7 @@ class Lookup(NamedTuple):
         module_name, colon, attribute = name.partition(":")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
-        code = UserCode(subject(), f"{key} = {name!r}")
+        code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
         try:
             target = getattr(module, attribute)
@@ -242,6 +242,6 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         try:
             return member.target(**parameters)
         except TypeError as error:
-            if user_error_of(subject(), error):
+            if user_error_of(error):
                 raise
             raise InputError("", f"{name} does not take {key} = {dict(parameters)}: {error}") from None

@@ -25,14 +25,9 @@ CHANGE_FORMS = (
 
 
 def read_changes(
-    changes: Sequence[str],
-    characteristics: CharacteristicSet,
-    source: str,
-    *,
-    beyond: bool = False,
-    single: bool = False,
+    changes: Sequence[str], characteristics: CharacteristicSet, *, beyond: bool = False, single: bool = False
 ) -> dict[str, list[float]]:
-    """Parse changes into the values of each named characteristic; errors name `source`. `single` refuses sweeps,
+    """Parse changes into the values of each named characteristic; `single` refuses sweeps,
     without suggesting --beyond.
 
     Raises
@@ -45,34 +40,32 @@ def read_changes(
     for change in changes:
         name, equals, text = (text.strip() for text in change.partition("="))
         if not equals:
-            raise InputError(source, repr(change), forms)
+            raise InputError("", repr(change), forms)
         if name in values_by_name:
-            raise InputError(source, f"{name} is set twice", "each characteristic once")
-        check_name(source, f"there is no characteristic {name!r}", name, characteristics.names)
+            raise InputError("", f"{name} is set twice", "each characteristic once")
+        check_name("", f"there is no characteristic {name!r}", name, characteristics.names)
         characteristic = characteristics.members[characteristics.names.index(name)]
-        values_by_name[name] = _parse_values(change, text, characteristic.original, forms, source)
+        values_by_name[name] = _parse_values(change, text, characteristic.original, forms)
         if single and len(values_by_name[name]) > 1:
-            raise InputError(source, f"{change!r} is a sweep", forms)
+            raise InputError("", f"{change!r} is a sweep", forms)
         for value in values_by_name[name]:
             hint = f", or {name}={text}% of the original" if SIGNED_NUMBER.fullmatch(text) else ""
-            characteristic.check(value, source, beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
+            characteristic.check(value, beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
         raise InputError(
-            source, f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER"
+            "", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER"
         )
     return values_by_name
 
 
-def _parse_values(change: str, text: str, original: float, forms: str, source: str) -> list[float]:
+def _parse_values(change: str, text: str, original: float, forms: str) -> list[float]:
     if percentage := PERCENTAGE.fullmatch(text):
         return [original + abs(original) * float(percentage[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
         count = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
         if count < 2:
-            raise InputError(
-                source, f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2"
-            )
+            raise InputError("", f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2")
         return np.linspace(float(sweep[1]), float(sweep[2]), count).tolist()  # type: ignore[no-any-return]
     if re.fullmatch(NUMBER_PATTERN, text):
         return [float(text)]
-    raise InputError(source, repr(change), forms)
+    raise InputError("", repr(change), forms)

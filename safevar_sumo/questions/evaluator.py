@@ -348,7 +348,7 @@ def open_evaluator(
     if pool is not None:
         yield Evaluator(study, pool, progress)
         return
-    assemble(study, study.source)
+    assemble(study)
     with open_pool(jobs) as new_pool:
         yield Evaluator(study, new_pool, progress)
 

@@ -65,7 +65,7 @@ def new_panels(
     return figure, list(axes.flat[:number])
 
 
-def save(figure: Figure, path: Path, source: str = "out") -> None:
+def save(figure: Figure, path: Path, option: str = "out") -> None:
     """Write a figure to a png, pdf or svg file; the same figure gives the same bytes.
 
     Raises
@@ -83,7 +83,7 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
             figure.savefig(file, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise InputError(
-            source,
+            option,
             f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
             f"{WRITABLE}; its name ends in .png, .pdf or .svg",
         ) from None

@@ -33,7 +33,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     if unsafe.bound is None:
         return study
     name, metrics, matrix = unsafe.bound.measure, study.metrics, study.matrix
-    known = [metric.name for metric in assemble(study, study.source).measuring.scoring.metrics]
+    known = [metric.name for metric in assemble(study).measuring.scoring.metrics]
     check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, [*known, *OPTIONAL_METRICS])
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
@@ -68,5 +68,5 @@ def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
         study=study,
         original={name: float(value[0]) for name, value in original.metrics.items()},
         solutions=solutions,
-        scoring=replace_in(case.scoring, metrics=assemble(study, study.source).measuring.scoring.metrics),
+        scoring=replace_in(case.scoring, metrics=assemble(study).measuring.scoring.metrics),
     )

@@ -109,11 +109,13 @@ def prediction_band(
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
     if point:
-        study = at_point(study, point, source="point")
-    systems = [
-        assemble(study_of_set, f"{study.source}: spread: set {k}" if k else study.source)
-        for k, study_of_set in enumerate(studies_of_sets(study))
-    ]
+        study = at_point(study, point)
+    systems = []
+    for k, one in enumerate(studies_of_sets(study)):
+        called = f"{study.source}: spread: set {k}" if k else study.source
+        systems.append(
+            assemble(msgspec.structs.replace(one, origin=msgspec.structs.replace(one.origin, called=called)))
+        )
     return [evaluate(system, settings) for system in systems]
 
 

@@ -157,7 +157,7 @@ def _drive_both(
     """Simulate the original vehicle and the causes with both models: a frame with `SETTING_COLUMNS`, and the runs."""
     characteristics, contact = system.characteristics, system.contact
     values = [{}, *(cause["changes"] | cause.get("encounter", {}) for cause in causes)]
-    settings = np.stack([characteristics.setting(one, "cause", beyond=True) for one in values])
+    settings = np.stack([characteristics.setting(one, beyond=True) for one in values])
     originals = characteristics.with_original_vehicle(settings)
     both = np.concatenate([settings, originals])
     # Shares of each setting's changes, one setting after the other; shape (settings, shares, n).

@@ -126,7 +126,7 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(point="")
     for index in np.unique(worst).tolist():
         rows, point = np.flatnonzero(worst == index), system.points[index]
-        study = at_point(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
+        study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
         settings, there = collisions.settings[rows], system.at(point)
         verdicts.loc[rows, list(drivers)] = _judge_at_point(evaluator.for_study(study), there, settings, drivers)
         verdicts.loc[rows, "point"] = point.name

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, about
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
@@ -110,7 +110,7 @@ def rating(
         )
     if not is_rated(study):
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
-    rater = assemble(study, study.source).rater
+    rater = assemble(study).rater
     assert rater is not None
     cells = evaluator.for_study(study).at_each_point(np.stack([*settings.values()]), "cells and robustness layers")
     return rate(study, rater, settings, cells)
@@ -134,10 +134,11 @@ def _variant(
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(solution))]
         setting, name = row[list(characteristics.names)].to_numpy(float), solution
     if changes:
-        values = dict(zip(characteristics.names, setting.tolist(), strict=True))
-        values |= {key: value for key, (value,) in read_changes(changes, characteristics, "set", single=True).items()}
-        setting = characteristics.setting(values, "set")
-        evaluator.region.check(setting[np.newaxis], "set")
+        with about("set"):
+            values = dict(zip(characteristics.names, setting.tolist(), strict=True))
+            values |= {key: value for key, (value,) in read_changes(changes, characteristics, single=True).items()}
+            setting = characteristics.setting(values)
+            evaluator.region.check(setting[np.newaxis])
         name = "variant" if solution is None else f"{solution} changed"
     return {name: setting} if changes or solution else {}
 

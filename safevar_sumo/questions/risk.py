@@ -75,7 +75,7 @@ def risk(
     evaluator.plan(SAMPLING, SENSITIVITY)
     with evaluator.stage(SAMPLING, samples):
         for start in range(0, samples, VEHICLES_PER_CALL):
-            vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng, study.source)
+            vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
             batches.append(evaluator.evaluate(vehicles, SAMPLING))
     drawn = Evaluations.concatenate(batches)
     simulated = drawn.take(np.flatnonzero(drawn.valid))

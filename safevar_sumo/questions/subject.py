@@ -164,7 +164,7 @@ def reduce_to_point(subject: Study | Case, point: str | None) -> Study | Case:
 
     if point is None:
         return subject
-    return at_point(subject, point, source="point") if isinstance(subject, Study) else case_at(subject, point)
+    return at_point(subject, point) if isinstance(subject, Study) else case_at(subject, point)
 
 
 def case_at(case: Case, point: str) -> Case:
@@ -180,7 +180,7 @@ def case_at(case: Case, point: str) -> Case:
     from safevar_sumo.sumo.matrix import at_point, evaluate
     from safevar_sumo.sumo.system import assemble
 
-    study, names = at_point(case.study, point, source="point"), list(case.characteristics.names)
+    study, names = at_point(case.study, point), list(case.characteristics.names)
     system = assemble(study)
     scoring = system.measuring.scoring
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[names].to_numpy(float)])
@@ -210,7 +210,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:
         return []
-    present = manifest_of(study, identity_of(study, assemble(study, str(directory)), manifest.get("files", {})))
+    present = manifest_of(study, identity_of(study, assemble(study), manifest.get("files", {})))
     changes = [text for _, text, matters in differences(manifest, present) if matters]
     if changes and not as_it_is_now:
         more = len(changes) - MAX_CHANGES_NAMED

@@ -37,6 +37,7 @@ class VariationModel:
             self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
         distributions = [study.variation.get(name, Uniform()) for name in self.characteristics.names]
+        self._study = study.source
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
         self.is_correlated, correlations = bool(study.correlations), np.eye(len(distributions))
         for correlation in study.correlations:
@@ -56,14 +57,14 @@ class VariationModel:
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
         return np.clip(np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper)
 
-    def draw(self, number: int, rng: np.random.Generator, source: object) -> FloatArray:
+    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Random vehicles that satisfy the constraints, shape (number, n)."""
         settings = self.region.draw_feasible(
             lambda count: self.settings(rng.random((count, len(self.characteristics)))), number
         )
         if len(settings) < number:
             raise InputError(
-                source,
+                self._study,
                 f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: {self.region}",
                 "a [variation] and [[constraints]] that agree",
             )

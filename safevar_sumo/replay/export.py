@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, InputError
+from safevar_sumo.errors import EnvironmentFault, InputError, about
 from safevar_sumo.questions.ask import PointName
 from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
@@ -144,7 +144,7 @@ def open_drive(network: Network) -> str:
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
 
-def carla_physics(setting: Mapping[str, float], source: str) -> dict[str, dict[str, float]]:
+def carla_physics(setting: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """The values of CARLA's physics and of each wheel, by attribute.
 
     Raises
@@ -157,11 +157,9 @@ def carla_physics(setting: Mapping[str, float], source: str) -> dict[str, dict[s
         problem = (
             f"{', '.join(without)} of its vehicle {'has' if len(without) == 1 else 'have'} no counterpart in CARLA"
         )
-        raise InputError(source, problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`")
+        raise InputError("", problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`")
     if missing := [name for name in names if name not in setting]:
-        raise InputError(
-            source, f"its vehicle has no {', '.join(missing)}", "the vehicle `carla`, or `to=openscenario`"
-        )
+        raise InputError("", f"its vehicle has no {', '.join(missing)}", "the vehicle `carla`, or `to=openscenario`")
     return {
         "physics": {attribute: setting[name] for name, attribute in CARLA_PHYSICS.items()},
         "wheels": {attribute: setting[name] for name, attribute in CARLA_WHEELS.items()},
@@ -224,12 +222,13 @@ def export(
     if out.exists() or out.is_symlink():
         raise InputError("out", f"{out} exists", "a new directory")
     target = load_target(directory, solution, [], as_it_is_now, point)
-    system = assemble(target.study, directory)
+    system = assemble(target.study)
     setting = target.setting(system)
     vehicle = system.characteristics.vehicle
     of_vehicle = setting[system.characteristics.of_vehicle]
     values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
-    physics = carla_physics(values, directory) if to == "carla" else {}
+    with about(directory):
+        physics = carla_physics(values) if to == "carla" else {}
     write_files(compare_setting(target.study, system, setting), to, out, solution, physics)
     return f"{to}: {out}"
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -155,11 +155,12 @@ def simulate(
     choices = {"most_severe": most_severe, "fewest": fewest, "smallest": smallest}
     chosen = [name for name, given in choices.items() if given]
     target = load_target(source, solution, chosen, as_it_is_now, point)
-    system = assemble(target.study, source)
-    values = read_changes(set, system.characteristics, "set", beyond=beyond)
-    requested = _combine(values, target.setting(system), system)
-    if not beyond and set:
-        system.check_feasible(requested, "set", filtered=not no_filter, switch="--beyond")
+    system = assemble(target.study)
+    with about("set"):
+        values = read_changes(set, system.characteristics, beyond=beyond)
+        requested = _combine(values, target.setting(system), system)
+        if not beyond and set:
+            system.check_feasible(requested, filtered=not no_filter, switch="--beyond")
     for path, name, endings in ((trace, "trace", (".csv",)), (animate, "animate", animation.ENDINGS)):
         if path is not None:
             check_writable(path, name, endings, but=SOLUTIONS)
@@ -253,15 +254,14 @@ def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_n
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
     whole = study_in(subject)
-    study = whole if point is None else at_point(whole, point, source="point")
+    study = whole if point is None else at_point(whole, point)
     if isinstance(subject, Study) or not wanted:
         return Target(study, source)
     subject.require_solutions()
-    handle = (
-        choose_handle(subject.solutions, subject.unsafe, chosen[0], source)
-        if chosen
-        else SolutionId.parse(str(solution))
-    )
+    with about(source):
+        handle = (
+            choose_handle(subject.solutions, subject.unsafe, chosen[0]) if chosen else SolutionId.parse(str(solution))
+        )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
     return Target(study, source, handle, {str(name): value for name, value in row.items()})
 

@@ -151,7 +151,7 @@ def usual_questions(case: Case, directory: Path, point: str | None = None) -> li
     """
     if is_rated(case.study) and point is None:
         any_unsafe = case.unsafe.rows(case.solutions).any()
-        handle = choose_handle(case.solutions, case.unsafe, "fewest", directory) if any_unsafe else None
+        handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]
     promises = case.study.repair.promise or case.study.limits
     return [*USUAL_QUESTIONS, *(["repair"] if promises else [])]

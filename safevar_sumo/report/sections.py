@@ -120,7 +120,7 @@ class ReportedStudy:
 
     @cached_property
     def system(self) -> System:
-        return assemble(self.case.study, str(self.directory))
+        return assemble(self.case.study)
 
     @cached_property
     def choices(self) -> dict[str, str]:
@@ -128,7 +128,7 @@ class ReportedStudy:
         solutions, chosen = self.case.solutions, dict[str, list[str]]()
         names = [] if solutions.empty else list(FIRST_CHOICES)
         for name in names if self.case.unsafe.rows(solutions).any() else names[-1:]:
-            handle = choose_handle(solutions, self.case.unsafe, name, self.directory)
+            handle = choose_handle(solutions, self.case.unsafe, name)
             chosen.setdefault(str(handle), []).append(FIRST_CHOICES[name])
         return {handle: ", ".join(reasons) for handle, reasons in chosen.items()}
 
@@ -268,7 +268,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     causes = [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]
     for row, encounter in causes:
         name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
-        settings[name] = characteristics.setting({**row, **encounter}, "cause", beyond=True)
+        settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))

@@ -194,7 +194,7 @@ CHOICES = {
 """Objectives that decide a choice, in order; smaller values first."""
 
 
-def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
+def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str) -> SolutionId:
     """The handle of the solution that a choice selects: `most_severe` among all solutions, any other choice among the
     unsafe ones.
 
@@ -215,7 +215,7 @@ def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: 
     if candidates.empty:
         missing = "solution" if table.empty else "unsafe solution"
         raise InputError(
-            source,
+            "",
             f"these results hold no {missing}",
             "other results, the most severe solution, or a solution by its handle",
         )

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from safevar_sumo.errors import subject
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import Legal, Returned, UserCode, quoted, read_only, user_errors
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -64,7 +65,7 @@ def check_search(code: UserCode, method: str, search: Any, problem: Problem, rng
     budget = problem.evaluations
     answer = None
     while True:
-        with user_errors(code.source), np.errstate():
+        with user_errors(subject()), np.errstate():
             try:
                 output = search.send(answer)
             except StopIteration as end:
@@ -91,7 +92,7 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
         advice = (
             f", for every setting that {code.name} yields: problem.characteristics.filter(problem.repaired(settings))"
         )
-        problem.region.check(settings, code.source, otherwise=advice)
+        problem.region.check(settings, otherwise=advice)
     return settings
 
 

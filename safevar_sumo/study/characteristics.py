@@ -253,7 +253,7 @@ class Limit(Table, frozen=True, kw_only=True):
 
 
 def limits_of(
-    texts: Iterable[str], rows: Mapping[str, Domain], stated: Mapping[str, Limit] | None = None, source: str = "limits"
+    texts: Iterable[str], rows: Mapping[str, Domain], stated: Mapping[str, Limit] | None = None
 ) -> dict[str, Limit]:
     """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >= 3`, and where a text
     does not replace them, those `stated` in a study.
@@ -268,26 +268,26 @@ def limits_of(
     for text in texts:
         match = LIMIT_FORM.fullmatch(text)
         if match is None:
-            raise InputError(source, repr(text), FORMS)
+            raise InputError("", repr(text), FORMS)
         name = match[1]
         side = "at_least" if match[2] == ">=" else "at_most"
         if side in sides.setdefault(name, {}):
-            raise InputError(source, f"{name} {match[2]} is given twice", "each limit once")
+            raise InputError("", f"{name} {match[2]} is given twice", "each limit once")
         sides[name][side] = float(match[3])
     try:
         typed = {name: Limit(**limit) for name, limit in sides.items()}
     except ValueError as error:
         problem, _, legal = str(error).partition("\n")
-        raise InputError(source, f"{', '.join(texts)}: {problem}", legal) from None
-    check_limits(rows, typed, source)
+        raise InputError("", f"{', '.join(texts)}: {problem}", legal) from None
+    check_limits(rows, typed)
     limits = {**(stated or {}), **typed}
     return {name: limits[name] for name in rows if name in limits}
 
 
-def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], source: object = "", table: str = "") -> None:
+def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], table: str = "") -> None:
     """Refuse limits of unknown characteristics, outside the domain, or that exclude the original."""
     for name, limit in limits.items():
-        check_name(source, f"{table}{name}: there is no such characteristic", name, rows)
+        check_name("", f"{table}{name}: there is no such characteristic", name, rows)
         row = rows[name]
         unit = unit_text(rows[name].unit)
         for side, lower, upper in (("at_least", row.lower, row.original), ("at_most", row.original, row.upper)):
@@ -297,4 +297,4 @@ def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], source
                 if row.lower <= value <= row.upper:
                     why = f": the original, {row.original:g}{unit}, does not keep it"
                 legal = f"a number in [{lower:g}, {upper:g}]{unit}"
-                raise InputError(source, f"{table}{name}.{side} = {value:g}{why}", legal)
+                raise InputError("", f"{table}{name}.{side} = {value:g}{why}", legal)

@@ -107,7 +107,7 @@ def _checked_study(raw: _RawStudy) -> Study:
 def _converted(raw: _RawStudy) -> Study:
     if "origin" in raw.tables:
         raise InputError("", "origin: there is no such key")
-    tables = with_file(raw.source, raw.tables, raw.origin.places)
+    tables = with_file(raw.tables, raw.origin.places)
     tables = _with_parameters(_with_parameters(tables, "search", SearchTable), "repair", RepairTable)
     matrix = tables.get("matrix")
     vehicle = tables.get("vehicle")
@@ -326,5 +326,6 @@ def data_files(study: Study) -> dict[str, str]:
                 raise InputError(study.source, problem, f"the path of a file or folder, relative to {places[0]}")
             paths[name] = found[0]
     if study.scenario.model == MODEL:
-        paths |= files_of(study.scenario.parameters, study.origin.places, study.source)
+        with about(study.source):
+            paths |= files_of(study.scenario.parameters, study.origin.places)
     return paths

@@ -24,29 +24,29 @@ WEATHER = tuple(free_parameters(Weather))
 Raw = Mapping[str, Any]
 
 
-def path_of(name: str, places: Sequence[str], source: object) -> str:
+def path_of(name: str, places: Sequence[str]) -> str:
     """The path of a file that a study names, beside the study."""
     for place in places or (os.getcwd(),):
         if (path := Path(place, name)).is_file():
             return os.path.abspath(path)
-    raise InputError(source, f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)")
+    raise InputError("", f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)")
 
 
-def files_of(scenario: Parameters, places: Sequence[str], source: object) -> dict[str, str]:
+def files_of(scenario: Parameters, places: Sequence[str]) -> dict[str, str]:
     """The paths of all files that a scenario from a file depends on, by themselves."""
     file = scenario.get("file")
     if not isinstance(file, str):
         return {}
-    path = path_of(file, places, source)
+    path = path_of(file, places)
     given = {name: str(value) for name, value in scenario.items() if name not in ("file", "ego")}
     try:
         document = read(path, given)
     except InputError as error:
-        raise InputError(source, f"scenario.file = {file!r}: {error.problem}", error.legal) from None
+        raise InputError("", f"scenario.file = {file!r}: {error.problem}", error.legal) from None
     return {name: name for name in (path, *document.catalogs, document.road)}
 
 
-def with_file(source: object, tables: Raw, places: Sequence[str]) -> Parameters:
+def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
     """The tables of a study whose scenario names a `file`, with all that the file says in its place.
 
     A range that is searched becomes its domain; what is not searched and has several values becomes points of the
@@ -58,22 +58,22 @@ def with_file(source: object, tables: Raw, places: Sequence[str]) -> Parameters:
     for key in ("model", "parameters", "files"):
         if scenario.get(key):
             raise InputError(
-                source, f"scenario.{key} beside scenario.file", "one of the two; values stand in [scenario.values]"
+                "", f"scenario.{key} beside scenario.file", "one of the two; values stand in [scenario.values]"
             )
     name = scenario["file"]
     values = scenario.get("values", {})
     search = scenario.get("search", {})
     for key, value, kind in (("file", name, str), ("values", values, dict), ("search", search, dict)):
         if not isinstance(value, kind):
-            raise InputError(source, f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
-    path = path_of(name, places, source)
+            raise InputError("", f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
+    path = path_of(name, places)
     try:
-        return _expanded(source, tables, open_file(path), places)
+        return _expanded(tables, open_file(path), places)
     except InputError as error:
-        raise InputError(source, f"scenario.file = {name!r}: {error.problem}", error.legal) from None
+        raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
 
 
-def _expanded(source: object, tables: Raw, offered: Source, places: Sequence[str]) -> Parameters:
+def _expanded(tables: Raw, offered: Source, places: Sequence[str]) -> Parameters:
     scenario: Parameters = tables["scenario"]
     values = scenario.get("values", {})
     search = scenario.get("search", {})

@@ -80,35 +80,35 @@ def parse_xml(source: Path) -> ElementTree.Element:
         raise InputError(source, f"is not XML: {error}") from None
 
 
-def write_roads(root: ElementTree.Element, n: int, file: Path, source: Path) -> None:
+def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
     """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before
     connections.
 
     Raises
     ------
     InputError
-        If an element of the `source` cannot be copied.
+        If an element cannot be copied.
     """
     blocks = []
     for tag, children in groupby(root, key=lambda child: child.tag):
         if tag in SHARED_ELEMENTS:
             blocks += [ElementTree.tostring(child, encoding="unicode") for child in children]
         else:
-            elements = "".join(_marked_xml(child, ROAD_IDS, source) for child in children)
+            elements = "".join(_marked_xml(child, ROAD_IDS) for child in children)
             blocks += [elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)]
     _write(root, blocks, file)
 
 
-def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path, source: Path) -> None:
+def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> None:
     """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file. There is
     one traffic for all copies, or one for each.
 
     Raises
     ------
     InputError
-        If an element of the `source` cannot be copied.
+        If an element cannot be copied.
     """
-    texts = [[(time, _marked_xml(child, DEMAND_IDS, source)) for child, time in _departures(root)] for root in roots]
+    texts = [[(time, _marked_xml(child, DEMAND_IDS)) for child, time in _departures(root)] for root in roots]
     copies = sorted(
         ((time, copy, text) for copy in range(n) for time, text in texts[copy % len(texts)]), key=itemgetter(0)
     )
@@ -140,11 +140,11 @@ def parse_seconds(text: str) -> float | None:
     return total if math.isfinite(total) else None
 
 
-def _marked_xml(element: ElementTree.Element, ids: IdAttributes, source: Path) -> str:
+def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
     """An element as XML with a placeholder in every id; changes the element."""
     for part in element.iter():
         if part.tag not in ids:
-            raise InputError(source, f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
+            raise InputError("", f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
         for name in set(ids[part.tag]) & part.attrib.keys():
             part.set(name, " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()))
     return ElementTree.tostring(element, encoding="unicode")

@@ -212,7 +212,7 @@ def system_at_worst_point(system: System, settings: FloatArray) -> System:
     return system.at(system.points[worst_points(system, at_points)[0]])
 
 
-def at_point(study: Study, name: str, source: object) -> Study:
+def at_point(study: Study, name: str) -> Study:
     """The study at a named point of its matrix alone.
 
     Raises
@@ -224,7 +224,7 @@ def at_point(study: Study, name: str, source: object) -> Study:
     if study.matrix is None or name not in points:
         similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
-        raise InputError(source, repr(name), legal if points else "a study with a matrix")
+        raise InputError("point", repr(name), legal if points else "a study with a matrix")
     search = replace_in(study.search, objectives=[*OBJECTIVES]) if study.matrix.protocol else study.search
     matrix = replace_in(study.matrix, point=name)
     origin = replace_in(study.origin, point=name)

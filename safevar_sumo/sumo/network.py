@@ -21,7 +21,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from safevar_sumo.errors import EnvironmentFault, InputError, did_you_mean
+from safevar_sumo.errors import EnvironmentFault, InputError, about, did_you_mean
 from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.shipped import NETWORKS
@@ -156,11 +156,12 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
     traffic_file = network.path(TRAFFIC_FILE)
 
     def copy_roads(into: Path) -> None:
-        source = network.path(network.roads_file) if network.is_built else network.folder
-        write_roads(parse_xml(built_network(network)), size, into / NETWORK_FILE, source)
+        with about(network.path(network.roads_file) if network.is_built else network.folder):
+            write_roads(parse_xml(built_network(network)), size, into / NETWORK_FILE)
 
     def copy_traffic(into: Path) -> None:
-        write_demand([_changed(traffic_file, network.traffic_changes)], n, into / TRAFFIC_FILE, traffic_file)
+        with about(traffic_file):
+            write_demand([_changed(traffic_file, network.traffic_changes)], n, into / TRAFFIC_FILE)
 
     roads = cache_folder_name(network, size, _road_digests(network))
     traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)])
@@ -181,7 +182,8 @@ def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
     with TemporaryDirectory() as folder:
         file = Path(folder, TRAFFIC_FILE)
         roots = [_changed(traffic_file, network.traffic_changes) for network in networks]
-        write_demand(roots, len(roots), file, traffic_file)
+        with about(traffic_file):
+            write_demand(roots, len(roots), file)
         yield files._replace(traffic=file)
 
 

@@ -132,12 +132,10 @@ class System:
         """The system reduced to one point."""
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=(), rater=None)
 
-    def check_feasible(
-        self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True"
-    ) -> None:
+    def check_feasible(self, settings: FloatArray, *, filtered: bool, switch: str = "beyond=True") -> None:
         """Refuse settings, shape (M, n), that violate a constraint; raises the errors of `FeasibleRegion.check`."""
         self.region.check(
-            self.characteristics.filter(settings) if filtered else settings, source, otherwise=f", or any with {switch}"
+            self.characteristics.filter(settings) if filtered else settings, otherwise=f", or any with {switch}"
         )
 
     @property
@@ -196,16 +194,15 @@ class System:
         return self.vehicle.prepare(original, 1.0, 0.1)  # road friction 1, time step 0.1 s
 
 
-def assemble(study: Study, source: str = "") -> System:
-    """Load the study's models and create them with their parameters; errors name the study by `source`.
+def assemble(study: Study) -> System:
+    """Load the study's models and create them with their parameters.
 
     Raises
     ------
     InputError
         Naming the study, the key, the value and the legal values.
     """
-    source = source or study.source
-    with user_errors(source), _ONE_AT_A_TIME:
+    with user_errors(study.source), _ONE_AT_A_TIME:
         return _assemble(study)
 
 
@@ -268,7 +265,7 @@ def _assemble(study: Study) -> System:
         nominal=nominal,
         measuring=measuring,
         region=region,
-        source=subject(),
+        source=study.source,
         scenes=scenes,
         matrix=matrix,
         rater=rater,
@@ -434,7 +431,7 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         path = file_beside(table.model, lookup.folders)
         if not path:
             raise InputError("", f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
-        code = UserCode(subject(), f"ads.model = {table.model!r}")
+        code = UserCode(f"ads.model = {table.model!r}")
         fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
         fleet.max_vehicles = MAX_INSTANCES
         return fleet

@@ -41,7 +41,6 @@ class TraciController(Ads):
 
     def __init__(self, create: Callable[[], Controller]) -> None:
         self._create = create
-        self._source = subject()
         self._world: Any = None
         self._sensors: Any = None
 
@@ -92,12 +91,12 @@ class TraciController(Ads):
         global _active_view
         _active_view = view
         try:
-            with user_errors(self._source), np.errstate():
+            with user_errors(subject()), np.errstate():
                 function(traci_module(), VUT)
         finally:
             _active_view = None
         if view.last_error is not None:  # the controller caught the error and continued
-            raise user_error_of(self._source, view.last_error) or view.last_error
+            raise user_error_of(view.last_error) or view.last_error
 
 
 class _Memory(NamedTuple):

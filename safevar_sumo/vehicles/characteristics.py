@@ -111,9 +111,7 @@ class Characteristic:
         """The unit as text after a number; empty without a unit."""
         return unit_text(self.unit)
 
-    def check(
-        self, value: float, source: object, *, beyond: bool = False, otherwise: str = "", switch: str = "beyond=True"
-    ) -> None:
+    def check(self, value: float, *, beyond: bool = False, otherwise: str = "", switch: str = "beyond=True") -> None:
         """Refuse a value that is not a number or not legal (`is_legal`).
 
         `otherwise` describes further legal values; `switch` is the option that allows values beyond the domain, empty
@@ -134,7 +132,7 @@ class Characteristic:
             is_outside_domain = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
             hint = f", or any with {switch}" if is_outside_domain and switch else ""
             raise InputError(
-                source,
+                "",
                 f"{self.name} = {value}{' is outside its domain' if is_outside_domain else ''}",
                 f"{expected}{self.suffix}{otherwise}{hint}",
             )
@@ -245,7 +243,7 @@ class CharacteristicSet:
         """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method section 3)."""
         return np.asarray(np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1), dtype=float)
 
-    def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False) -> FloatArray:
+    def setting(self, values: Mapping[str, float], *, beyond: bool = False) -> FloatArray:
         """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the
         domain are legal.
 
@@ -256,13 +254,11 @@ class CharacteristicSet:
         """
         values = plain_values(values)
         if not isinstance(values, Mapping):
-            raise InputError(
-                source, f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}"
-            )
+            raise InputError("", f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}")
         setting = self.original.copy()
         for name, value in values.items():
-            check_name(source, f"there is no characteristic {name!r}", name, self.names)
+            check_name("", f"there is no characteristic {name!r}", name, self.names)
             column = self.names.index(name)
-            self.members[column].check(value, source, beyond=beyond)
+            self.members[column].check(value, beyond=beyond)
             setting[column] = value
         return setting

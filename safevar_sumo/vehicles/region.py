@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, subject
+from safevar_sumo.errors import InputError, about, subject
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
@@ -96,7 +96,7 @@ class FeasibleRegion:
         """Which settings satisfy all constraints; shape (N,)."""
         return np.asarray(self.violation(settings) == 0)
 
-    def check(self, settings: FloatArray, source: object, *, otherwise: str = "") -> None:
+    def check(self, settings: FloatArray, *, otherwise: str = "") -> None:
         """Refuse settings, shape (N, n), that are not feasible.
 
         Raises
@@ -114,7 +114,7 @@ class FeasibleRegion:
             )
             quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
             problem = f"violates a constraint: {quantity} ({values})"
-            raise InputError(source, problem, bound.condition + otherwise)
+            raise InputError("", problem, bound.condition + otherwise)
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
         """Settings moved towards the original until they are feasible, shape (N, n); if `filtered`, feasible after the
@@ -159,11 +159,9 @@ def region_of(study: Study) -> FeasibleRegion:
     region = FeasibleRegion(characteristics, bounds)
     if not bounds:
         return region
-    region.check(
-        characteristics.original[np.newaxis],
-        f"{subject()}: the original vehicle",
-        otherwise="; the original vehicle must satisfy every constraint",
-    )
+    with about(f"{subject()}: the original vehicle"):
+        required = "; the original vehicle must satisfy every constraint"
+        region.check(characteristics.original[np.newaxis], otherwise=required)
     shape = (N_PROBES, len(characteristics))
     probes = np.random.default_rng(0).uniform(characteristics.lower, characteristics.upper, shape)
     if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:

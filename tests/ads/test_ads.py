@@ -108,7 +108,7 @@ class Timid(ScalarAds):
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
-    ads = PerVehicleAds(Timid, UserCode("it.toml", "ads"))
+    ads = PerVehicleAds(Timid, UserCode("ads"))
     nominal = SYSTEMS["krauss"].nominal
     memory = ads.start(3, nominal, STEP)
     gap = np.array([5.0, 50.0, 50.0])
@@ -161,8 +161,8 @@ class NearForMany(Hold):
 
 def test_an_ads_of_ones_own_warns() -> None:
     original = CARLA.characteristics.original
-    for_many = checked_class(UserCode("it.toml", "ads", NearForMany), Ads)()
-    for ads in (PerVehicleAds(Near, UserCode("it.toml", "ads")), for_many):
+    for_many = checked_class(UserCode("ads", NearForMany), Ads)()
+    for ads in (PerVehicleAds(Near, UserCode("ads")), for_many):
         run = driven(CarToCar(test="CCRs", speed=36), ads, np.stack([original, original]))
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)
 

@@ -87,7 +87,7 @@ def small(in_tmp: Path) -> Make:
         Path("small.toml").write_text(
             f'extends = "native"\nname = "small"\n[ads]\nkind = "fmu"\nmodel = "Small.fmu"\n{table}'
         )
-        return assemble(load_study("small.toml"), "small.toml")
+        return assemble(load_study("small.toml"))
 
     return system
 
@@ -136,7 +136,7 @@ class Law(Ads):
         return pedals_for(nominal, seen.speed, wish, trim), (nominal, trim)
 """)
     Path("law.toml").write_text('extends = "native"\nname = "law"\n[ads]\nmodel = "law:Law"')
-    law = assemble(load_study("law.toml"), "law.toml")
+    law = assemble(load_study("law.toml"))
     members = law.characteristics
     settings = np.random.default_rng(5).uniform(members.lower, members.upper, (12, len(members)))
     expected = evaluate(law, settings)

@@ -195,7 +195,7 @@ def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     points = simulate_all_points(system, system.characteristics.original[np.newaxis])
     worst = points[worst_points(system, [point.evaluations for point in points])[0]].point.name
     assert worst != points[-1].point.name  # the last one that is driven
-    alone = sv.simulate(at_point(study, worst, "the test")).trace
+    alone = sv.simulate(at_point(study, worst)).trace
     pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
 
 

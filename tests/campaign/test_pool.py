@@ -169,7 +169,7 @@ def test_a_full_disk_or_memory_is_no_property_of_a_setting(fail: Callable[..., l
 
 def reproduced(study: Study, **values: float) -> str:
     """What follows the study's name in the command that reproduces these values."""
-    setting = CharacteristicSet.of(study).setting(values, "test", beyond=True)
+    setting = CharacteristicSet.of(study).setting(values, beyond=True)
     return reproduction_command(study, setting).partition(f"simulate {study.name}")[2]
 
 
@@ -180,10 +180,7 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
     assert reproduced(study, mass=original + 5) == f" --set mass={original + 5} --no-filter"
     assert reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
     point = assemble(study).matrix[3].name
-    assert (
-        reproduced(at_point(study, point, "test"), mass=original + 200)
-        == f" --point '{point}' --set mass={original + 200}"
-    )
+    assert reproduced(at_point(study, point), mass=original + 200) == f" --point '{point}' --set mass={original + 200}"
 
 
 def half(number: float) -> float:

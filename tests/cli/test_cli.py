@@ -121,7 +121,7 @@ def test_a_gate_ends_with_code_3(condition: str, code: int, words: str, capfd: p
     ],
 )
 def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]) -> None:
-    (result,) = read_changes((change,), SUN, "--set").values()
+    (result,) = read_changes((change,), SUN).values()
     assert result == pytest.approx(values)
 
 

@@ -32,6 +32,6 @@ def mine(folder: Path) -> Mine:
     def result(module: str, table: str = ADS) -> System:
         (folder / "mine.py").write_text(module)
         (folder / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{table}')
-        return assemble(load_study(str(folder / "mine.toml")), "mine.toml")
+        return assemble(load_study(str(folder / "mine.toml")))
 
     return result

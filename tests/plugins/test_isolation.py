@@ -168,7 +168,7 @@ class Diverges(Vehicle):
         return result._replace(speed=np.where(self._is_heavy & (self._calls >= self.steps), self.speed, result.speed))
 
 
-USERS = checked_class(UserCode("it.toml", "vehicle.model = 'mine:Mine'", Diverges), Vehicle)
+USERS = checked_class(UserCode("vehicle.model = 'mine:Mine'", Diverges), Vehicle)
 
 
 BOTH = np.stack([HEAVY, ORIGINAL])

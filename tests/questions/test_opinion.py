@@ -226,7 +226,7 @@ def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> No
     assert "; with our model borderline: only 79 % of its neighbours are unsafe too;" in here.because
     system, vehicle = assemble_both_systems(study)
     frictions, characteristics = np.linspace(1.0, 3.5, 60), system.characteristics
-    settings = np.stack([characteristics.setting({**WORN_TYRES, "tireFric": one}, "cause") for one in frictions])
+    settings = np.stack([characteristics.setting({**WORN_TYRES, "tireFric": one}) for one in frictions])
     runs = evaluate(replace(system, vehicle=vehicle), settings)
     least = float(frictions[runs.collided].max())
     cause = causes(("nsga2:0:0", {**WORN_TYRES, "tireFric": least}, 0.99, 1.0))

@@ -216,7 +216,7 @@ def box_of(
     columns = list(range(n))
     scans = scan(evaluator, columns, Unsafe())
     ends = [{one.characteristic.name: end} for one in scans for interval in one.of_state("unsafe") for end in interval]
-    known = np.array([evaluator.characteristics.setting(end, "end") for end in ends]).reshape(-1, n)
+    known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
     return find_limits_together(Models(tuple(fits), ()), columns, limits, scans, known, budget)
 
 

@@ -124,7 +124,7 @@ def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() ->
 def answer_about(*impacts: Any, claims: dict[str, list[str]] | None = None) -> Answer:
     """The answer about the original and a variant with worn tyres, from the impacts of both."""
     characteristics = CharacteristicSet.of(STUDY)
-    vehicles = {"original": characteristics.original, "variant": characteristics.setting({"treadDepth": 3.0}, "it")}
+    vehicles = {"original": characteristics.original, "variant": characteristics.setting({"treadDepth": 3.0})}
     cells = CellResults(*(np.concatenate(values) for values in zip(*map(results, impacts), strict=True)))
     return rate(STUDY, Rater(protocol=PROTOCOL, claims=claims or {}), dict([*vehicles.items()][: len(impacts)]), cells)
 

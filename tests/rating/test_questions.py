@@ -79,7 +79,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_points_that_are_kept() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
     members = evaluator.characteristics
-    settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
+    settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}) for value in (0.5, 0.6)])
     original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
     case = case_of(STUDY, original, evaluations)
     points = float(original.column("rating_points")[0])

@@ -149,7 +149,7 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     study = load_study(
         "sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={}
     )
-    setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
+    setting = assemble(study).characteristics.setting({"tireFric": 1.3})[np.newaxis]
     alone = [
         evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting)
         for gap in (OWN, OWN - 1, OWN + 1)

@@ -63,7 +63,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     out = results.with_name("out")
     chosen = ("--point", point) if point else ()
     run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
-    there = assemble(at_point(load_study(study), point, "")) if point else system
+    there = assemble(at_point(load_study(study), point)) if point else system
     return out, compare_setting(load_study(study), there, setting)
 
 

@@ -208,18 +208,18 @@ def test_the_error_for_a_missing_solution_names_the_present_ones(handle: str, le
 
 
 def test_chosen_by_what_they_are_among_the_unsafe() -> None:
-    assert str(choose_handle(FRAME, Unsafe(), "most_severe", "x")) == "nsga2:0:0"
-    assert str(choose_handle(FRAME, Unsafe(), "fewest", "x")) == "nsga2:0:1"
-    assert str(choose_handle(FRAME, Unsafe(), "smallest", "x")) == "nsga2:3:0"
+    assert str(choose_handle(FRAME, Unsafe(), "most_severe")) == "nsga2:0:0"
+    assert str(choose_handle(FRAME, Unsafe(), "fewest")) == "nsga2:0:1"
+    assert str(choose_handle(FRAME, Unsafe(), "smallest")) == "nsga2:3:0"
 
 
 def test_without_a_collision_half_the_distance_is_unsafe() -> None:
     safe = FRAME[FRAME["outcome"] == "stopped"]
     wide, narrow = (Unsafe.default({"safety_degree": degree}, safe["outcome"]) for degree in (4.1, 4.0))
-    assert str(choose_handle(safe, wide, "smallest", "x")) == "rs:0:0"
+    assert str(choose_handle(safe, wide, "smallest")) == "rs:0:0"
     with pytest.raises(InputError, match="no unsafe solution"):
-        choose_handle(safe, narrow, "smallest", "x")
-    assert str(choose_handle(safe, narrow, "most_severe", "x")) == "rs:0:0"
+        choose_handle(safe, narrow, "smallest")
+    assert str(choose_handle(safe, narrow, "most_severe")) == "rs:0:0"
 
 
 def test_a_point_is_lost_to_six_decimals() -> None:

@@ -275,8 +275,8 @@ def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> No
     ],
 )
 def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:
-    with pytest.raises(InputError, match=re.escape(f"--promise: {message}")) as caught:
-        limits_of(texts.split(", "), ROWS, source="--promise")
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        limits_of(texts.split(", "), ROWS)
     assert len(str(caught.value).splitlines()) <= 2
 
 

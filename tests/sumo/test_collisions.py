@@ -89,7 +89,7 @@ def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> 
     scenario = {"model": "crossing", "parameters": parameters}
     system = assemble(sv.load_study("sun", scenario=scenario, ads={"model": "aeb"}))
     weak = {"maxBrakeTorque": 400.0, "tireFric": 0.3}
-    setting = system.characteristics.setting(weak, "changes", beyond=True)[np.newaxis]
+    setting = system.characteristics.setting(weak, beyond=True)[np.newaxis]
     ((_, evaluations, runs),) = simulate_all_points(system, setting)
     assert evaluations.outcome[0] == "collision"
     # The car crosses at right angles: what closes is the vehicle's own speed.
@@ -193,7 +193,7 @@ def test_a_hit_on_a_moving_car_is_as_bad_as_it_closes(parameters: dict[str, obje
     """`relative_impact_speed` is that of the moment of contact, within the last step."""
     scenario = {"model": "car_to_car", "parameters": parameters}
     system = assemble(sv.load_study("sun", scenario=scenario, ads={"model": "aeb"}))
-    weak = system.characteristics.setting({"maxBrakeTorque": 600.0, "tireFric": 0.5}, "changes", beyond=True)
+    weak = system.characteristics.setting({"maxBrakeTorque": 600.0, "tireFric": 0.5}, beyond=True)
     ((_, evaluations, runs),) = simulate_all_points(system, weak[np.newaxis])
     assert evaluations.outcome[0] == "collision"
     assert evaluations.f_safe[0] == pytest.approx(other - runs.collision_speed[0], abs=1e-9)

@@ -172,7 +172,7 @@ def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
 
 
 def test_a_robot_drives_who_does_nothing_to_the_target_but_braking_for_nobody_is_told_with_its_points() -> None:
-    test = at_point(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear", "test")
+    test = at_point(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear")
     assert reason(test, lambda seen: (0, 0)) == ""
     assert reason(test, lambda seen: (0, 1)) == BRAKES + NO_VERDICT
     assert reason(test, lambda seen: (0, 0.1 * (seen.time == 0))).startswith(

@@ -83,7 +83,7 @@ def system(name: str, script: str = SCRIPT, **tables: object) -> System:
 
 
 def changed(of: System, **values: float) -> np.ndarray:
-    return of.characteristics.setting(values, "test")[np.newaxis]
+    return of.characteristics.setting(values)[np.newaxis]
 
 
 @pytest.mark.slow

@@ -299,9 +299,9 @@ def test_filter_is_idempotent_and_keeps_or_restores(settings: np.ndarray) -> Non
 @pytest.mark.parametrize("value", [1.0, 5000.0, float("nan"), float("inf")])
 def test_a_value_outside_the_domain_is_refused(value: float) -> None:
     with pytest.raises(InputError, match=r"mass = .*\nexpected: a number in \[2040, 2700\] kg"):
-        SUN.setting({"mass": value}, "--set")
+        SUN.setting({"mass": value})
     with pytest.raises(InputError, match=r"\nexpected: a number in \[[\d.]+, [\d.]+\]$"):
-        SUN.setting({"tireFric": -abs(value)}, "--set")
+        SUN.setting({"tireFric": -abs(value)})
 
 
 def test_a_plausible_value_is_up_to_1000_times_the_largest_of_the_domain_and_positive_if_that_is() -> None:

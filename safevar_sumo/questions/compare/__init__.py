@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.errors import about
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
@@ -97,7 +98,8 @@ def compare(
     """
     study, second = evaluator.study, evaluator.for_study(in_order_of(evaluator.study, study_in(other)))
     evaluators = evaluator, second
-    within = limits_of(limits, study.domains)
+    with about("limits"):
+        within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)
     stated = [one.parse_criterion(unsafe) for one in evaluators if unsafe is not None]
     originals = [one.evaluate_original() for one in evaluators]

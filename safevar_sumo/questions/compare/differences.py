@@ -168,7 +168,7 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     """In how many of A's benign scenes the original vehicles of A and B brake, None without any; and the number of
     these scenes.
     """
-    systems = [assemble(one.study, one.study.source) for one in (a, b)]
+    systems = [assemble(one.study) for one in (a, b)]
     # What a study searches in its scenario, these scenes do not have.
     systems = [replace(one, characteristics=one.characteristics.vehicle) for one in systems]
     scenes = benign_scenes(a.study, systems[0])

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator, Interval, sobol_points
@@ -90,7 +90,8 @@ class CommonDomain(NamedTuple):
             common.
         """
         members, rows = [one.characteristics for one in evaluators], [one.study.domains for one in evaluators]
-        check_limits(rows[1], limits, evaluators[1].study.source, "limits: ")
+        with about(evaluators[1].study.source):
+            check_limits(rows[1], limits, "limits: ")
         shift = np.where(members[0].of_vehicle, members[1].original - members[0].original, 0.0)
         ends = np.array([[within(limits, name, of[name]) for name in members[0].names] for of in rows])
         common = cls(evaluators, shift, ends[:, :, 0], ends[:, :, 1])

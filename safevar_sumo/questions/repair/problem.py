@@ -15,7 +15,7 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.campaign.evaluation import Selection
-from safevar_sumo.errors import InputError, UserCodeError, unknown_name
+from safevar_sumo.errors import InputError, UserCodeError, about, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
@@ -79,8 +79,10 @@ class Promise(Box):
         if list(texts) == [ALL] or (not texts and stated == ALL):
             return cls(region, everything.lower, everything.upper)
         of_study = stated if stated and isinstance(stated, dict) else study.limits
-        check_limits(rows, of_study, study.source, "repair.promise.")
-        limits = limits_of(texts, rows, None if texts else of_study, "promise")
+        with about(study.source):
+            check_limits(rows, of_study, "repair.promise.")
+        with about("promise"):
+            limits = limits_of(texts, rows, None if texts else of_study)
         if not limits:
             raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
         lower, upper = (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
@@ -248,16 +248,17 @@ def _limits_of(study: Study, texts: Sequence[str], columns: Sequence[int]) -> di
     """The limits of the study and of the option for the characteristics that vary."""
     rows = study.vehicle.characteristics
     varied = [list(rows)[column] for column in columns]
-    for name in limits_of(texts, rows):
-        check_name("limits", f"{name} does not vary with these --characteristics", name, varied)
-    return {name: limit for name, limit in limits_of(texts, rows, study.limits).items() if name in varied}
+    with about("limits"):
+        for name in limits_of(texts, rows):
+            check_name("", f"{name} does not vary with these --characteristics", name, varied)
+        return {name: limit for name, limit in limits_of(texts, rows, study.limits).items() if name in varied}
 
 
 def _unsafe_alone(evaluator: Evaluator, scans: Sequence[OneAtATimeScan]) -> FloatArray:
     """The ends of the unsafe intervals as settings, shape (K, n), each in its worst encounter."""
     characteristics = evaluator.characteristics
     ends = [(one.characteristic.name, end) for one in scans for interval in one.of_state("unsafe") for end in interval]
-    settings = [characteristics.setting({name: end}, name) for name, end in ends]
+    settings = [characteristics.setting({name: end}) for name, end in ends]
     ends_of_intervals = np.array(settings).reshape(-1, len(characteristics))
     return evaluator.evaluate_over_encounters(ends_of_intervals, "ends of what is unsafe alone").settings
 

@@ -63,7 +63,7 @@ class _Ends:
             outside = [value for value in values if (value < self.ends[0], value > self.ends[1])[side]]
             if self.ends[side] != last and outside:
                 nearest = min(outside, key=lambda value: abs(value - item.original))
-                self.beyond[side] = members.setting({item.name: nearest}, item.name), own
+                self.beyond[side] = members.setting({item.name: nearest}), own
 
     def limit(self) -> AloneLimit:
         item, (low, high) = self.item, self.ends

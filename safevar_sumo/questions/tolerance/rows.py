@@ -98,7 +98,7 @@ def _broken_in_words(
     name = f"{item.name} {next(value for value in specified if value is not None):.5g}{item.suffix}"
     if by:
         members = models[0].evaluator.characteristics
-        setting = members.setting({item.name: end}, item.name)
+        setting = members.setting({item.name: end})
         for model in models:
             if model.are_unsafe(setting[np.newaxis], "what fails first")[0]:
                 failure = describe(model, {item.name: setting})[item.name]
