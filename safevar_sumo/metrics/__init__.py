@@ -13,7 +13,9 @@ from safevar_sumo.metrics.measures import (
     BRAKE_HARSHNESS,
     DRAC,
     MAX_JERK,
+    PET,
     RATING_POINTS as RATING_POINTS,
+    REACTION_TIME,
     RMS_ACCELERATION,
     SAFETY_DEGREE_METRIC,
     STOPPING_DISTANCE as STOPPING_DISTANCE,
@@ -26,7 +28,8 @@ from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
 OPTIONAL_METRICS = {
-    metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE, TTC_MIN, DRAC)
+    metric.name: metric
+    for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE, TTC_MIN, DRAC, PET, REACTION_TIME)
 }
 """Metrics that only the studies have that name them."""
 OBJECTIVES = {one.name: one for one in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.base import Measure, mask_collisions, sampling_stride, sum_in_order
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, FloatArray, SimulationRuns
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 
@@ -118,6 +118,63 @@ DRAC = Measure(
     over_collisions=False,
     function=largest_deceleration_rate,
     description="Largest deceleration rate to avoid the crash, v_L^2 / (2 L_s); without a collision.",
+)
+
+
+def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Time from the first one's leaving the place that both paths share to the second one's entering it [s] (Allen,
+    Shin and Cooper 1978); shape (N,), NaN unless the vehicle and a body that crosses pass without a stop.
+
+    The run ends when the first one has left: the body the vehicle's path, or the vehicle's rear the body's. The second
+    one arrives at its speed then. PET of SUMO's SSM device takes lanes for bodies: it is shorter by the share of both
+    widths that lanes are wider.
+    """
+    trace = runs.trace
+    number = np.count_nonzero(trace.active, axis=0)
+    at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
+    speed, gap, lateral, lateral_speed, obstacle_width = (
+        np.broadcast_to(column, trace.speed.shape)[at_end]
+        for column in (trace.speed, trace.gap, trace.lateral, trace.lateral_speed, trace.obstacle_width)
+    )
+    apart = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
+    crossing = np.abs(lateral_speed)
+    leaves = (lateral * lateral_speed > 0) & (gap > 0)
+    comes = (lateral * lateral_speed < 0) & (gap <= 0)
+    way = np.where(leaves, gap, apart)
+    rate = np.where(leaves, speed, crossing)
+    is_defined = (runs.outcome == Outcome.PASSED) & (apart >= 0) & (leaves | comes) & (rate > STANDSTILL)
+    return np.asarray(np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined))
+
+
+def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Time from the first sample at which nothing hides the body ahead to the first brake command from then on [s], as
+    of a driver (Olson and Sivak 1986: perception-response time); shape (N,), NaN for a vehicle that sees nobody, or
+    does not brake.
+    """
+    trace = runs.trace
+    visible = trace.active & trace.visible
+    first = np.argmax(visible, axis=0)
+    has_seen = np.logical_or.accumulate(visible, axis=0)
+    brakes = trace.active & has_seen & (trace.brake > 0)
+    steps = np.argmax(brakes, axis=0) - first
+    return np.where(brakes.any(axis=0), np.round(steps * trace.step, TIME_DECIMALS), np.nan)
+
+
+PET = Measure(
+    name="pet",
+    title="PET",
+    unit="s",
+    over_collisions=False,
+    function=post_encroachment_time,
+    description="Post-encroachment time of a vehicle that passes who crosses; without a collision or a stop.",
+)
+REACTION_TIME = Measure(
+    name="reaction_time",
+    title="reaction",
+    unit="s",
+    more_is_unsafe=True,
+    function=reaction_time,
+    description="Time from the first sight of the body ahead to the first brake command.",
 )
 
 

@@ -37,6 +37,8 @@ DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
 """
 DEFAULT_MARGIN = 0.3
 """Distance to keep in a study that states no error of its model [m]."""
+LEAST = 1e-9
+"""The least by which what is unsafe is beyond a limit, in its unit."""
 POINT_LOSS, POINT_DECIMALS = 1.0, 6
 """The default limit in a rated study: the original's points minus this loss, to this many decimals."""
 
@@ -60,7 +62,7 @@ class Bound(NamedTuple):
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with `below`, a safety degree
     below this limit [m, or -m/s]; with `points`, at most that many points of a rating; with a `bound`, a metric of the
-    study beyond a limit, or a collision.
+    study beyond a limit, or a collision (points of a rating are of no run: these alone).
 
     `contact` is the safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre.
     """
@@ -86,6 +88,11 @@ class Unsafe:
         return self.below is None and self.points is None and self.bound is None
 
     @property
+    def is_of_points(self) -> bool:
+        """Whether points of a rating decide, by `points` or by a bound."""
+        return self.points is not None or (self.bound is not None and self.bound.measure == RATING_POINTS.name)
+
+    @property
     def worst(self) -> Callable[..., float]:
         """Which of several values is the worst: `min`, or `max` where a bound forbids large ones."""
         return max if self.bound is not None and self.bound.worst_is_largest else min
@@ -98,7 +105,7 @@ class Unsafe:
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.bound is not None:
-            return f"{self.bound}, or a collision"
+            return f"{self.bound}{'' if self.is_of_points else ', or a collision'}"
         if self.below is None:
             kept = f"{self.keep:.2f}" if round(self.keep, 2) == self.keep else f"{self.keep:g}"
             where = ", from bumper to bumper" if self.contact else ""
@@ -131,18 +138,22 @@ class Unsafe:
         collides = outcome == COLLISION
         if self.bound is not None:
             name, comparison, limit = self.bound
-            return collides | COMPARISONS[comparison](column(name), limit)
+            is_beyond = COMPARISONS[comparison](column(name), limit)
+            return is_beyond if self.is_of_points else collides | is_beyond
         return collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
 
     def left(self, evaluations: Evaluations) -> FloatArray:
-        """How far evaluations are from the limit, in its unit, shape (M,): below 0 beyond it, NaN where it is
-        undefined; on a collision by a bound, minus the speed of the collision.
+        """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are unsafe; infinite
+        where the measure is undefined; on a collision by a bound, minus the speed of the collision.
         """
-        if self.bound is not None:
+        if self.bound is None:
+            left = evaluations.f_safe - (self.contact + self.keep if self.below is None else self.below)
+        else:
             difference = evaluations.column(self.bound.measure) - self.bound.limit
             left = -difference if self.bound.worst_is_largest else difference
-            return np.where(evaluations.collided, evaluations.f_safe, left)
-        return evaluations.f_safe - (self.contact + self.keep if self.below is None else self.below)
+            left = left if self.is_of_points else np.where(evaluations.collided, evaluations.f_safe, left)
+        left = np.where(np.isnan(left), np.inf, left)
+        return np.where(self.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
 
     def value(self, left: float) -> float:
         """What is `left` away from the limit: a distance between bumpers [m], or the value that is limited."""

@@ -32,12 +32,14 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     """
     if unsafe.bound is None:
         return study
-    name, metrics, matrix = unsafe.bound.measure, study.metrics, study.matrix
+    name = unsafe.bound.measure
+    metrics = study.metrics
+    matrix = study.matrix
     known = [metric.name for metric in assemble(study).measuring.scoring.metrics]
     check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, [*known, *OPTIONAL_METRICS])
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
-    if matrix is not None:
+    if matrix is not None and not unsafe.is_of_points:
         matrix = replace_in(matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}")
     return replace_in(study, metrics=metrics, matrix=matrix)
 
@@ -54,7 +56,7 @@ def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
     solutions are simulated again.
     """
     study = study_by(case.study, unsafe)
-    if unsafe.bound is None or (study.matrix is None and unsafe.bound.measure in case.solutions):
+    if study == case.study:
         return case
     evaluator = evaluator.for_study(study, verified=0)
     names = evaluator.characteristics.names

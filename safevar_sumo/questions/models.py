@@ -32,8 +32,6 @@ the rest, and contact is no limit to release.
 """
 BETWEEN_DECIMALS = 2
 """Decimals of a parameter between two values of a matrix."""
-LEAST = 1e-9
-"""The least by which an unsafe setting is beyond the limit [m]."""
 
 
 class Model(NamedTuple):
@@ -66,9 +64,7 @@ class Model(NamedTuple):
 
     def left_by(self, evaluations: Evaluations) -> FloatArray:
         """What evaluated settings leave; see `left`."""
-        left = self.unsafe.left(evaluations)
-        left = np.where(self.unsafe.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
-        return np.where(evaluations.valid & np.isfinite(left), left, np.inf)
+        return np.where(evaluations.valid, self.unsafe.left(evaluations), np.inf)
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""

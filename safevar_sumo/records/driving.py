@@ -160,10 +160,11 @@ class Trace:
     A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the
     batch.
 
-    - `vehicle_length`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
+    - `vehicle_length`, `vehicle_width`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
     - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
     - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its length where the scenario
-      states it [m].
+      states it [m], `obstacle_width` its extent across the lane, 0 where the scenario does not state it [m].
+    - `visible`: nothing hides the obstacle.
     """
 
     step: float
@@ -180,6 +181,9 @@ class Trace:
     active: BoolArray
     obstacle_speed: FloatArray = field(default_factory=lambda: ZERO)
     obstacle_length: FloatArray = field(default_factory=lambda: ZERO)
+    obstacle_width: FloatArray = field(default_factory=lambda: ZERO)
+    visible: BoolArray = field(default_factory=lambda: ALL_TRUE)
+    vehicle_width: float = 0.0
     pedal: FloatArray = field(default_factory=lambda: ZERO)
 
     def of(self, vehicles: slice | IntArray) -> Trace:

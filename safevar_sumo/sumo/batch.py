@@ -30,7 +30,6 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, Scenario, Scene, TrackScenario, WorldScenario
-from safevar_sumo.scenarios.base import Frame
 from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
@@ -49,6 +48,9 @@ from safevar_sumo.vehicles.base import Prepared
 
 Listener = Callable[[Observation], None]
 """A function that is called with what the ADS observes at every sample."""
+OF_ALL_RUNS = ("step", "vehicle_length", "vehicle_width", "time", "position")
+"""Fields of a trace that are no columns of a log."""
+TRUTHS = ("active", "visible")
 
 
 @np.errstate(all="ignore")
@@ -196,14 +198,12 @@ def drive(
     n = len(settings)
     outcomes = _Outcomes(len(settings))
     prepared, ads, motion = enter(system, settings, world)
-    vehicle_length = world.vehicle_length(VUT)
-    frame = world.frame
     state = vehicle.at_start(prepared, motion.speeds)
     ads_memory = ads.start(n, system.nominal, step)
     size = n // len(system.points)
     perception = Perception([point.weather for point in system.points], step, size)
     last_step = np.round(per_vehicle([point.scenario.duration / step for point in system.points], size)).astype(int)
-    log = _Log(n, int(last_step.max()) + 1, frame)
+    log = _Log(world, int(last_step.max()) + 1)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     fronts_only = np.repeat([point.scenario.is_hit_in_front for point in system.points], size)
     contacts = Contacts(n, fronts_only)
@@ -236,7 +236,7 @@ def drive(
             state = vehicle.advance(prepared, state, command)
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
-    trace = log.trace(sample + 1, step, vehicle_length)
+    trace = log.trace(sample + 1)
     return SimulationRuns(
         trace=trace,
         encounter=observer.encounter(trace),
@@ -320,14 +320,16 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
 class _Log:
     """T samples of N runs in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
-    def __init__(self, n: int, length: int, frame: Frame) -> None:
+    def __init__(self, world: World, length: int) -> None:
+        n = world.n
         self.length = length
-        self._frame = frame
+        self._frame = world.frame
+        self._step = world.step_length
+        self._length = world.vehicle_length(VUT)
+        self._width = world.vehicle_width
         self._positions = np.zeros((length, n, 2))
-        names = (
-            field.name for field in fields(Trace) if field.name not in ("step", "vehicle_length", "time", "position")
-        )
-        self._columns = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in names}
+        names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
+        self._columns = {name: np.zeros((length, n), dtype=bool if name in TRUTHS else float) for name in names}
 
     def write(
         self, sample: int, position: FloatArray, scene: Scene, command: Command, **others: FloatArray | BoolArray
@@ -337,11 +339,15 @@ class _Log:
         for name, column in self._columns.items():
             column[sample] = values[name]
 
-    def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
+    def trace(self, length: int) -> Trace:
         columns = {name: values[:length] for name, values in self._columns.items()}
         columns["position"] = self._frame.along(self._positions[:length].reshape(-1, 2)).reshape(length, -1)
         return Trace(
-            step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **columns
+            step=self._step,
+            vehicle_length=self._length,
+            vehicle_width=self._width,
+            time=np.round(np.arange(length) * self._step, TIME_DECIMALS),
+            **columns,
         )
 
 

@@ -109,6 +109,10 @@ class World(Protocol):
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
 
+    @property
+    def vehicle_width(self) -> float:
+        """Width of the vehicles under test [m]."""
+
 
 class SceneWorld(World, ScenariosWorld, Protocol):
     """N vehicles in a scene that SUMO simulates or that was recorded; scenarios see it as theirs."""

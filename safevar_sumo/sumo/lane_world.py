@@ -49,3 +49,7 @@ class LaneWorld:
 
     def vehicle_length(self, actor: str) -> float:
         return self._stage.length
+
+    @property
+    def vehicle_width(self) -> float:
+        return self._stage.width

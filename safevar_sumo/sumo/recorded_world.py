@@ -118,6 +118,10 @@ class RecordedWorld:
     def vehicle_length(self, actor: str) -> float:
         return self._scene.length if actor == VUT else self._scene.tracks[actor].length
 
+    @property
+    def vehicle_width(self) -> float:
+        return self._scene.width
+
     def person_width(self, actor: str) -> float:
         return self._scene.tracks[actor].width
 

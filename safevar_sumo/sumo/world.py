@@ -238,6 +238,10 @@ class SumoWorld:
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))
 
+    @property
+    def vehicle_width(self) -> float:
+        return float(self.api.vehicle.getWidth(self.ids(VUT)[0]))
+
     def lane(self, lane: str) -> Lane:
         return lane_through(lane, self.api.lane.getShape(copied_id(0, lane)))
 

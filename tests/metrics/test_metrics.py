@@ -94,6 +94,62 @@ def test_least_ttc_and_largest_drac_of_even_braking() -> None:
     assert np.isnan([OPTIONAL_METRICS[name].function(nobody, THRESHOLDS)[0] for name in ("ttc_min", "drac")]).all()
 
 
+@pytest.mark.parametrize(
+    ("gap", "lateral", "lateral_speed", "expected"),
+    [
+        (6.0, 1.6, 2.0, 0.6),  # he has left, and the vehicle is 6 m before his path
+        (-7.0, -3.6, 2.0, 1.0),  # the vehicle's rear has left, and his side is 2 m beside its path
+        (6.0, -3.6, 2.0, np.nan),  # he has not crossed yet
+        (6.0, 1.0, 2.0, np.nan),  # he is in the path
+        (-7.0, -3.6, -2.0, np.nan),  # he goes back
+    ],
+)
+def test_post_encroachment_time_is_that_of_the_second_one(
+    gap: float, lateral: float, lateral_speed: float, expected: float
+) -> None:
+    """A vehicle 2 m wide at 10 m/s, and somebody 1.2 m wide across the lane; the last sample is after the run's end."""
+    at = np.ones((3, 1))
+    columns = {"lateral": lateral * at, "lateral_speed": lateral_speed * at, "obstacle_width": 1.2 * at}
+    active = np.array([[True], [True], [False]])
+    run = made_up_runs(STEP, 10 * at, gap * at, **columns, active=active)
+    run = dataclasses.replace(run, trace=dataclasses.replace(run.trace, vehicle_width=2.0))
+    pet = OPTIONAL_METRICS["pet"].function
+    assert np.isnan(pet(run, THRESHOLDS)[0]), "it has stopped"
+    run.outcome[:] = "passed"
+    assert pet(run, THRESHOLDS)[0] == pytest.approx(expected, nan_ok=True)
+
+
+def test_reaction_time_begins_with_the_first_sight() -> None:
+    """It brakes a little before it sees somebody after 1 s, and again from 1.7 s on."""
+    time = RUN.trace.time[:, np.newaxis]
+    brake = ((time > 0.5) & (time < 0.9)) | (time >= 1.7)
+    visible = time >= 1.0
+    reaction = OPTIONAL_METRICS["reaction_time"].function
+    assert reaction(driving(brake=brake.astype(float), visible=visible), THRESHOLDS)[0] == pytest.approx(0.7)
+    assert np.isnan(reaction(driving(brake=brake & (time < 0.9), visible=visible), THRESHOLDS)[0])
+    assert np.isnan(reaction(driving(visible=visible & False), THRESHOLDS)[0])
+
+
+def test_who_collides_is_unsafe_by_every_measure_of_a_run_and_points_are_of_none() -> None:
+    """The third vehicle collides with a measure on the safe side, the fourth without one."""
+    nan = np.nan
+    columns = {"safety_degree": [1.0, 2.0, -3.0, -1.0, 1.0], "drac": [5.0, 7.0, 1.0, nan, nan]}
+    columns["rating_points"] = [40.0, 30.0, 40.0, 30.0, 35.0]
+    runs = made_up_evaluations(columns["safety_degree"], metrics={k: np.array(v) for k, v in columns.items()})
+    for text, expected in (
+        ("drac > 6", [False, True, True, True, False]),
+        ("drac < 6", [True, False, True, True, False]),
+        ("rating_points < 35", [False, True, False, True, False]),
+        ("points=35", [False, True, False, True, True]),
+        ("below=1.5", [True, False, True, True, True]),
+    ):
+        criterion = Unsafe.parse(text)
+        assert criterion.of(runs).tolist() == expected, text
+        assert "collision" in criterion.description or "drac" not in text
+        if criterion.points is None:
+            assert (criterion.left(runs) < 0).tolist() == expected, text
+
+
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
     fine = value("tet", RUN)
     coarse = value("tet", RUN, COARSE)

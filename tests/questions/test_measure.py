@@ -86,6 +86,7 @@ def test_every_question_takes_an_own_metric(folder: Path) -> None:
         ("explain", "results", "--fits", "0", "--top", "1"),
         ("compare", "tiny.toml", "tiny.toml", "--samples", "64"),
         ("tolerance", "tiny.toml", "--fits", "0", "--attack", "200", *few),
+        ("repair", "tiny.toml", "--fits", "0", "--promise", "tireFric >= 3"),
     ):
         answer = json_of(*typed, "--unsafe", "hardest > 6.8")
         assert answer["numbers"]["unsafe"] == "hardest > 6.8", typed

@@ -199,15 +199,15 @@ def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -
 class Adding:
     """A problem without simulations: the changes of the parameters, up to 0.85 each, add up to what a vehicle needs."""
 
-    arrays, margin = True, MARGIN
+    arrays = True
 
     def __init__(self, parameters: int, need: float) -> None:
         self.today, self._need = np.full(parameters, 0.1), need
 
-    def degrees(self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()) -> tuple[FloatArray, Any]:
+    def lefts(self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()) -> tuple[FloatArray, Any]:
         gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
-        degrees = gain[:, np.newaxis] - self._need * settings[:, 0] + MARGIN
-        return degrees, np.zeros(degrees.size, dtype=int)
+        left = gain[:, np.newaxis] - self._need * settings[:, 0]
+        return left, np.zeros(left.size, dtype=int)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
         settings = problem.promise.draw(20, np.random.default_rng(1))
         driver = problem.best_driver
         assert driver is not None
-        is_safe = full_braking.degrees_of(driver.evaluator.evaluate(settings, "")) >= problem.margin
+        is_safe = full_braking.lefts_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
         assert 0 < np.count_nonzero(is_safe) < len(settings)
         for rows in (np.arange(20), np.flatnonzero(~is_safe)):  # the second time the hardest points are known
             assert (driver.saves(settings[rows]) == is_safe[rows]).all()

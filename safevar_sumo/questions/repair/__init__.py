@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -18,21 +19,21 @@ import tomli_w
 
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe, margin_of
+from safevar_sumo.metrics import F_SAFE, Unsafe, margin_of
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
-from safevar_sumo.questions.ask import Margin, Range, question
+from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
-from safevar_sumo.questions.models import Models, fit_names, models_of
+from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.repair.attack import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE, find_failures, prove_change
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import Search
 from safevar_sumo.questions.words import encounter_in_words, join_phrases
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
 from safevar_sumo.sumo.system import assemble
@@ -72,7 +73,7 @@ REPAIRS = {
 
 @question
 @contents(
-    *("margin", "promise", "worst_today", "kept_today", "repairs", "not_repairable", "simulations"),
+    *("unsafe", "margin", "promise", "worst_today", "kept_today", "repairs", "not_repairable", "simulations"),
     *("fits", "fits_tried"),
     repairs=REPAIRS,
 )
@@ -82,6 +83,7 @@ def repair(
     *,
     promise: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
     margin: Margin = None,
+    unsafe: Criterion = None,
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
     fits: Annotated[int | None, Range(0, 1000)] = None,
     out: Annotated[str | None, "FILE.toml"] = None,
@@ -98,6 +100,8 @@ def repair(
     margin
         Distance to keep from a collision [m], between bumpers where the safety degree is from centre to centre; by
         default the model's error that the study states, else 0.3 m.
+    unsafe
+        What is unsafe instead: a collision, a safety degree below X, or a metric such as "drac > 6".
     change
         Parameter of the driving system that may change; may be repeated. By default those under [repair], else those
         that come with a shipped driving system.
@@ -113,8 +117,12 @@ def repair(
         raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
     if out is not None:
         _check_file(Path(out), study)
-    unsafe_today = Unsafe(keep=margin_of(study, margin), contact=assemble(study).contact)
-    promised, parameters = Promise.of(study, evaluator.region, promise), parameters_of(study, change)
+    criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
+    check_margin(criterion, margin)
+    keep = margin_of(study, margin) if unsafe is None or margin is not None else 0.0
+    unsafe_today = replace(criterion, keep=keep, contact=assemble(study).contact)
+    promised = Promise.of(study, evaluator.region, promise)
+    parameters = parameters_of(study, change)
     evaluator.plan(SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE)
     models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
     problems = [
@@ -126,17 +134,18 @@ def repair(
     problem = problems[0]
     vehicles = _first_vehicles(problem, subject)
     if not len(vehicles):
-        text = f"{study.name!r}: the new vehicle keeps {problem.unsafe.keep:g} m in no encounter that was tried"
+        kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
+        text = f"{study.name!r}: the new vehicle {kept} in no encounter that was tried"
         raise InputError(study.source, text, "a smaller --margin, or other domains under [scenario.search]")
-    degrees = problem.degrees_with(problem.today, vehicles, "the driving system of today")
-    order = np.argsort(degrees, kind="stable")
-    vehicles, degrees = vehicles[order], degrees[order]
+    left = problem.lefts_with(problem.today, vehicles, "the driving system of today")
+    order = np.argsort(left, kind="stable")
+    vehicles = vehicles[order]
     # What no driving system survives needs another part, not a parameter; the rest is repaired.
-    is_repairable = degrees >= problem.margin
+    is_repairable = left[order] >= 0
     is_repairable[~is_repairable] = problem.repairable(vehicles[~is_repairable])
     worst_vehicles = vehicles[is_repairable]
     found = _find_survivors(problems, worst_vehicles) if len(worst_vehicles) else Survivors([], len(problems), ())
-    worst = float(degrees[is_repairable][0] if is_repairable.any() else degrees[0])
+    worst = problem.worst_today(worst_vehicles[0] if len(worst_vehicles) else vehicles[0])
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
     answer = _answer_of(problem, models, found, worst, not_repairable)
     if out is not None and answer.numbers["repairs"]:
@@ -161,7 +170,7 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
     points = sobol_points(SOBOL_VEHICLES, len(promise.lower), seed)
     settings = [promise.region.characteristics.original[np.newaxis], promise.at(np.round(points)), promise.at(points)]
     if not isinstance(subject, Study):
-        failures = subject.solutions[Unsafe(problem.margin).rows(subject.solutions)]
+        failures = subject.solutions[problem.unsafe.rows(subject.solutions)]
         settings.append(failures[list(promise.region.characteristics.names)].to_numpy(dtype=float))
     rows = np.unique(np.concatenate(settings), axis=0)
     return rows[problem.holds(rows)]
@@ -220,7 +229,8 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     """
     if not len(failures) or problem.best_driver is None:
         return []
-    driver, unsafe = problem.best_driver.evaluator, Unsafe(problem.margin)
+    driver = problem.best_driver.evaluator
+    unsafe = problem.unsafe
     chosen = failures[np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)]
     causes = [cause for group in find_minimal_causes(driver, chosen, unsafe) for cause in group]
     limits: dict[tuple[object, ...], dict[str, float]] = {}
@@ -231,21 +241,28 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
 
 
 def _answer_of(
-    problem: RepairProblem, models: Models, found: Survivors, worst_today: float, not_repairable: list[dict[str, float]]
+    problem: RepairProblem,
+    models: Models,
+    found: Survivors,
+    worst_today: Evaluations,
+    not_repairable: list[dict[str, float]],
 ) -> Answer:
     """The answer from the changes that survive, each with its proof: today's parameters alone if they do.
 
-    `worst_today` is the safety degree of today's driving system with the worst vehicle of the promise that was tried
-    and that a driving system can keep safe [m]; below 0, minus the speed of the impact [m/s].
+    `worst_today` is how the driving system of today ends with the worst vehicle of the promise that was tried and that
+    a driving system can keep safe.
     """
     survivors = found.changes
+    unsafe = problem.unsafe
+    worst = float(worst_today.column(unsafe.bound.measure if unsafe.bound else F_SAFE.name)[0])
     kept_today = bool(survivors) and not problem.changed_values(survivors[0][0])
     repairs = [] if kept_today else [_row(problem, *pair, found.fits) for pair in survivors]
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
-        "margin": problem.unsafe.keep,
+        "unsafe": str(unsafe),
+        "margin": unsafe.keep if unsafe.is_collision else None,
         "promise": problem.promise.to_dict(),
-        "worst_today": worst_today,
+        "worst_today": worst,
         "kept_today": kept_today,
         "repairs": len(repairs),
         "not_repairable": not_repairable,
@@ -253,13 +270,15 @@ def _answer_of(
         "fits": found.fits if survivors else 0,
         "fits_tried": len(models.members),
     }
-    wear = f"({problem.promise.in_words}) with {problem.unsafe.keep:g} m left"
+    demand = f"with {unsafe.keep:g} m left" if unsafe.keep else f"without {unsafe.description}"
+    wear = f"({problem.promise.in_words}) {demand}"
     if kept_today:
         where = " wherever any driving system can" if not_repairable else ""
-        degree = distance_in_words(worst_today, problem.unsafe.contact)
+        degree = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
+        ending = unsafe.value_in_words(worst) if unsafe.bound else degree
         verdict = (
-            f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried has a safety "
-            f"degree of {degree}, and {_proof_in_words(survivors[0][1])}."
+            f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried {ending}, and "
+            f"{_proof_in_words(survivors[0][1])}."
         )
     elif repairs:
         verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors[0][1])}."

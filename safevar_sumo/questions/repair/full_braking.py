@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.system import assemble
@@ -19,13 +20,14 @@ STAGE = "full braking"
 
 
 class FullBraking:
-    """Full braking at the first possible moment, whose safety degrees have to be at least `margin` at every point.
+    """Full braking at the first possible moment, which must not be unsafe at any point.
 
     Who is not safe at one point need not drive at the others; so those points come first at which most others were not.
     """
 
-    def __init__(self, evaluator: Evaluator, margin: float) -> None:
-        self.evaluator, self._margin = evaluator, margin
+    def __init__(self, evaluator: Evaluator, unsafe: Unsafe) -> None:
+        self.evaluator = evaluator
+        self._unsafe = unsafe
         self._failures = np.zeros(len(assemble(evaluator.study).points))
         """How many vehicles were least safe, and not safe, at each point."""
 
@@ -33,18 +35,17 @@ class FullBraking:
         """Which settings are safe, shape (M,)."""
         has_encounters = len(self.evaluator.characteristics.scenario) > 0
         if has_encounters or len(self._failures) <= HARDEST[-1] or len(settings) < LEAST_SETTINGS:
-            return degrees_of(self.evaluator.evaluate(settings, STAGE)) >= self._margin
+            return lefts_of(self.evaluator.evaluate(settings, STAGE), self._unsafe) >= 0
         is_safe = self.evaluator.region.feasible(settings)
         for points in np.split(np.argsort(-self._failures, kind="stable"), HARDEST):
             rows, selection = np.flatnonzero(is_safe), Selection(points=tuple(points.tolist()))
             evaluations = self.evaluator.evaluate_selection(settings[rows], selection, STAGE)
-            is_safe[rows] = degrees_of(evaluations) >= self._margin
+            is_safe[rows] = lefts_of(evaluations, self._unsafe) >= 0
             if evaluations.worst_points is not None:
                 np.add.at(self._failures, points[evaluations.worst_points[~is_safe[rows]]], 1)
         return is_safe
 
 
-def degrees_of(evaluations: Evaluations) -> FloatArray:
-    """Safety degrees [m, or -m/s], shape (M,); infinite without a conflict, minus infinity without a valid result."""
-    degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
-    return np.where(evaluations.valid, degrees, -np.inf)
+def lefts_of(evaluations: Evaluations, unsafe: Unsafe) -> FloatArray:
+    """What evaluations leave to a limit, shape (M,): infinite without a conflict, minus infinity if invalid."""
+    return np.where(evaluations.valid, unsafe.left(evaluations), -np.inf)

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator, sobol_points
 from safevar_sumo.questions.preventability import approach_parameters
-from safevar_sumo.questions.repair.full_braking import FullBraking, degrees_of
+from safevar_sumo.questions.repair.full_braking import FullBraking, lefts_of
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
@@ -154,8 +154,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
-    """A study's ADS with P parameters that may change, and the criterion to keep within a promise: safety degrees of at
-    least `margin`, with one `fit` of the vehicle.
+    """A study's ADS with P parameters that may change, and what is `unsafe` within a promise, with one `fit` of the
+    vehicle.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
     """
@@ -169,10 +169,6 @@ class RepairProblem:
     @property
     def study(self) -> Study:
         return self.evaluator.study
-
-    @property
-    def margin(self) -> float:
-        return self.unsafe.keep + self.unsafe.contact
 
     @cached_property
     def today(self) -> FloatArray:
@@ -217,19 +213,24 @@ class RepairProblem:
         selection = Selection(tuple(parameter.name for parameter in self.parameters), tuple(points), arrays)
         return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
 
-    def degrees(
+    def lefts(
         self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
     ) -> tuple[FloatArray, npt.NDArray[np.intp] | None]:
-        """Safety degrees of each of M sets of parameters with each of L settings, shape (M, L), and the worst points of
-        these M L rows; None without a matrix.
+        """What each of M sets of parameters leaves to the limit with each of L settings, shape (M, L), and the worst
+        points of these M L rows; None without a matrix.
         """
         values = self.values(np.repeat(shares, len(settings), axis=0))
         evaluations = self._evaluate(values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays)
-        return degrees_of(evaluations).reshape(len(shares), len(settings)), evaluations.worst_points
+        return lefts_of(evaluations, self.unsafe).reshape(len(shares), len(settings)), evaluations.worst_points
 
-    def degrees_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
-        """Safety degrees of settings with one set of parameters, shape (L,)."""
-        return self.degrees(change[np.newaxis], settings, stage)[0].reshape(-1)
+    def lefts_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+        """What one set of parameters leaves to the limit with each of L settings, shape (L,)."""
+        return self.lefts(change[np.newaxis], settings, stage)[0].reshape(-1)
+
+    def worst_today(self, setting: FloatArray) -> Evaluations:
+        """How the ADS of today ends with one setting, shape (n,)."""
+        values = self.values(self.today[np.newaxis])
+        return self._evaluate(values, setting[np.newaxis], "the driving system of today", arrays=self.arrays)
 
     def left(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
         """What settings leave to the margin with one set of parameters, shape (L,); infinite where they do not hold, or
@@ -237,7 +238,7 @@ class RepairProblem:
         """
         left = np.full(len(settings), np.inf)
         rows = np.flatnonzero(self.holds(settings))
-        left[rows] = self.degrees_with(change, settings[rows], stage) - self.margin
+        left[rows] = self.lefts_with(change, settings[rows], stage)
         unsafe = np.flatnonzero(left < 0)
         left[unsafe[~self.repairable(settings[unsafe])]] = np.inf
         return left
@@ -249,7 +250,7 @@ class RepairProblem:
         is_promised, characteristics = self.promise.holds(settings), self.promise.region.characteristics
         if len(characteristics.scenario) and is_promised.any():
             originals = characteristics.with_original_vehicle(settings[is_promised])
-            is_promised[is_promised] = self.degrees_with(self.today, originals, "new vehicles") >= self.margin
+            is_promised[is_promised] = self.lefts_with(self.today, originals, "new vehicles") >= 0
         return is_promised
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
@@ -272,14 +273,15 @@ class RepairProblem:
 
     @cached_property
     def best_driver(self) -> FullBraking | None:
-        """Full braking at the first possible moment; None where it has no approach (`approach_parameters`)."""
-        approach = approach_parameters(assemble(self.study))
+        """Full braking at the first possible moment; None where it has no approach (`approach_parameters`), and by a
+        bound of a measure, of which it need not be the best.
+        """
+        approach = None if self.unsafe.bound else approach_parameters(assemble(self.study))
         if approach is None:
             return None
         ads = ModelTable(model="full_braking", parameters=approach)
-        return FullBraking(
-            self.evaluator.for_study(replace_in(self.study, ads=ads, spread={}), verified=0), self.margin
-        )
+        study = replace_in(self.study, ads=ads, spread={})
+        return FullBraking(self.evaluator.for_study(study, verified=0), self.unsafe)
 
     def repairable(self, settings: FloatArray) -> BoolArray:
         """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe; all without
@@ -289,5 +291,5 @@ class RepairProblem:
             return np.ones(len(settings), dtype=bool)
         is_safe = self.best_driver.saves(settings)
         unsafe = np.flatnonzero(~is_safe)
-        is_safe[unsafe] = self.degrees_with(self.today, settings[unsafe], "full braking") >= self.margin
+        is_safe[unsafe] = self.lefts_with(self.today, settings[unsafe], "full braking") >= 0
         return is_safe

@@ -128,9 +128,9 @@ class Search:
             while start < len(settings):
                 rows = settings[start : start + size]
                 problem = self.problems[number]
-                (degrees,), points = problem.degrees(change[np.newaxis], rows, "changes with all vehicles")
-                worst = int(np.argmin(degrees))
-                if degrees[worst] < problem.margin:
+                (left,), points = problem.lefts(change[np.newaxis], rows, "changes with all vehicles")
+                worst = int(np.argmin(left))
+                if left[worst] < 0:
                     return Failure(rows[worst], number, () if points is None else (int(points[worst]),))
                 start, size = start + size, 4 * size
         return None
@@ -156,7 +156,7 @@ class Search:
             settings, problem = np.array(same), self.problems[number]
             while len(settings) and len(alive):
                 count = max(1, BATCH // len(alive))
-                degrees, _ = problem.degrees(changes[alive], settings[:count], "changes with one vehicle", points)
-                alive = alive[(degrees >= problem.margin).all(axis=1)]
+                left, _ = problem.lefts(changes[alive], settings[:count], "changes with one vehicle", points)
+                alive = alive[(left >= 0).all(axis=1)]
                 settings = settings[count:]
         return alive
