@@ -153,7 +153,7 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
 def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[Record]:
     """Against other ways to do the same, on the clock."""
     n, few = len(settings), settings[:SOCKET_SETTINGS]
-    scalar = replace(system, ads=PerVehicleAds(Coasting, UserCode("benchmark", "ads")))
+    scalar = replace(system, ads=PerVehicleAds(Coasting, UserCode("ads")))
     evaluate(system, settings)
     program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo")
     command = [program, *sumo_options(copied_network(stage_network(system.points[0].scenario), 1))]

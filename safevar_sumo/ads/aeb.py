@@ -129,7 +129,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             stage=stage,
             intervened=has_intervened,
             obstacle=seen.obstacle,
-            obstacle_speed=_obstacle_speed(seen),
+            obstacle_speed=seen.obstacle_speed,
             warns=warns,
         )
 
@@ -140,7 +140,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
         """The braking stage; it does not fall while the obstacle blocks the way, nor at standstill."""
         speed = seen.speed
-        obstacle_speed = _obstacle_speed(seen)
+        obstacle_speed = seen.obstacle_speed
         deceleration = self.braking_share * memory.nominal.decel
         lost_speed = np.where(seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0)
         obstacle_deceleration = lost_speed / memory.step
@@ -161,10 +161,6 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         still_blocks = is_ahead & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
         is_standing = speed <= 0
         return np.where(still_blocks | is_standing, np.maximum(stage, memory.stage), stage)
-
-
-def _obstacle_speed(seen: Observation) -> FloatArray:
-    return np.broadcast_to(seen.obstacle_speed, seen.speed.shape)
 
 
 class _AutowareMemory(NamedTuple):

@@ -84,6 +84,7 @@ class DrivingRobot:
         """
         if not self._is_needed:
             return command, state
+        self._is_needed = not self._has_braked.all()  # this is the last call that it is needed for
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
         error_share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
         is_larger = is_open & (error_share > self._error_share)

@@ -42,7 +42,9 @@ class LaneWorld:
 
     def _motion(self, is_open: BoolArray) -> Motion:
         hits = self._stage.hits(self._sample, self._front, self._speed, is_open)
-        return Motion(np.stack([self._front, np.zeros(self.n)], axis=1), self._speed, hits)
+        fronts = np.zeros((self.n, 2))
+        fronts[:, 0] = self._front
+        return Motion(fronts, self._speed, hits)
 
     def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
         return self._stage.bodies(vehicles, self._front, self._speed)

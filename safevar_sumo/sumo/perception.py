@@ -19,6 +19,7 @@ OCCLUDED = {
     **{"obstacle_width": 0.0, "obstacle": 0.0},
 }
 """What is observed of an occluded obstacle [m, m/s]."""
+_UNSEEN = np.array([*OCCLUDED.values()])[:, np.newaxis]
 
 
 class Observer(Protocol):
@@ -52,10 +53,10 @@ class Perception:
         """
         values = np.empty((len(OCCLUDED) + 1, len(speed)))
         values[-1] = speed
-        for row, (quantity, occluded) in enumerate(OCCLUDED.items()):
+        for row, quantity in enumerate(OCCLUDED):
             values[row] = getattr(scene, quantity)
-            if scene.visible is not ALL_TRUE:
-                values[row] = np.where(scene.visible, values[row], occluded)
+        if scene.visible is not ALL_TRUE:
+            values[:-1] = np.where(scene.visible, values[:-1], _UNSEEN)
         seen = np.empty_like(values)
         for k, (vehicles, line) in enumerate(self._lines):
             seen[:, vehicles], next_line = line.delayed(values[:, vehicles])

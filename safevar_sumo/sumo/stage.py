@@ -194,8 +194,10 @@ class Stage:
     def _body(self, number: int, vehicles: IntArray) -> Body:
         """A body at this sample, as the given vehicles meet it."""
         body = self._bodies[number]
+        group = vehicles if self.group is None else self.group[vehicles]
+        columns = (row(column, self._sample, None) for column in (*body.track[2:], body.vy))
         length, width, x, y, along, left, speed, vy = (
-            np.broadcast_to(self._row(column), self.n)[vehicles] for column in (*body.track[2:], body.vy)
+            values[group] if len(values) > 1 else values.repeat(len(vehicles)) for values in columns
         )
         drift = vy if body.faces_along else np.zeros_like(vy)
         return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed, drift)

@@ -79,7 +79,11 @@ LONGEST_DELAY = 3600.0
 """Longest delay [s]."""
 
 
-class DelayedSignal(NamedTuple):
+SPARE = 32
+"""Number of further samples for which a history has room before it is copied."""
+
+
+class DelayedSignal:
     """A signal of N vehicles, each with its own delay, which ends between two samples: a newer and an older one.
 
     Attributes
@@ -93,9 +97,16 @@ class DelayedSignal(NamedTuple):
         The older sample's share, shape (N,).
     """
 
-    samples: FloatArray
-    newer: IntArray
-    share: FloatArray
+    __slots__ = ("_begin", "_room", "newer", "samples", "share")
+
+    def __init__(self, samples: FloatArray, newer: IntArray, share: FloatArray, room: _Room | None = None) -> None:
+        if room is None:
+            room = _Room(samples)
+        self._room = room
+        self._begin = room.begin
+        self.samples = room.samples[room.begin : room.begin + len(samples)]
+        self.newer = newer
+        self.share = share
 
     @classmethod
     def of(cls, sample: FloatArray, delay: FloatArray, step: float) -> DelayedSignal:
@@ -114,9 +125,20 @@ class DelayedSignal(NamedTuple):
         newer = whole_steps.astype(np.intp) * sample.size + np.arange(sample.size).reshape(sample.shape)
         return cls(np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0), newer, age - whole_steps)
 
+    def where(self, chosen: BoolArray, other: DelayedSignal) -> DelayedSignal:
+        """This history of the `chosen` vehicles, shape (N,), and another one, of equal length, of all others."""
+        samples = np.where(chosen, self.samples, other.samples)
+        newer = np.where(chosen, self.newer, other.newer)
+        return DelayedSignal(samples, newer, np.where(chosen, self.share, other.share))
+
     def extended(self, sample: FloatArray) -> DelayedSignal:
         """The history with a new sample at its front and the oldest one dropped."""
-        return self._replace(samples=np.concatenate([sample[np.newaxis], self.samples[:-1]]))
+        room = self._room
+        if room.begin != self._begin or not room.begin:  # another history goes on there, or it is full
+            room = _Room(self.samples)
+        room.begin -= 1
+        room.samples[room.begin] = sample
+        return DelayedSignal(self.samples, self.newer, self.share, room)
 
     def delayed(self) -> FloatArray:
         """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (..., N)."""
@@ -126,6 +148,17 @@ class DelayedSignal(NamedTuple):
             signal = newer * (1 - self.share) + older * self.share
         np.copyto(signal, newer, where=np.isnan(signal))
         return signal
+
+
+class _Room:
+    """Room for `SPARE` samples before those of a history, which grows towards the `begin`."""
+
+    __slots__ = ("begin", "samples")
+
+    def __init__(self, samples: FloatArray) -> None:
+        self.begin = SPARE
+        self.samples = np.empty((SPARE + len(samples), *samples.shape[1:]))
+        self.samples[SPARE:] = samples
 
 
 class Sensors(NamedTuple):
@@ -313,6 +346,8 @@ class Vehicle:
 
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
     """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist of states."""
+    if isinstance(steady, DelayedSignal):
+        return steady.where(is_rolling, rest)
     if isinstance(steady, tuple):
         columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
         return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)

@@ -182,6 +182,19 @@ def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
         assert unseen.extended(np.array([5.0])).delayed().tolist() == [sensed]
 
 
+def test_two_continuations_of_a_history_know_nothing_of_each_other() -> None:
+    rng = np.random.default_rng(0)
+    first = rng.random(3)
+    histories = [DelayedSignal.of(first, np.array([0.0, 0.17, 0.4]), 0.1)] * 2
+    samples = [[first] * 6, [first] * 6]
+    for _ in range(100):  # more than a history has room for
+        for one in (0, 1):
+            samples[one].insert(0, rng.random(3))
+            histories[one] = histories[one].extended(samples[one][0])
+            (a, b, c), share = zip(*samples[one][:6], strict=True), 0.17 / 0.1 - 1
+            assert histories[one].delayed() == pytest.approx([a[0], b[1] * (1 - share) + b[2] * share, c[4]])
+
+
 def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
     """Five values of a characteristic, and the gaps that such vehicles report while an obstacle comes nearer at 10 m/s;
     shape (T, 5).
