@@ -15,10 +15,11 @@ from safevar_sumo.campaign.campaign import choose_engine, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import MAX_BATCH, InputError, warn
-from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Jobs, Range
-from safevar_sumo.questions.case import UnanswerableError, are_collisions
+from safevar_sumo.questions.ask import Criterion, Jobs, Range
+from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
+from safevar_sumo.questions.measure import cases_by, study_by
 from safevar_sumo.questions.research_questions.answer import REMARKS, answer_questions
 from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
@@ -36,6 +37,7 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
+from safevar_sumo.terminal import show_no_progress
 
 ALGORITHMS: Columns = {
     "algorithm": "algorithm",
@@ -66,6 +68,7 @@ def study(
     evaluations: Annotated[int | None, Range(1, 10_000_000)] = None,
     algorithms: Annotated[str | None, "NAME,..."] = None,
     seed: Annotated[int | None, Range(0, 2**63 - 1)] = None,
+    unsafe: Criterion = None,
     batch: Annotated[int | None, Range(1, MAX_BATCH)] = None,
     engine: Literal["recorded", "sumo"] = "recorded",
     out: Path | None = None,
@@ -90,6 +93,8 @@ def study(
         Algorithms, separated by commas.
     seed
         Seed of the whole study.
+    unsafe
+        What the verdict calls unsafe: a collision, a safety degree below X, or a metric such as "drac > 6".
     batch
         Maximum settings per batch, gathered from several runs; does not change results. By default the fastest.
     engine
@@ -126,6 +131,8 @@ def study(
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
     changed = msgspec.structs.replace(as_written, search=msgspec.structs.replace(search, **changes))
     loaded, system = load_for_search(changed)
+    if unsafe is not None:
+        study_by(loaded, Unsafe.parse(unsafe))  # refuses what no study has, before the search
     for remark in dict.fromkeys([*loaded.origin.remarks, *system.remarks, *vehicle_remarks(system)]):
         warn(remark)
     keys = _select_runs(all_runs(loaded), only, shard)
@@ -144,8 +151,9 @@ def study(
         raise
     answer = summarise(results)
     reason = why_no_verdict(system)
+    (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
     following = ", ".join(question_command(name, str(directory)) for name in ("explain", "tolerance"))
-    verdict = f"{reason or _verdict(results, system)} Next: {following}"
+    verdict = f"{reason or _verdict(results, case, system)} Next: {following}"
     return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
 
@@ -186,9 +194,8 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
     )
 
 
-def _verdict(results: Results, system: System) -> str:
-    """How many solutions are unsafe, and how little is enough."""
-    case = results.case
+def _verdict(results: Results, case: Case, system: System) -> str:
+    """How many solutions of a case of the results are unsafe, and how little is enough."""
     names = list(system.characteristics.names)
     if results.original["collision"] and not system.rater and not system.characteristics.scenario:
         return "The original vehicle itself collides: no change is needed."
@@ -204,6 +211,8 @@ def _verdict(results: Results, system: System) -> str:
     ending = ending_in_words(fewest["outcome"], fewest["f_safe"], system.contact)
     if system.rater:
         ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
+    elif case.unsafe.bound:
+        ending += f", {case.unsafe.bound.measure} {fewest[case.unsafe.bound.measure]:.3g}"
     changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})
     return f"{counts} With the fewest changes it {ending}: {changes}."
 

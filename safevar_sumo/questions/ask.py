@@ -310,6 +310,13 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     return asked, values
 
 
+def with_criterion(text: str, unsafe: str | None) -> str:
+    """A question as `parse_question` reads it, with a criterion if it takes one and states none."""
+    asked, values = parse_question(text)
+    takes_it = unsafe is not None and any(option.metavar == CRITERION for option in asked.options)
+    return f"{text} --unsafe {quote(str(unsafe))}" if takes_it and "unsafe" not in values else text
+
+
 def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     limits, metavar = None, None
     if get_origin(hint) is Annotated:

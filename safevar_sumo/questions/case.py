@@ -56,6 +56,8 @@ class Case:
         Names of algorithms for readers, by label, as far as their classes have them.
     stop_by_themselves
         Labels of algorithms that may end before they have used their budget.
+    stated
+        What is unsafe if a user states it.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Case:
     scoring: Scoring = PUBLISHED_SCORING
     titles: Mapping[str, str] = field(default_factory=dict)
     stop_by_themselves: Collection[str] = ("safe_fuzzer",)
+    stated: Unsafe | None = None
 
     def title_of(self, algorithm: str) -> str:
         """The name of an algorithm for readers."""
@@ -84,8 +87,8 @@ class Case:
 
     @property
     def unsafe(self) -> Unsafe:
-        """The default criterion for unsafe solutions."""
-        return Unsafe.default(self.original, self.solutions["outcome"])
+        """The criterion for unsafe solutions, by default that of `Unsafe.default`."""
+        return self.stated or Unsafe.default(self.original, self.solutions["outcome"])
 
     @property
     def algorithms(self) -> tuple[str, ...]:

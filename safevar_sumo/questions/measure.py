@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +12,13 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
+from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import Progress
 
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
-    from safevar_sumo.questions.evaluator import Evaluator
 
 STAGE = "solutions by the measure"
 
@@ -51,13 +53,30 @@ def subject_by(subject: Study | Case | Path, unsafe: Unsafe, evaluator: Evaluato
     return study_by(subject, unsafe) if isinstance(subject, Study) else case_by(subject, unsafe, evaluator)
 
 
+def cases_by(cases: Sequence[Case], text: str | None, jobs: int | None, progress: Progress) -> list[Case]:
+    """Results by the criterion that a text states; as they are without one.
+
+    Raises
+    ------
+    InputError
+        If it is no criterion, or not one of a study.
+    """
+    if text is None:
+        return [*cases]
+    found = []
+    for case in cases:
+        with open_evaluator(case.study, jobs=jobs, progress=progress) as evaluator:
+            found.append(case_by(case, evaluator.parse_criterion(text), evaluator))
+    return found
+
+
 def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
     """Results by a criterion: with a bound on a metric that they lack, or that is of another point of a matrix, all
     solutions are simulated again.
     """
     study = study_by(case.study, unsafe)
     if study == case.study:
-        return case
+        return replace(case, stated=unsafe)
     evaluator = evaluator.for_study(study, verified=0)
     names = evaluator.characteristics.names
     settings = case.solutions[[*names]].to_numpy(dtype=float)
@@ -67,6 +86,7 @@ def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
     solutions = case.solutions.assign(outcome=found.outcome, collision_speed=found.collision_speed, **values)
     return replace(
         case,
+        stated=unsafe,
         study=study,
         original={name: float(value[0]) for name, value in original.metrics.items()},
         solutions=solutions,

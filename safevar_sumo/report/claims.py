@@ -25,6 +25,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import Column
 from safevar_sumo.questions.words import number_of
@@ -109,7 +110,8 @@ class Packed:
     def page(self) -> bytes:
         answers = [self.answer(text) for text in self.packed.questions]
         versions = self.manifest["versions"]
-        study = ReportedStudy(directory=self._directory, case=self.case, versions=versions, answers=answers)
+        (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
+        study = ReportedStudy(directory=self._directory, case=case, versions=versions, answers=answers)
         return make_page([study], progress=self._progress).encode()
 
     def study_file(self) -> bytes:

@@ -16,8 +16,9 @@ from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable
 from safevar_sumo.plugins import code_files, file_by_name, is_shipped, only_from
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Jobs
+from safevar_sumo.questions.ask import Criterion, Jobs, with_criterion
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import number_of
@@ -45,11 +46,16 @@ from safevar_sumo.report.page import usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, read_manifest
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_of
-from safevar_sumo.terminal import Progress, open_progress, show_within
+from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
 
 def evidence(
-    *results: str | Path, out: Path, ask: tuple[str, ...] = (), jobs: Jobs = None, progress: bool | Progress = False
+    *results: str | Path,
+    out: Path,
+    ask: tuple[str, ...] = (),
+    unsafe: Criterion = None,
+    jobs: Jobs = None,
+    progress: bool | Progress = False,
 ) -> str:
     """Pack results with their study, page and answers, so that anybody can compute every number again.
 
@@ -61,6 +67,9 @@ def evidence(
         The pack to write.
     ask
         Ask this question instead of the usual ones, with its options, such as "risk --samples 4000"; may be repeated.
+    unsafe
+        What is unsafe, in all answers and on the page: a collision, a safety degree below X, or a metric such as
+        "drac > 6".
     jobs
         Number of worker processes, by default one for each core.
     progress
@@ -81,7 +90,7 @@ def evidence(
     studies, files = [], dict[str, bytes]()
     with open_progress(progress) as show:
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
-            described, own_files = _pack_study(number, directory, ask, jobs, show)
+            described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
             studies.append(described)
             files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
     write_pack(out, studies, files)
@@ -89,7 +98,7 @@ def evidence(
 
 
 def _pack_study(
-    number: int, directory: Path, ask: Sequence[str], jobs: int | None, progress: Progress
+    number: int, directory: Path, ask: Sequence[str], unsafe: str | None, jobs: int | None, progress: Progress
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
     case = study_or_case(directory, results_only=True)
@@ -98,8 +107,11 @@ def _pack_study(
         raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
     study, manifest = case.study, read_manifest(directory)
     manifest.pop("folders", None)  # of this machine
-    questions = list(dict.fromkeys(ask or usual_questions(case, directory)))
-    described = PackedStudy(f"{number}-{study.name}", questions, list(case.finished_runs), count_outcomes(case))
+    (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
+    asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown, directory)]
+    questions = list(dict.fromkeys(asked))
+    folder = f"{number}-{study.name}"
+    described = PackedStudy(folder, questions, list(case.finished_runs), count_outcomes(case), unsafe)
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
     packed = Packed(described, files, study.origin.places, jobs, partial(show_within, progress, study.name))

@@ -19,8 +19,9 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import Jobs, parse_question
+from safevar_sumo.questions.ask import Criterion, Jobs, parse_question, with_criterion
 from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.subject import Results, case_at, changes_since
@@ -47,6 +48,7 @@ def report(
     out: str | Path = "report.html",
     ask: tuple[str, ...] = (),
     paper: bool = False,
+    unsafe: Criterion = None,
     point: str | None = None,
     jobs: Jobs = None,
     progress: bool | Progress = False,
@@ -67,6 +69,8 @@ def report(
         The verdict of the first question leads the page.
     paper
         With the research questions of the paper, as tables and figures.
+    unsafe
+        What is unsafe, on the whole page: a collision, a safety degree below X, or a metric such as "drac > 6".
     point
         Only this point of the study's matrix.
     jobs
@@ -106,10 +110,13 @@ def report(
         for change in changes:
             warn(f"{path}: {change}")
     give = answer_to if ask else answer_or_reason
-    subjects = cases if point is None else [case_at(case, point) for case in cases]
+    at_point = cases if point is None else [case_at(case, point) for case in cases]
+    subjects = cases_by(at_point, unsafe, jobs, show_no_progress)
     asked = [
-        alone or ([] if ask else usual_questions(case, path, point)) for case, path in zip(subjects, paths, strict=True)
+        [with_criterion(text, unsafe) for text in alone or ([] if ask else usual_questions(case, path, point))]
+        for case, path in zip(subjects, paths, strict=True)
     ]
+    joint = [with_criterion(text, unsafe) for text in joint]
     numbers = count(1)
     total = sum(map(len, asked)) + len(joint)
 

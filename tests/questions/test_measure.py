@@ -13,7 +13,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.measure import study_by
 from safevar_sumo.study import load_study
-from tests.in_process import json_of, refused, searched
+from tests.in_process import json_of, refused, run, searched
 
 METRIC = """
 import numpy as np
@@ -93,6 +93,30 @@ def test_every_question_takes_an_own_metric(folder: Path) -> None:
         assert "hardest > 6.8" in answer["verdict"], typed
 
 
+@pytest.mark.slow
+def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
+    criterion = ("--unsafe", "hardest > 6.8")
+    studied = json_of("study", "tiny.toml", "--out", "results", "--quiet", *criterion)
+    counts = re.search(r"(\d+) of (\d+) different solutions are unsafe: hardest > 6.8, or a col", studied["verdict"])
+    results = sv.load("results")
+    solutions = results.solutions.drop_duplicates([*results.case.characteristics.names])
+    assert counts is not None
+    assert 0 < int(counts[1]) == ((solutions["hardest"] > 6.8) | (solutions["outcome"] == "collision")).sum()
+    assert re.search(r"With the fewest changes it .*, hardest [\d.]+: ", studied["verdict"])
+    ask = ("--ask", "risk --samples 64", *criterion)
+    run("report", "results", "--out", "page.html", *ask)
+    page = (folder / "page.html").read_text()
+    assert "--unsafe &#39;hardest &gt; 6.8&#39;" in page
+    run("evidence", "results", "--out", "pack.zip", *ask)
+    verified = json_of("verify", "pack.zip", "--run-code")
+    assert verified["numbers"]["passed"], verified["tables"]["claims"]
+
+
+def test_a_study_refuses_a_criterion_before_it_searches(folder: Path) -> None:
+    refused("study", "tiny.toml", "--unsafe", "hardness > 5", message=("study 'tiny' has no metric 'hardness'",))
+    assert not (folder / "results").exists()
+
+
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
     (folder / "nowhere.py").write_text(METRIC.replace("return np.where", "return np.nan * np.where"))
     (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
@@ -115,6 +139,23 @@ def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
     assert (found["outcome"] != "collision").all()
     assert found["hardest"].max() <= 6.8
     assert answer["numbers"]["least_attacked"] <= 6.8
+
+
+@pytest.mark.slow
+def test_limits_of_the_matrix_by_drac_are_obeyed() -> None:
+    """500 cars within the limits together, at all points of the matrix: the worst one by DRAC counts."""
+    answer = json_of("tolerance", "wear", "--fits", "0", "--unsafe", "drac > 8")
+    ends = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
+    study = study_by(load_study("wear"), Unsafe.parse("drac > 8"))
+    assert answer["numbers"]["box"]
+    rng = np.random.default_rng(5)
+    cars = [
+        {name: float(rng.uniform(row["together_low"], row["together_high"])) for name, row in ends.items()}
+        for _ in range(500)
+    ]
+    found = sv.evaluate(study, cars, filtered=False, jobs=1)
+    assert (found["outcome"] != "collision").all()
+    assert found["drac"].max() <= 8
 
 
 @pytest.mark.parametrize(
