@@ -35,6 +35,8 @@ from safevar_sumo.study import searched
 STEADY_SPEED_LIMIT = 80.0
 """Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower.
 """
+FASTEST_TARGET = 130.0
+"""Highest speed of a target ahead [km/h], that of the vehicle in Euro NCAP's tests and in UN R157."""
 
 
 BESIDE = (-50.0, -40.0)
@@ -224,12 +226,17 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """A car is in the next lane."""
         return next_lane(self.speed, HEADWAYS, self.vut_length, self.vut_width)
 
+    def check(self) -> None:
+        """Refuse a leader who is faster than any test's."""
+        if self._target_speed > FASTEST_TARGET * KMH:
+            raise InputError("", f"target_speed = {self._target_speed / KMH:g} km/h", f"up to {FASTEST_TARGET:g} km/h")
+
     @property
     def direction(self) -> Direction:
         """Direction of the target."""
         if self.heading and self._target_speed:
             problem = f"heading = {self.heading:g} with a moving target"
-            raise InputError("scenario.parameters", problem, "a heading for a standing target")
+            raise InputError("", problem, "a heading for a standing target")
         return SAME_DIRECTION.turned(self.heading)
 
     @property
@@ -266,7 +273,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         if not self._target_brakes:
             if np.any(closing_speed <= 0):
                 problem = f"speed = {np.min(self.speed):g} km/h never reaches the target"
-                raise InputError("scenario.parameters", problem, "a slower target")
+                raise InputError("", problem, "a slower target")
             return gap / closing_speed
         gap_at_braking = gap - closing_speed * self.brakes_at
         b = self.target_deceleration

@@ -105,14 +105,13 @@ class SpeedProfile(NamedTuple):
         """
         if np.any(distance < run_up):
             raise InputError(
-                "scenario.parameters",
-                f"acceleration_distance = {run_up:g} m is longer than the distance of {np.min(distance):g} m",
+                "", f"acceleration_distance = {run_up:g} m is longer than the distance of {np.min(distance):g} m"
             )
         shortest_time = (distance + run_up) / speed
         begin = time - shortest_time
         if np.any(begin < 0):
             raise InputError(
-                "scenario.parameters",
+                "",
                 f"the target needs {np.max(shortest_time):.2f} s to the impact and has {np.max(time):g} s",
                 "a faster target, a shorter distance or a longer time_to_impact",
             )

@@ -127,7 +127,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         left = self.gap - (self.start_speed - self.first_speed) * enters_after
         if left <= 0:
             problem = f"gap = {self.gap:g} m is closed before the car is in the lane, after {enters_after:.2f} s"
-            raise InputError("scenario.parameters", problem, f"a gap above {self.gap - left:.4g} m")
+            raise InputError("", problem, f"a gap above {self.gap - left:.4g} m")
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The car that cuts in."""
@@ -190,8 +190,9 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         speed = self.start_speed
         apart = self.gap / self.start_speed * self.lateral_speed
         if np.any(apart < CAR.width):
-            problem = f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the standing car"
-            raise InputError("scenario.parameters", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")
+            moved = f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the standing car"
+            problem = f"gap = {np.min(self.gap):g} m: {moved}"
+            raise InputError("", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")
         front = self.headway * speed + CAR.length
         x = front - CAR.length / 2 + speed * times
         leader = Track("leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed)

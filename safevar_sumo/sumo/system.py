@@ -239,9 +239,8 @@ def _assemble(study: Study) -> System:
         check_name("", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network)
-    if not study.scenario.search:
-        for one in (point.scenario for point in matrix or (Point(scenario, weather),)):
-            one.check()
+    if not (matrix or study.scenario.search):
+        scenario.check()
     if study.scenario.search:
         points = matrix or (Point(scenario, weather),)
         check_domains(study, points)
@@ -370,6 +369,8 @@ def _points_of(test: MatrixTest, study: Study) -> Iterator[Point]:
         over = dict(zip(test.over, values, strict=True))
         table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
         scenario = _create_scenario(table, Lookup.of(study))
+        if not study.scenario.search:
+            scenario.check()
         for weather in map(weather_of, test.weathers or [study.weather]):
             name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
             parameters = {"test": test.name, **over, "weather": weather.name}

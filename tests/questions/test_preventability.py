@@ -268,6 +268,24 @@ def test_what_a_late_sensor_costs_is_the_way_that_it_closes_meanwhile() -> None:
 
 
 @pytest.mark.slow
+def test_behind_a_braking_leader_a_delay_moves_the_border_of_the_headway_by_itself() -> None:
+    """The border is below the study's headway of 2 s; far above it the leader stands, and he collides, too. With a
+    range of 15 m he avoids nothing. Where the border is the domain's lower end, it is that.
+    """
+    study = load_study("alks", matrix={"point": "following, speed 60, wet"})
+    changes = {"sensorLatency": 0.35, "brakeResponse": 0.3, "sensorRange": 15.0}
+    moved = find_moved_borders(Evaluator(study, InlinePool()), [Cause(changes, "collision", -1.0, {})])
+    by_name = moved.set_index("characteristic")
+    added = by_name["border_now"] - by_name["border_before"]
+    assert added["sensorLatency"] == pytest.approx(0.3, abs=0.02)
+    assert added["brakeResponse"] == pytest.approx(0.2, abs=0.02)
+    assert np.isnan(added["sensorRange"])
+    study = load_study("alks_joint_cut_out")
+    moved = find_moved_borders(Evaluator(study, InlinePool()), [Cause({"brakeTorque": 0.5}, "collision", -1.0, {})])
+    assert moved["border_before"].tolist() == [1.0]
+
+
+@pytest.mark.slow
 def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
     study = load_study("alks_joint")
     evaluator = Evaluator(study, InlinePool(), verified=0)

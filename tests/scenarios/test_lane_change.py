@@ -11,13 +11,14 @@ import pytest
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.preventability import ANY
 from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import drive
 from safevar_sumo.sumo.lane_world import LaneWorld
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import simulate, simulate_all_points
 from safevar_sumo.sumo.stage import Stage
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -228,6 +229,7 @@ def test_whose_collision_it_is() -> None:
 REFUSED = {
     "closed": ("cut_in", {"speed": 130.0, "target_speed": 30.0, "gap": 10.0}, r"gap = 10 m is closed before"),
     "fast": ("cut_in", {"target_speed": 140.0}, "target_speed = 140"),
+    "fast leader": ("car_to_car", {"test": "CCRb", "speed": 140.0}, "target_speed = 140 km/h"),
     "through": ("cut_out", {"speed": 100.0, "gap": 20.0}, r"0\.72 m sideways when he drives through"),
 }
 
@@ -238,7 +240,18 @@ def test_what_cannot_be_is_refused_in_two_lines(name: str) -> None:
     scenario = {"model": model, "parameters": parameters}
     with pytest.raises(InputError, match=message) as caught:
         simulate(assemble(load_study("wear", matrix=None, scenario=scenario)), ORIGINAL)
-    assert len(str(caught.value).splitlines()) == 2
+    lines = str(caught.value).splitlines()
+    assert lines[0].startswith("study 'wear': ")
+    assert len(lines) == 2
+
+
+@pytest.mark.slow
+def test_the_new_car_and_the_regulations_driver_in_it_avoid_all_encounters_of_the_study() -> None:
+    for ads in ({"model": "aeb"}, {"model": "competent_driver", "parameters": ANY}):
+        system = assemble(load_study("alks", ads=ads))
+        results = simulate_all_points(system, system.characteristics.original[np.newaxis])
+        assert len(results) == 13
+        assert min(result.evaluations.f_safe[0] for result in results) >= 0.3
 
 
 SCRIPT = """

@@ -14,7 +14,7 @@ from safevar_sumo.questions.preventability import ANY, LETTER
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point
-from safevar_sumo.study import Domain, ModelTable, Study, free_parameters
+from safevar_sumo.study import Domain, ModelTable, Study
 from safevar_sumo.sumo.system import assemble
 
 BORDERS = "borders of what a competent driver avoids"
@@ -25,8 +25,12 @@ COLUMNS: Columns = {
     "characteristic": "characteristic that is changed alone",
     "value": Column("", "its value, the furthest from the original in the causes", ".5g"),
     "scenario": "scenario, and the parameter that has the border",
-    "border_before": Column("", "value from which on a competent driver avoids the collision in the new car", ".4g"),
-    "border_now": Column("", "the same in the car with this change", ".4g"),
+    "border_before": Column(
+        "", "value from which on, up to the study's own, a competent driver avoids the collision in the new car", ".4g"
+    ),
+    "border_now": Column(
+        "", "the same in the car with this change, above the study's value if need be; undefined if at no value", ".4g"
+    ),
 }
 
 
@@ -45,18 +49,22 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
     rows = []
     for point in system.points if changed else ():
         border = point.scenario.border
-        domain = free_parameters(type(point.scenario)).get(border)
-        if domain is None:
+        free = point.scenario.free().get(border)
+        if free is None:
             continue
-        searched = Domain(unit=domain.unit, original=domain.upper, lower=domain.lower, upper=domain.upper)
-        study = _with_border(evaluator.study, point, border, searched)
+        own = getattr(point.scenario, border, None)
+        default = Domain(
+            unit=free.unit, original=free.upper if own is None else own, lower=free.lower, upper=free.upper
+        )
+        domain = evaluator.study.scenario.search.get(border, default)
+        study = _with_border(evaluator.study, point, border, domain)
         with_driver = evaluator.for_study(study, verified=0)
         vehicle = original[evaluator.characteristics.of_vehicle]
         cars = np.where(np.eye(len(vehicle), dtype=bool), furthest[: len(vehicle)], vehicle)[changed]
-        before, *borders = _borders(with_driver, np.vstack([vehicle, cars]), searched).tolist()
+        before, *borders = _borders(with_driver, np.vstack([vehicle, cars]), domain).tolist()
         title = f"{point.name or evaluator.study.scenario.model}: {border} [{domain.unit}]"
         moved = [pair for pair in zip(changed, borders, strict=True) if pair[1] > before]
-        rows += [(names[k], furthest[k], title, before, now) for k, now in moved]
+        rows += [(names[k], furthest[k], title, before, now if now < np.inf else None) for k, now in moved]
     return pd.DataFrame(rows, columns=[*COLUMNS])
 
 
@@ -72,22 +80,30 @@ def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Stu
     fixed = {name: value for name, value in parameters.items() if name not in (border, *WEATHER_PARAMETERS)}
     scenario = replace(study.scenario, model=model, parameters=fixed, search={border: domain}, margin=0.0)
     driver = ModelTable(model=LETTER, parameters=ANY)
-    return replace(study, scenario=scenario, matrix=None, weather=point.weather, ads=driver, spread={})
+    return replace(study, scenario=scenario, matrix=None, weather=point.weather, ads=driver, spread={}, constraints=[])
 
 
 def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArray:
-    """The values from which on each of M cars, shape (M, n), is safe, and the first one, the new car, too; shape (M,).
-    A border beyond the domain is its end.
+    """The values from which on each of M cars, shape (M, n), is safe, up to the study's own value or, if it is unsafe
+    there, up to the first safe value above; shape (M,). The first car is the new one.
+
+    It is the domain's lower end if a car is safe from there on, and infinite if no value from the study's own on is.
     """
-    rows = np.arange(len(cars))
-    low, high = np.full(len(cars), domain.lower), np.full(len(cars), domain.upper)
+    rows, size = np.arange(len(cars)), STEPS + 1
+    values = np.tile(np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original]), (len(cars), 1))
+    own = int(np.searchsorted(values[0], domain.original))
+    is_never_safe = np.zeros(len(cars), dtype=bool)
     for _ in range(ROUNDS):
-        values = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.linspace(0.0, 1.0, STEPS)
-        settings = np.column_stack([np.repeat(cars, STEPS, axis=0), values.ravel()])
+        settings = np.column_stack([np.repeat(cars, size, axis=0), values.ravel()])
         runs = evaluator.evaluate(settings, BORDERS, ignore_constraints=True)
         # Where the new car is unsafe, the encounter is infeasible.
         fails = (runs.collided | (runs.outcome == Outcome.INFEASIBLE)).reshape(values.shape)
+        is_never_safe |= fails[:, own:].all(axis=1)
+        first_safe = own + np.argmin(fails[:, own:], axis=1)
+        fails &= np.arange(size) < first_safe[:, np.newaxis]
+        last = size - 1 - np.argmax(fails[:, ::-1], axis=1)  # the last unsafe value below
         ever_fails = fails.any(axis=1)
-        last = np.where(ever_fails, STEPS - 1 - np.argmax(fails[:, ::-1], axis=1), 0)
-        low, high = values[rows, last], values[rows, np.minimum(last + ever_fails, STEPS - 1)]
-    return np.asarray(high)
+        low = np.where(ever_fails, values[rows, last], domain.lower)
+        high = np.where(ever_fails, values[rows, np.minimum(last + 1, size - 1)], domain.lower)
+        values, own = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.linspace(0.0, 1.0, size), size - 1
+    return np.where(is_never_safe, np.inf, high)
