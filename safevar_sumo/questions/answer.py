@@ -6,6 +6,7 @@ import json
 import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from html import escape
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -50,7 +51,7 @@ WIDTH = 80
 
 class Contents(NamedTuple):
     """The names of an answer's numbers, and of the columns of its tables; `...` among them stands for names that a
-    study gives, such as its metrics.
+    study gives, such as its metrics, and `*` for any end of a name.
     """
 
     numbers: Collection[str | EllipsisType]
@@ -65,7 +66,7 @@ class Contents(NamedTuple):
         name, _, rest = key.rpartition(".")
         number = name if name and rest.isdecimal() else key
         wanted, names = (rest, self.tables[name]) if name in self.tables else (number, self.numbers)
-        if wanted not in names and ... not in names:
+        if ... not in names and not any(fnmatchcase(wanted, str(known)) for known in names):
             raise unknown_name("fail_if", f"the answer has no number {key!r}", key, self.keys)
 
     @property

@@ -153,12 +153,15 @@ def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_un
     return Models(tuple(members), tuple(left_out))
 
 
-def with_points_between(model: Model, unsafe: Unsafe, rng: np.random.Generator) -> tuple[Model, int]:
-    """A model whose study also has points between those of its matrix, drawn at random, and the number of those left
-    out: points at which the original itself is unsafe, by a criterion that may be stricter than the model's.
+def with_points_between(
+    model: Model, unsafe: Unsafe, rng: np.random.Generator, cells: Sequence[MatrixTest] | None = None
+) -> tuple[Model, int]:
+    """A model whose study also has points between those of its matrix, or of other `cells`, drawn at random, and the
+    number of those left out: points at which the original itself is unsafe, by a criterion that may be stricter than
+    the model's.
     """
     study = model.evaluator.study
-    tests = tests_between(study, rng)
+    tests = tests_between(study, rng, cells)
     if not tests:
         return model, 0
     original = model.evaluator.characteristics.original[np.newaxis]
@@ -180,19 +183,21 @@ def _with_tests(study: Study, tests: Sequence[MatrixTest]) -> Study:
     return replace_in(study, matrix=replace_in(study.matrix, tests=[*tests]))
 
 
-def tests_between(study: Study, rng: np.random.Generator) -> list[MatrixTest]:
+def tests_between(study: Study, rng: np.random.Generator, cells: Sequence[MatrixTest] | None) -> list[MatrixTest]:
     """A test at one random point in each cell of each test's grid: between neighbouring values of every axis that a
-    study may search, at all values of other axes; none without such an axis.
+    study may search, at all values of other axes; none without such an axis. `cells` are tests in place of the study's.
     """
-    if study.matrix is None or study.matrix.protocol or study.scenario.search:
+    if study.matrix is None or study.matrix.protocol or study.scenario.search or cells == []:
         return []
+    if cells:
+        study = _with_tests(study, cells)
     tests = list[MatrixTest]()
     for test, points in points_of_tests(study, assemble(study).points):
         searchable = searchable_in(points[0].scenario)
-        cells = {name: _cells(values) if name in searchable else [] for name, values in test.over.items()}
-        if not any(cells.values()):
+        pairs = {name: _cells(values) if name in searchable else [] for name, values in test.over.items()}
+        if not any(pairs.values()):
             continue
-        for cell in product(*(cells[name] or [(value,) for value in values] for name, values in test.over.items())):
+        for cell in product(*(pairs[name] or [(value,) for value in values] for name, values in test.over.items())):
             drawn = [_draw(ends, rng) for ends in cell]
             over = {name: [value] for name, value in zip(test.over, drawn, strict=True)}
             tests.append(replace_in(test, over=over))

@@ -23,8 +23,11 @@ from safevar_sumo.questions.models import Models, limit_criterion, models_of, wi
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, limits_alone
+from safevar_sumo.questions.tolerance.by_parameter import Parameter
+from safevar_sumo.questions.tolerance.levels import LevelSearch
+from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
-from safevar_sumo.questions.tolerance.rows import limit_rows
+from safevar_sumo.questions.tolerance.rows import CHARACTERISTIC, LIMITS, limit_rows
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES, WHOLE_POINT_LOSS, OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
 from safevar_sumo.questions.tolerance.together import TEST_STAGE, LimitsTogether, find_limits_together
@@ -42,24 +45,6 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.case import Case
 
-CHARACTERISTIC: Columns = {"characteristic": "characteristic of the vehicle", "unit": "unit of its values"}
-LIMITS: Columns = {
-    **CHARACTERISTIC,
-    "original": Column("", "value of the original vehicle", ".6g"),
-    **{
-        f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g")
-        for name, meaning in (
-            ("alone", "that is safe with all others as in the original, with every fit"),
-            ("together", "that is safe with all others within theirs, with every fit"),
-            ("specified", "that the user's limit allows"),
-        )
-        for end in ("low", "high")
-    },
-    "kept": "whether the car is safe within the specified limits with every fit; empty without one",
-    "fails_first": Column("", "what fails first beyond the limit", is_shown=False),
-    "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
-    "sentence": "for a maintenance manual; all of these may be obeyed together",
-}
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
@@ -95,8 +80,8 @@ NEAREST: Columns = {
 
 @question
 @contents(
-    *("unsafe", "margin", "kept", "scope", "boxes", *OF_BOX),
-    limits=LIMITS,
+    *("unsafe", "margin", "kept", "scope", "boxes", "up_to", *OF_BOX),
+    limits=(*LIMITS, "by_*", "scope"),
     intervals=INTERVALS,
     fits=FITS,
     points=POINTS,
@@ -113,6 +98,8 @@ def tolerance(
     unsafe: Criterion = None,
     fits: Annotated[int | None, Range(0, 1000)] = None,
     attack: Annotated[int, Range(0, 100_000_000)] = 5000,
+    by: Annotated[str | None, "NAME=V1,V2,..."] = None,
+    together: bool = False,
 ) -> Answer:
     """Find how far each characteristic may go: alone, and all together.
 
@@ -138,14 +125,26 @@ def tolerance(
         by default all; 0 for the study's own alone.
     attack
         Number of simulations that are aimed at the limits together, over all fits; 0 leaves the attack out.
+    by
+        A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits alone that hold up
+        to each, and up to which value the specified limits hold.
+    together
+        With `by`, the limits together that hold up to each value as well, which takes long; without, they always are.
     """
     study = evaluator.study
     members = evaluator.characteristics
+    parameter = None if by is None else Parameter.parse(by, study)
+    check_by(by, unsafe, together)
     evaluator.plan(SCAN_STAGE, SEARCH_STAGE, TEST_STAGE, ALONE_STAGE, *([WIDER_STAGE] if study.wider else []))
     columns = _columns_of(members.vehicle.names, characteristics)
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
     criterion = limit_criterion(evaluator, subject, unsafe, margin, original)
+    if parameter is not None:
+        solutions = _unsafe_solutions(subject, range(len(members)), criterion)
+        is_alone = np.count_nonzero((solutions != members.original) & members.of_vehicle, axis=1) == 1
+        search = LevelSearch(evaluator, parameter, criterion, columns, specified, fits, attack)
+        return answer_by(search, solutions[is_alone], together)
     is_sought = not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
     if is_sought:
         _check_drawable(evaluator)
@@ -153,39 +152,39 @@ def tolerance(
         scans = scan(evaluator, columns, criterion)
     is_safe = not criterion.of(original)[0]
     models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
-    together = None
+    found_together: LimitsTogether | None = None
     if is_sought and is_safe:
         all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
         everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
         known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, scans)]
         all_limits = {**specified, **everywhere}
-        together = find_limits_together(models, all_columns, all_limits, scans, np.concatenate(known), attack)
+        found_together = find_limits_together(models, all_columns, all_limits, scans, np.concatenate(known), attack)
     judges = _denser(models, attack) if is_sought else models.members
     with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
-        met = () if together is None else together.searched
-        failures = np.zeros((0, len(members))) if together is None else together.failures_alone
+        met = () if found_together is None else found_together.searched
+        failures = np.zeros((0, len(members))) if found_together is None else found_together.failures_alone
         alone = limits_alone(scans, columns, judges, attack, met, failures)
-    found = limit_rows(alone, together, specified, models.members)
+    found = limit_rows(alone, found_together, specified, models.members)
     tables = {
         "limits": tabulate("Limits, rounded to the safe side", LIMITS, found.rows),
         "intervals": tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans)),
     }
-    if together is not None and len(models.members) + len(models.left_out) > 1:
-        tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, _fit_rows(models, together))
+    if found_together is not None and len(models.members) + len(models.left_out) > 1:
+        tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, _fit_rows(models, found_together))
     if is_rated(study):
         tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
-    nearest = nearest_limits(models, specified) if found.broken and together is not None else []
+    nearest = nearest_limits(models, specified) if found.broken and found_together is not None else []
     if nearest:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
-    wider = wider_rows(evaluator, specified, together, unsafe, margin, fits, attack) if is_safe else []
+    wider = wider_rows(evaluator, specified, found_together, unsafe, margin, fits, attack) if is_safe else []
     if wider:
         tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
-    sentences = verdict_sentences(models, alone, together, specified, found.broken, attack, nearest, wider)
+    sentences = verdict_sentences(models, alone, found_together, specified, found.broken, attack, nearest, wider)
     return Answer(
         question="tolerance",
         study=study,
         verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
-        numbers=_numbers(study, criterion, models, together, found.broken, attack),
+        numbers=_numbers(study, criterion, models, found_together, found.broken, attack),
         tables=tables,
         failures=tuple(f"limit of {text}" for text in found.broken),
         draw=partial(_draw, scans=scans),
@@ -204,20 +203,7 @@ def _numbers(
     }
     if together is None:
         return {**numbers, **dict.fromkeys(OF_BOX), "boxes": 0}
-    proof, found = together.proof, together.attack
-    return {
-        **numbers,
-        "box": together.box is not None,
-        "samples": None if proof is None else proof.samples,
-        "failures": None if proof is None else proof.failures,
-        "at_most": None if proof is None else proof.at_most,
-        "not_simulated": None if proof is None else proof.not_simulated,
-        "fits": len(together.members),
-        "fits_tried": len(models.members),
-        "attacked": None if found is None else found.simulated,
-        "least_attacked": None if found is None else together.least[0],
-        "boxes": int(together.box is not None),
-    }
+    return {**numbers, **together.numbers, "fits_tried": len(models.members)}
 
 
 def _check_drawable(evaluator: Evaluator) -> None:

@@ -22,11 +22,13 @@ PARTS, ROUNDS = 8, 4
 """Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts."""
 MOVED_BEFORE = 8
 """Number of failures, the nearest to the original, in whose encounters a limit is safe at once."""
-ATTACKS, ATTACK_SHARE, GENERATIONS = 3, 0.1, 5
+ATTACKS, ATTACK_SHARE, GENERATIONS = 8, 0.1, 5
 """Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each, and its
-number of generations.
+number of generations, the first at the limit itself.
 """
 ALONE_STAGE = "limits alone with each fit"
+Beyond = tuple[FloatArray, Model] | None
+"""A setting just beyond a limit, and the model in which it is unsafe; None where nothing is known to be."""
 
 
 class AloneLimit(NamedTuple):
@@ -37,16 +39,25 @@ class AloneLimit(NamedTuple):
     safe
         The safe interval around the original, rounded inwards; ends of the domain stay. None if the original is unsafe.
     beyond
-        A setting just beyond each end, and the model in which it is unsafe; None where nothing is known to be.
+        What is just beyond each end.
     """
 
     scan: OneAtATimeScan
     safe: Interval | None
-    beyond: tuple[tuple[FloatArray, Model] | None, tuple[FloatArray, Model] | None] = (None, None)
+    beyond: tuple[Beyond, Beyond] = (None, None)
 
     @property
     def characteristic(self) -> Characteristic:
         return self.scan.characteristic
+
+    @property
+    def nearest_failure(self) -> Beyond:
+        """What is beyond the end that is nearer to the original."""
+        return min(filter(None, self.beyond), key=lambda pair: self._change(*pair), default=None)
+
+    def _change(self, setting: FloatArray, model: Model) -> float:
+        column = model.evaluator.characteristics.names.index(self.characteristic.name)
+        return abs(float(setting[column]) - self.characteristic.original)
 
 
 class _Ends:
@@ -57,7 +68,7 @@ class _Ends:
         assert scan.safe is not None
         self.item, self.column, self.scan = item, column, scan
         self.ends, members = [*scan.safe], own.evaluator.characteristics
-        self.beyond: list[tuple[FloatArray, Model] | None] = [None, None]
+        self.beyond: list[Beyond] = [None, None]
         for side, last in enumerate((item.lower, item.upper)):
             values = [value for pair in scan.of_state("unsafe") for value in pair]
             outside = [value for value in values if (value < self.ends[0], value > self.ends[1])[side]]
@@ -74,42 +85,52 @@ class _Ends:
         return AloneLimit(self.scan, safe, (self.beyond[0], self.beyond[1]))
 
 
-class _Move:
-    """The move of one end between the original and the nearest of some failures, shape (K, n): to the last value before
-    it that is safe in the encounters of them all.
+class Move:
+    """The move of an end of one column between a safe value and the nearest of some failures, shape (K, n): to the last
+    value before it that is safe in the encounters of them all.
+
+    Attributes
+    ----------
+    safe, failure
+        The last safe value, and the failure just beyond it, shape (n,).
     """
 
-    def __init__(self, ends: _Ends, side: int, failures: FloatArray) -> None:
-        self.ends, self.side = ends, side
-        distances = np.abs(failures[:, ends.column] - ends.item.original)
-        self.encounters = failures[np.argsort(distances, kind="stable")[:MOVED_BEFORE]]
+    def __init__(self, column: int, start: float, failures: FloatArray) -> None:
+        self.column, self.safe = column, start
+        order = np.argsort(np.abs(failures[:, column] - start), kind="stable")
+        self.encounters = failures[order[:MOVED_BEFORE]]
         self.failure = self.encounters[0]
-        self.safe = ends.item.original
 
     @property
-    def values(self) -> FloatArray:
-        unsafe = self.failure[self.ends.column]
-        return np.asarray(self.safe + (unsafe - self.safe) * np.arange(1, PARTS) / PARTS)
+    def _values(self) -> FloatArray:
+        """The values of a round."""
+        return np.asarray(self.safe + (self.failure[self.column] - self.safe) * np.arange(1, PARTS) / PARTS)
 
     @property
     def settings(self) -> FloatArray:
         """The settings of a round, shape (K (`PARTS` - 1), n)."""
         settings = np.repeat(self.encounters, PARTS - 1, axis=0)
-        settings[:, self.ends.column] = np.tile(self.values, len(self.encounters))
+        settings[:, self.column] = np.tile(self._values, len(self.encounters))
         return settings
 
     def narrow(self, are_unsafe: BoolArray) -> None:
         """Take what a round gave."""
-        is_unsafe, values = are_unsafe.reshape(len(self.encounters), PARTS - 1), self.values
+        is_unsafe, values = are_unsafe.reshape(len(self.encounters), PARTS - 1), self._values
         first = int(np.argmax(np.append(is_unsafe.any(axis=0), True)))
         self.safe = self.safe if first == 0 else float(values[first - 1])
         if first < len(values):
             self.failure = self.encounters[np.argmax(is_unsafe[:, first])].copy()
-            self.failure[self.ends.column] = values[first]
+            self.failure[self.column] = values[first]
 
-    def end(self, model: Model) -> None:
-        self.ends.ends[self.side] = self.safe
-        self.ends.beyond[self.side] = self.failure, model
+
+def carry_out(moves: Sequence[Move], model: Model) -> None:
+    """Carry out moves before failures in a model, side by side."""
+    for _ in range(ROUNDS):
+        settings = [each.settings for each in moves]
+        are_unsafe = model.are_unsafe(np.concatenate(settings), ALONE_STAGE)
+        parts = np.split(are_unsafe, np.cumsum([*map(len, settings)])[:-1])
+        for each, part in zip(moves, parts, strict=True):
+            each.narrow(part)
 
 
 def limits_alone(
@@ -119,9 +140,11 @@ def limits_alone(
     budget: int,
     met: Sequence[Model],
     failures: FloatArray,
+    values: int = VALUES,
 ) -> list[AloneLimit]:
-    """The limits alone that hold in all models, from scans with the study's own fit, the first model; and before the
-    failures of one characteristic that the search for limits together met in some models, shape (K, n).
+    """The limits alone that hold in all models, each at some `values`, from scans with the study's own fit, the first
+    model; and before the failures of one characteristic that the search for limits together met in some models, shape
+    (K, n).
     """
     if any(scan.safe is None for scan in scans):
         return [AloneLimit(scan, None) for scan in scans]
@@ -129,7 +152,7 @@ def limits_alone(
     encounters = models[0].evaluator.critical_encounters
     encounters = np.concatenate([models[0].evaluator.characteristics.original[np.newaxis], encounters])
     for model in models:
-        _move_before(ends, model, encounters, VALUES)
+        _move_before(ends, model, encounters, values)
         while _move_before(ends, model, encounters, 2):
             pass
     for model in met if len(failures) else ():
@@ -169,20 +192,16 @@ def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -
     end has moved.
     """
     has_moved = False
-    while moves := [
-        _Move(each, side, of_side)
-        for each, rows in zip(ends, failures, strict=True)
+    while moves := {
+        (number, side): Move(each.column, each.item.original, of_side)
+        for number, (each, rows) in enumerate(zip(ends, failures, strict=True))
         for side, of_side in enumerate(_by_side(each, rows))
         if len(of_side)
-    ]:
-        for _ in range(ROUNDS):
-            settings = [each.settings for each in moves]
-            are_unsafe = model.are_unsafe(np.concatenate(settings), ALONE_STAGE)
-            parts = np.split(are_unsafe, np.cumsum([*map(len, settings)])[:-1])
-            for each, part in zip(moves, parts, strict=True):
-                each.narrow(part)
-        for each in moves:
-            each.end(model)
+    }:
+        carry_out([*moves.values()], model)
+        for (number, side), move in moves.items():
+            ends[number].ends[side] = move.safe
+            ends[number].beyond[side] = move.failure, model
         has_moved = True
     return has_moved
 
@@ -199,18 +218,21 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
     """Attack the limits in encounters that no scan met, until nothing is found."""
     members, seed = models[0].evaluator.characteristics, models[0].evaluator.study.search.seed
     judges = [partial(model.left, stage="attack on limits alone") for model in models]
-    waiting = [*ends]
+    waiting, size = [*ends], max(budget // GENERATIONS, 1)
     for number in range(ATTACKS):
-        boxes = list[Box]()
-        for each in waiting:
+        boxes, known = list[Box](), list[list[FloatArray]]()
+        rngs = [np.random.default_rng((seed, 6, each.column, number)) for each in waiting]
+        for each, rng in zip(waiting, rngs, strict=True):
             lower = np.where(members.of_vehicle, members.original, members.lower)
             upper = np.where(members.of_vehicle, members.original, members.upper)
             limit = each.limit().safe
             assert limit is not None
             lower[each.column], upper[each.column] = limit
             boxes.append(Box(models[0].evaluator.region, lower, upper))
-        rngs = [np.random.default_rng((seed, 6, each.column, number)) for each in waiting]
-        found = attack_all(boxes, judges, [()] * len(boxes), budget, rngs, max(budget // GENERATIONS, 1))
+            at_limit = boxes[-1].draw(size, rng)
+            at_limit[:, each.column] = np.resize(limit, len(at_limit))
+            known.append(np.array_split(at_limit, len(models)))
+        found = attack_all(boxes, judges, known, budget, rngs, size)
         for judge, model in enumerate(models):
             _move(waiting, model, [one.settings[(one.left < 0) & (one.judges == judge)] for one in found])
         waiting = [each for each, one in zip(waiting, found, strict=True) if (one.left < 0).any()]

@@ -10,24 +10,44 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Interval
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.records import KMH_PER_MS, FloatArray
+from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
+CHARACTERISTIC: Columns = {"characteristic": "characteristic of the vehicle", "unit": "unit of its values"}
+LIMITS: Columns = {
+    **CHARACTERISTIC,
+    "original": Column("", "value of the original vehicle", ".6g"),
+    **{
+        f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g")
+        for name, meaning in (
+            ("alone", "that is safe with all others as in the original, with every fit"),
+            ("together", "that is safe with all others within theirs, with every fit"),
+            ("specified", "that the user's limit allows"),
+        )
+        for end in ("low", "high")
+    },
+    "kept": "whether the car is safe within the specified limits with every fit; empty without one",
+    "fails_first": Column("", "what fails first beyond the limit", is_shown=False),
+    "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
+    "sentence": "for a maintenance manual; all of these may be obeyed together",
+}
 Ends = tuple[float | None, float | None]
 NOWHERE: Ends = None, None
 
 
 class Failure(NamedTuple):
-    """An unsafe setting, and how it fails, in words."""
+    """An unsafe setting, how it fails, in words, and the parameters of the point of the matrix where it does."""
 
     setting: FloatArray
     words: str
+    point: JsonObject
 
 
 class LimitRows(NamedTuple):
@@ -117,15 +137,8 @@ def _failures_alone(alone: Iterable[AloneLimit]) -> dict[str, Failure]:
     """How each characteristic alone fails first, by its name."""
     failures = dict[str, Failure]()
     for each in alone:
-        original = each.characteristic.original
-        known = [pair for pair in each.beyond if pair is not None]
-        if known:
-            column = next(
-                number
-                for number, member in enumerate(known[0][1].evaluator.characteristics)
-                if member.name == each.characteristic.name
-            )
-            setting, model = min(known, key=lambda pair: abs(pair[0][column] - original))
+        if each.nearest_failure is not None:
+            setting, model = each.nearest_failure
             failures |= describe(model, {each.characteristic.name: setting})
     return failures
 
@@ -159,7 +172,8 @@ def describe(model: Model, settings: Mapping[str, FloatArray]) -> dict[str, Fail
     for (name, setting), point, collided, degree in rows:
         values = dict(zip(members.scenario.names, setting[~members.of_vehicle].tolist(), strict=True))
         scenario = encounter(points[point], values).scenario
-        failures[name] = Failure(setting, _failure_in_words(scenario, model.unsafe, bool(collided), degree) + fit)
+        words = _failure_in_words(scenario, model.unsafe, bool(collided), degree) + fit
+        failures[name] = Failure(setting, words, dict(points[point].parameters))
     return failures
 
 

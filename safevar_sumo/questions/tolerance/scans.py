@@ -73,11 +73,20 @@ class OneAtATimeScan(NamedTuple):
         return min(values, key=lambda value: abs(value - original), default=math.nan)
 
 
-def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, one at a time."""
+def scan(
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    unsafe: Unsafe,
+    within: Sequence[Interval] | None = None,
+    number: int | None = None,
+) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, or intervals within them, one at a time; at `number` values, by default
+    `SCAN_VALUES`.
+    """
     scanned = [evaluator.characteristics.members[column] for column in columns]
-    number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
-    values = [np.union1d(np.linspace(item.lower, item.upper, number), item.original) for item in scanned]
+    number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (number or SCAN_VALUES, ROUNDS)
+    ends = [(item.lower, item.upper) for item in scanned] if within is None else within
+    values = [np.union1d(np.linspace(*end, number), item.original) for item, end in zip(scanned, ends, strict=True)]
     profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
         values = [_values_between_states(profile) for profile in profiles]

@@ -15,7 +15,7 @@ from safevar_sumo.questions.models import Model, Models, with_points_between
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
 from safevar_sumo.questions.tolerance.settlement import Settlement
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
 MAX_UNSAFE_SHARE = 0.003
@@ -77,6 +77,22 @@ class LimitsTogether(NamedTuple):
     room: BoolArray
     searched: tuple[Model, ...]
     failures_alone: FloatArray
+
+    @property
+    def numbers(self) -> JsonObject:
+        """What an answer says of them in numbers."""
+        proof, found = self.proof, self.attack
+        return {
+            "box": self.box is not None,
+            "samples": None if proof is None else proof.samples,
+            "failures": None if proof is None else proof.failures,
+            "at_most": None if proof is None else proof.at_most,
+            "not_simulated": None if proof is None else proof.not_simulated,
+            "fits": len(self.members),
+            "attacked": None if found is None else found.simulated,
+            "least_attacked": None if found is None else self.least[0],
+            "boxes": int(self.box is not None),
+        }
 
 
 class _Failures(NamedTuple):
@@ -208,9 +224,10 @@ def find_limits_together(
     scans: Sequence[OneAtATimeScan],
     unsafe_settings: FloatArray,
     budget: int,
+    inner: Box | None = None,
 ) -> LimitsTogether:
     """The largest box by relative volume in which `columns` vary, in which those of `limits` reach their limits, and
-    that holds none of `unsafe_settings`, shape (K, n).
+    that holds none of `unsafe_settings`, shape (K, n); around an `inner` box, if that passes its test.
 
     Notes
     -----
@@ -250,7 +267,7 @@ def find_limits_together(
     test = _BoxTest(members, budget, models.own.evaluator)
     for number in range(1, MAX_BOXES + 1):
         with test.evaluator.stage(SEARCH_STAGE):
-            sides = search.best(start)
+            sides = search.best(start) if inner is None or number > 1 else search.sides_of(inner)
         if sides is None:
             return _without_box(nothing, search, number)
         box = search.printed(sides)

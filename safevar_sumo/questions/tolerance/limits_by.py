@@ -1,0 +1,289 @@
+"""The answer with limits up to each of some values of a parameter: its table, its words, and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tolerance.alone import ATTACK_SHARE, AloneLimit
+from safevar_sumo.questions.tolerance.by_parameter import Parameter
+from safevar_sumo.questions.tolerance.levels import Level, LevelSearch, Reach
+from safevar_sumo.questions.tolerance.levels_together import levels_with_together
+from safevar_sumo.questions.tolerance.rows import LIMITS, NOWHERE, Failure, describe
+from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.study import Limit, unit_text
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+UNSAFE_ORIGINAL = "the original vehicle itself is unsafe, or safe in no encounter"
+
+
+def answer_by(search: LevelSearch, known: FloatArray, is_together: bool) -> Answer:
+    """Limits that hold up to each value of a parameter, alone, and if they are wanted, together; `known` are failures
+    of one characteristic that results hold, shape (K, n).
+    """
+    by, unsafe, limits, study = search.by, search.unsafe, search.limits, search.evaluator.study
+    levels = levels_with_together(search, known) if is_together else search.levels(known)
+    with search.evaluator.stage("specified limits between two values"):
+        reach = search.reach(levels)
+    scopes = [by.scope(study, level.value, between=search.budget > 0) for level in levels]
+    is_kept = not limits or all(level.alone is not None and not level.failures for level in levels)
+    frame = tabulate(_title(by), columns_by(by), _rows(search, levels, scopes))
+    sentences = [*_sentences(search, levels, frame, reach), f"Scope: {scopes[-1]}."]
+    return Answer(
+        question="tolerance",
+        study=study,
+        verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
+        numbers={
+            "unsafe": str(unsafe),
+            "margin": unsafe.keep,
+            "kept": is_kept,
+            "scope": scopes[-1],
+            **_numbers(levels, reach, unsafe),
+            "up_to": reach.value,
+        },
+        tables={"limits": frame},
+        failures=() if is_kept else (f"the limits hold up to {_text(by, reach.value)}, not {by.text(by.values[-1])}",),
+        draw=lambda answer: _draw(answer, search),
+    )
+
+
+def _numbers(levels: Sequence[Level], reach: Reach, unsafe: Unsafe) -> JsonObject:
+    """Numbers about the limits up to the greatest value, and about the attack on the specified limits up to the value
+    that they reach; `boxes` counts the values that have limits together.
+    """
+    last, found = levels[-1], reach.attack
+    least = None if found is None or not len(found.left) else unsafe.value(float(found.left[0]))
+    attacked = {"attacked": None if found is None else found.simulated, "least_attacked": least}
+    members, left_out = last.models
+    numbers = {"fits": len(members), "fits_tried": len(members) + len(left_out), **attacked}
+    if last.together is not None:
+        numbers |= last.together.numbers
+    boxes = [level for level in levels if level.together is not None and level.together.box is not None]
+    return {**numbers, "boxes": len(boxes)}
+
+
+def columns_by(by: Parameter) -> Columns:
+    """The columns of the table, with that of the parameter behind the original."""
+    own = {f"by_{by.name}": Column(by.unit, "value up to which the limits hold", ".6g")}
+    names = [*LIMITS]
+    place = names.index("original") + 1
+    first, rest = names[:place], names[place:]
+    texts = {
+        "sentence": Column("", "for a maintenance manual", is_shown=False),
+        "scope": Column("", "what the limits up to this value cover", is_shown=False),
+    }
+    return {**{name: LIMITS[name] for name in first}, **own, **{name: LIMITS[name] for name in rest}, **texts}
+
+
+def _title(by: Parameter) -> str:
+    return f"Limits up to each {by.name.replace('_', ' ')}, rounded to the safe side"
+
+
+def _text(by: Parameter, value: float | None) -> str:
+    return "none of these values" if value is None else by.text(value)
+
+
+def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -> list[tuple[Any, ...]]:
+    """A row for each characteristic and value."""
+    failures, members = _failures(levels), search.evaluator.characteristics
+    rows = list[tuple[Any, ...]]()
+    for number, column in enumerate(search.columns):
+        item = members.members[column]
+        limit = search.limits.get(item.name)
+        specified = NOWHERE if limit is None else (limit.at_least, limit.at_most)
+        for level, scope in zip(levels, scopes, strict=True):
+            alone = None if level.alone is None else level.alone[number]
+            box = None if level.together is None else level.together.box
+            failure = failures.get((level.value, number))
+            kept = None if limit is None else not level.failures and _holds(alone, limit)
+            rows.append(
+                (
+                    *(item.name, item.unit, item.original, level.value),
+                    *(NOWHERE if alone is None or alone.safe is None else alone.safe),
+                    *(NOWHERE if box is None else (float(box.lower[column]), float(box.upper[column]))),
+                    *(*specified, kept),
+                    UNSAFE_ORIGINAL if alone is None else None if failure is None else failure.words,
+                    None if failure is None else _setting(members, failure),
+                    f"Up to {search.by.text(level.value)}, {_keep(item, alone, level.together, column)}.",
+                    scope,
+                )
+            )
+    return rows
+
+
+def _setting(members: CharacteristicSet, failure: Failure) -> JsonObject:
+    """The vehicle that fails, and its encounter: searched values, or those of a point of the matrix."""
+    return {**dict(zip(members.names, failure.setting.tolist(), strict=True)), **failure.point}
+
+
+def _holds(alone: AloneLimit | None, limit: Limit) -> bool:
+    """Whether a specified limit is safe alone."""
+    if alone is None or alone.safe is None:
+        return False
+    low, high = alone.safe
+    return (limit.at_least is None or limit.at_least >= low) and (limit.at_most is None or limit.at_most <= high)
+
+
+def _keep(item: Characteristic, alone: AloneLimit | None, together: LimitsTogether | None, column: int) -> str:
+    """What limits demand: `with all others as in the original: brake torque at least 0.7`."""
+    others = "with all others as in the original"
+    ends = None if alone is None else alone.safe
+    if together is not None:
+        others, box = "with all others within theirs", together.box
+        ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
+    if ends is None:
+        return "no limit holds"
+    low, high = ends
+    name = item.short_name[:1].lower() + item.short_name[1:]
+    if low == high:
+        return f"no room for {name}: {low:g}{item.suffix}, as in the original"
+    sides = (("at least", low, item.lower), ("at most", high, item.upper))
+    keep = " and ".join(f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last)
+    return f"{others}: {name} {keep or 'anywhere in its domain'}"
+
+
+def _failures(levels: Sequence[Level]) -> dict[tuple[float, int], Failure]:
+    """How each characteristic alone fails first, by value and number; failures of one model are driven together."""
+    models = dict[int, Model]()
+    settings = dict[int, dict[str, FloatArray]]()
+    places = dict[tuple[float, int], tuple[int, str]]()
+    for level in levels:
+        for number, limit in enumerate(level.alone or ()):
+            nearest = limit.nearest_failure
+            if nearest is not None:
+                setting, model = nearest
+                place = id(model.evaluator), setting.tobytes().hex()
+                models[place[0]] = model
+                settings.setdefault(place[0], {})[place[1]] = setting
+                places[level.value, number] = place
+    found = {number: describe(model, settings[number]) for number, model in models.items()}
+    return {key: found[model][name] for key, (model, name) in places.items()}
+
+
+def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame, reach: Reach) -> Iterator[str]:
+    """The sentences of the verdict, the allowed value first."""
+    by, unsafe, study = search.by, search.unsafe, search.evaluator.study
+    names = dict.fromkeys(point.weather.name.replace("_", " ") for point in assemble(study).points)
+    where = f"On a {' or '.join(names)} road"
+    if search.limits:
+        what = join_phrases(_limit_texts(search))
+        yield f"{where} with {what}, all others as in the original: up to {_text(by, reach.value)}."
+    else:
+        yield f"{where}, each alone, all others as in the original: {'; '.join(_allowed(search, frame))}."
+    values = f"{join_phrases(f'{value:g}' for value in by.values)}{unit_text(by.unit)}"
+    members, left_out = levels[-1].models
+    tried = len(members) + len(left_out)
+    fits = "in one model" if tried == 1 else f"in {len(members)} of {tried} fits"
+    keeps = f"keeps less than {unsafe.keep:.3g} m" if unsafe.keep else f"is unsafe ({unsafe.description})"
+    others = f" with the study's own fit, and none collides with {len(members) - 1} others" if len(members) > 1 else ""
+    yield f"Limits up to {values} hold {fits}: within them no vehicle that was tried {keeps}{others}."
+    yield _tried(search)
+    unsafe_from = next((level.value for level in levels if level.alone is None), None)
+    if unsafe_from is not None:
+        yield f"Up to {by.text(unsafe_from)} no limit holds: {UNSAFE_ORIGINAL}."
+    without = [f"{level.value:g}" for level in levels if level.together is not None and level.together.box is None]
+    if without:
+        yield f"No limits together were found up to {join_phrases(without)}{unit_text(by.unit)}."
+
+
+def _tried(search: LevelSearch) -> str:
+    """What was driven beside scans."""
+    if not search.budget:
+        return "Not attacked."
+    texts = ["points between those of the study"]
+    if search.evaluator.study.scenario.search:
+        texts = [f"{round(ATTACK_SHARE * search.budget):,} aimed at each limit between two values"]
+    if search.limits:
+        texts.append(f"{search.budget:,} aimed at the specified limits")
+    return f"Tried beside scans: {join_phrases(texts)}."
+
+
+def _limit_texts(search: LevelSearch) -> Iterator[str]:
+    """Specified limits in words: `treadDepth at least 3 mm`."""
+    members = {item.name: item for item in search.evaluator.characteristics}
+    for name, limit in search.limits.items():
+        for word, end in (("at least", limit.at_least), ("at most", limit.at_most)):
+            if end is not None:
+                yield f"{name} {word} {end:g}{members[name].suffix}"
+
+
+def _allowed(search: LevelSearch, frame: pd.DataFrame) -> Iterator[str]:
+    """For each characteristic, up to which value it may go to the far end of its domain."""
+    by = search.by
+    for column in search.columns:
+        item = search.evaluator.characteristics.members[column]
+        rows = frame[frame["characteristic"] == item.name]
+        is_low = item.original - item.lower >= item.upper - item.original
+        is_whole = rows["alone_low"] <= item.lower if is_low else rows["alone_high"] >= item.upper
+        whole = rows.loc[is_whole, f"by_{by.name}"].max()
+        text = f"{item.name} {item.lower if is_low else item.upper:g}{item.suffix}"
+        yield f"{text} not up to {by.text(by.values[0])}" if np.isnan(whole) else f"{text} up to {by.text(whole)}"
+
+
+def _draw(answer: Answer, search: LevelSearch) -> Figure:
+    """The limits across, the parameter upward, a panel for each characteristic."""
+    from safevar_sumo.questions.figures import FONT_SIZE, as_formula, new_panels
+
+    frame, by = answer.tables["limits"], search.by
+    title = f"{answer.study.name}: limits alone up to each {by.name.replace('_', ' ')}"
+    figure, axes = new_panels(title, len(search.columns), 4, (2.3, 1.75), min_width=4.6, title_height=1.1)
+    for axis, column in zip(axes, search.columns, strict=True):
+        item = search.evaluator.characteristics.members[column]
+        if axis is not axes[0]:
+            axis.sharey(axes[0])
+        _draw_limits(axis, frame[frame["characteristic"] == item.name], by)
+        axis.set_xlim(item.lower, item.upper)
+        axis.set_title(item.name.replace("$", r"\$"), fontsize=FONT_SIZE)
+        axis.set_xlabel(f"[{as_formula(item.unit)}]")
+        axis.locator_params(axis="x", nbins=4)
+    unit = f" [{as_formula(by.unit)}]" if by.unit else ""
+    figure.supylabel(f"up to {by.name.replace('_', ' ')}{unit}", fontsize=FONT_SIZE)
+    marks = "blue: limits alone; dotted: the original vehicle; line: specified"
+    figure.supxlabel(marks, fontsize=FONT_SIZE)
+    return figure
+
+
+def _draw_limits(axis: Axes, rows: pd.DataFrame, by: Parameter) -> None:
+    """The limits of one characteristic, a step for each value: what holds up to it holds from the value below on."""
+    from safevar_sumo.questions.figures import BLUE, SKY_BLUE, VERMILION
+
+    values = np.concatenate([[by.lowest], rows[f"by_{by.name}"].to_numpy(float)])
+    low, high = (np.append(ends[:1], ends) for ends in rows[["alone_low", "alone_high"]].to_numpy(float).T)
+    axis.fill_betweenx(values, low, high, step="pre", color=SKY_BLUE, alpha=0.6)
+    for ends in (low, high):
+        axis.step(ends, values, where="post", color=BLUE, linewidth=1.2)
+    axis.axvline(rows["original"].iloc[0], color="black", linestyle=":", linewidth=1)
+    for name in ("specified_low", "specified_high"):
+        if not pd.isna(rows[name].iloc[0]):
+            axis.axvline(rows[name].iloc[0], color=VERMILION, linewidth=1.5)
+    axis.set_ylim(values[0], values[-1])
+
+
+def check_by(by: str | None, unsafe: str | None, is_together: bool) -> None:
+    """Refuse options that do not go together with limits up to values of a parameter, or with none.
+
+    Raises
+    ------
+    InputError
+        If another criterion than the margin stands beside `by`, or limits together are asked for without it.
+    """
+    if by is None and is_together:
+        raise InputError("together", "limits together are always sought without --by", "--by NAME=V1,V2,... beside it")
+    if by is not None and unsafe is not None:
+        legal = "limits that keep the margin (--margin), or the question without --by"
+        raise InputError("by", f"{by!r} beside --unsafe {unsafe!r}", legal)

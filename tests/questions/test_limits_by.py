@@ -1,0 +1,212 @@
+"""Limits up to each of some speeds against cars driven at random, and what `--by` refuses."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from safevar_sumo import tolerance
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.attack import Attack, attack, attack_all
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet, region_of
+from tests.in_process import refused, run
+
+SEARCHED = """
+extends = "wear"
+name = "crossing_at_any_speed"
+title = "A pedestrian from the near side, at any speed"
+[matrix]
+tests = [{ name = "CPNA", parameters = { test = "CPNA" } }]
+[scenario.search]
+speed = { unit = "km/h", original = 40, lower = 10, upper = 60, meaning = "speed of the vehicle at the start" }
+impact_location = { unit = "%", original = 50, lower = 25, upper = 75, meaning = "impact location" }
+"""
+SPEEDS = (20, 30, 45, 60)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("wear", "--by", "speed=20,50"),
+            (
+                "speed=50 is beyond the points of CPFA, CPNA and CPNCO, which end at 40 km/h",
+                "values up to 40 km/h, or the study wear_joint, whose scope is wider",
+            ),
+        ),
+        (("wear", "--by", "speed=5"), ("speed=5 is below every point of study 'wear'", "from 10 to 40 km/h")),
+        (("wear_joint", "--by", "speed=20,61"), ("outside the domain", "values above 10 and up to 60 km/h")),
+        (("wear", "--by", "sped=20"), ("study 'wear' does not vary 'sped'; did you mean 'speed'?",)),
+        (("rain", "--by", "speed=20"), ("study 'rain' does not vary 'speed'", "[scenario.search]")),
+        (("wear", "--by", "speed=fast"), ("'fast' is no number", "NAME=V1,V2,...")),
+        (("wear", "--by", "speed"), ("'speed'", "NAME=V1,V2,...")),
+        (("wear", "--by", "speed=20", "--unsafe", "drac > 6"), ("beside --unsafe 'drac > 6'", "keep the margin")),
+        (("euro_ncap_rating", "--by", "speed=20"), ("study 'euro_ncap_rating' is rated", "not rated")),
+        (("wear", "--by", "speed=20", "--point", "CPFA, speed 10, wet"), ("beside a point",)),
+        (("wear", "--together"), ("together", "--by")),
+    ],
+)
+def test_by_is_refused_in_words(arguments: tuple[str, ...], message: tuple[str, ...]) -> None:
+    refused("tolerance", *arguments, message=message)
+
+
+def test_compare_has_no_limits_by_a_parameter() -> None:
+    refused("compare", "wear", "wear", "--by", "speed=20", message=("--by",))
+
+
+def test_a_level_of_a_matrix_drives_what_the_one_below_did_not() -> None:
+    """All points of `wear` up to 40 km/h stand in exactly one level, and a cell's ends are its points or values."""
+    study = load_study("wear")
+    by = Parameter.parse("speed=40,15,30", study)
+    assert by.values == (15, 30, 40)
+    lows = (None, *by.values)
+    levels = [study_between(study, by, low, high) for low, high in zip(lows, by.values, strict=False)]
+    names = [point.name for level in levels for point in assemble(level).points]
+    whole = [point for point in assemble(study).points if dict(point.parameters)["speed"] <= 40]
+    assert sorted(names) == sorted(point.name for point in whole)
+    cells = [cells_between(study, by, low, high) for low, high in zip(lows, by.values, strict=False)]
+    assert [tests[0].over["speed"] for tests in cells] == [[10, 15], [15, 20, 30], [30, 40]]
+    assert "15 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in by.scope(study, 15, between=True)
+    assert "only what the attack" not in by.scope(study, 30, between=True)
+
+
+def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
+    study = load_study("smoke")
+    region = region_of(study)
+    members = region.characteristics
+    boxes = [Box(region, members.lower, members.upper), Box(region, members.original, members.upper)]
+
+    def judge(rows: FloatArray) -> FloatArray:
+        return np.asarray(np.abs((rows - members.lower) / (members.upper - members.lower) - 0.7).sum(axis=1) - 0.5)
+
+    def alone(number: int) -> Attack:
+        return attack(boxes[number], [judge, judge], [], 2000, np.random.default_rng(number))
+
+    rngs = [np.random.default_rng(number) for number in (0, 1)]
+    for one, other in zip(attack_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True):
+        assert np.array_equal(one.settings, other.settings)
+        assert one.simulated == other.simulated
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    file = tmp_path_factory.mktemp("by") / "at_any_speed.toml"
+    file.write_text(SEARCHED)
+    return load_study(str(file))
+
+
+@pytest.fixture(scope="module")
+def answer(searched: Study) -> Answer:
+    by = f"speed={','.join(map(str, SPEEDS))}"
+    names = ("brakeTorque,brakeResponse,sensorRange",)
+    return tolerance(searched, by=by, fits=0, jobs=2, characteristics=names, limits=["brakeTorque >= 0.55"])
+
+
+def rows_of(answer: Answer) -> list[dict[str, Any]]:
+    return list(answer.to_dict()["tables"]["limits"]["rows"])
+
+
+def unsafe_cars(study: Study, margin: float, settings: FloatArray) -> Any:
+    """Which cars keep less than the margin where the original keeps that of the study."""
+    found = evaluate(assemble(study), settings)
+    counts = found.metrics["original_safety_degree"] >= study.scenario.margin
+    return counts & (found.collided | (found.f_safe < margin))
+
+
+@pytest.mark.slow
+def test_no_car_within_a_limit_is_unsafe_up_to_its_speed_and_one_beyond_is(searched: Study, answer: Answer) -> None:
+    """400 cars a row, at speeds up to its own; and up to 10 % of the domain beyond, in the encounter of its failure."""
+    characteristics, rng = CharacteristicSet.of(searched), np.random.default_rng(3)
+    margin = answer.numbers["margin"]
+    beyond = 0
+    for row in rows_of(answer):
+        column = characteristics.names.index(row["characteristic"])
+        speed = characteristics.names.index("speed")
+        settings = np.tile(characteristics.original, (400, 1))
+        for item in characteristics.scenario:
+            settings[:, characteristics.names.index(item.name)] = rng.uniform(item.lower, item.upper, 400)
+        settings[:, speed] = rng.uniform(10, row["by_speed"], 400)
+        settings[:, column] = rng.uniform(row["alone_low"], row["alone_high"], 400)
+        settings[:100, column] = row["alone_low"]
+        settings[100:200, column] = row["alone_high"]
+        assert not unsafe_cars(searched, margin, settings).any(), row
+        item = characteristics.members[column]
+        if row["fails_at"] is None:
+            assert (row["alone_low"], row["alone_high"]) == (item.lower, item.upper)
+            continue
+        failure = np.array([row["fails_at"][name] for name in characteristics.names])
+        assert failure[speed] <= row["by_speed"]
+        side = "alone_low" if failure[column] < item.original else "alone_high"
+        end = row[side]
+        step = 0.1 * (item.upper - item.lower) * (-1 if side == "alone_low" else 1)
+        tried = np.tile(failure, (21, 1))
+        tried[:, column] = np.clip(end + np.linspace(0, step, 21), item.lower, item.upper)
+        assert unsafe_cars(searched, margin, tried)[1:].any(), row
+        beyond += 1
+    assert beyond >= 3
+
+
+@pytest.mark.slow
+def test_limits_are_wider_up_to_a_slower_speed_and_never_narrower(answer: Answer) -> None:
+    for _, rows in itertools.groupby(rows_of(answer), key=lambda row: row["characteristic"]):
+        levels = list(rows)
+        assert [row["by_speed"] for row in levels] == [*SPEEDS]
+        for slower, faster in itertools.pairwise(levels):
+            assert slower["alone_low"] <= faster["alone_low"]
+            assert slower["alone_high"] >= faster["alone_high"]
+            assert slower["kept"] in (None, True) or not faster["kept"]
+
+
+@pytest.mark.slow
+def test_the_verdict_says_up_to_which_speed_a_worn_car_may_drive(searched: Study, answer: Answer) -> None:
+    """Cars at the specified limit are safe at every speed up to the one that is said, and one a little above is not."""
+    reach = answer.numbers["up_to"]
+    assert f"On a wet road with brakeTorque at least 0.55, all others as in the original: up to {reach:g} km/h." in (
+        answer.verdict
+    )
+    kept = [row["by_speed"] for row in rows_of(answer) if row["kept"]]
+    assert max(kept) <= reach < 60
+    assert (answer.numbers["kept"], len(answer.failures)) == (False, 1)
+    characteristics = CharacteristicSet.of(searched)
+    settings = np.tile(characteristics.original, (2000, 1))
+    settings[:, characteristics.names.index("brakeTorque")] = 0.55
+    rng = np.random.default_rng(4)
+    settings[:, characteristics.names.index("impact_location")] = rng.uniform(25, 75, 2000)
+    for low, high, is_safe in ((10.0, reach, True), (reach, reach + 3, False)):
+        settings[:, characteristics.names.index("speed")] = rng.uniform(low, high, 2000)
+        assert unsafe_cars(searched, answer.numbers["margin"], settings).any() != is_safe
+
+
+@pytest.mark.slow
+def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(tmp_path: Path) -> None:
+    study = load_study("wear")
+    picture = tmp_path / "by.png"
+    names = ("--characteristics", "brakeTorque,sensorLatency", "--fits", "0", "--attack", "100", "--jobs", "2")
+    run("tolerance", "wear", "--by", "speed=20,35,40", *names, "--plot", str(picture))
+    assert picture.stat().st_size > 10_000
+    answer = tolerance(study, by="speed=20,35,40", fits=0, attack=100, jobs=2, characteristics=names[1].split(","))
+    characteristics = CharacteristicSet.of(study)
+    rows = rows_of(answer)
+    assert [row["by_speed"] for row in rows] == [20, 35, 40] * 2
+    for row in rows:
+        column = characteristics.names.index(row["characteristic"])
+        settings = np.tile(characteristics.original, (100, 1))
+        settings[:, column] = np.linspace(row["alone_low"], row["alone_high"], 100)
+        up_to = msgspec.structs.replace(
+            study, matrix=study_between(study, Parameter.parse("speed=40", study), None, row["by_speed"]).matrix
+        )
+        for result in simulate_all_points(assemble(up_to), settings):
+            assert result.evaluations.f_safe.min() >= answer.numbers["margin"], (row, result.point.name)
+    assert any(row["fails_first"] for row in rows)
+    assert "up to 35 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in rows[1]["scope"]
