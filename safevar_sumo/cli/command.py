@@ -198,8 +198,12 @@ def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[
     values = answer.values(key)
     if None in values or not values:
         click.echo(f"note: --fail-if: {key} is {'undefined' if values else 'in no row'} here", err=True)
-    for value in values:
+    rows = [""] * len(values)
+    table = key.rpartition(".")[0]
+    if table in answer.tables:  # a row by its first column
+        rows = [f" in the row {row}" for row in answer.tables[table].iloc[:, 0]]
+    for value, row in zip(values, rows, strict=True):
         if isinstance(value, bool) or not isinstance(value, int | float | None):
             raise InputError("fail_if", f"{key} is no number", "the key of a number of the answer")
         if value is not None and OPERATORS[sign](value, limit):
-            yield f"{key} = {value:g} {sign} {limit:g}"
+            yield f"{key} = {value:g} {sign} {limit:g}{row}"

@@ -20,7 +20,15 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, describe_error, did_you_mean, one_of, subject
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins.contract import UserCode, checked_class, contract_of, user_error_of, user_errors, violation
+from safevar_sumo.plugins.contract import (
+    UserCode,
+    checked_class,
+    contract_of,
+    named_files,
+    user_error_of,
+    user_errors,
+    violation,
+)
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.study import Study, convert_table, data_files
 from safevar_sumo.study.schema import Parameters
@@ -73,6 +81,7 @@ class Lookup(NamedTuple):
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
+        named_files.add(file_of_module(module_name))
         try:
             target = getattr(module, attribute)
         except AttributeError:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.errors import InputError, check_name, unknown_name
+from safevar_sumo.errors import InputError, check_name, did_you_mean, one_of
 from safevar_sumo.questions.tables import (
     HIGH as HIGH,
     LATEX_PREAMBLE,
@@ -67,7 +67,11 @@ class Contents(NamedTuple):
         number = name if name and rest.isdecimal() else key
         wanted, names = (rest, self.tables[name]) if name in self.tables else (number, self.numbers)
         if ... not in names and not any(fnmatchcase(wanted, str(known)) for known in names):
-            raise unknown_name("fail_if", f"the answer has no number {key!r}", key, self.keys)
+            # Of a table its columns are legal; the columns of all tables would fill the screen.
+            of_table = [legal for legal in self.keys if legal.startswith(f"{name}.")]
+            legal = of_table or [*(name for name in self.numbers if name != ...), *(f"{t}.COLUMN" for t in self.tables)]
+            problem = f"the answer has no number {key!r}{did_you_mean(key, self.keys)}"
+            raise InputError("fail_if", problem, one_of(legal))
 
     @property
     def keys(self) -> list[str]:

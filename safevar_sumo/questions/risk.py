@@ -37,6 +37,8 @@ RESAMPLES = 200
 """Number of bootstrap samples for the intervals of indices."""
 MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
+UNSURE = 0.5
+"""Width of an interval of a share of the variance from which on the verdict says that it is unsure [-]."""
 VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
@@ -102,10 +104,29 @@ def risk(
     left_out = int(drawn.infeasible.sum())
     if total + left_out < samples:
         verdict += f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
-    if len(table):
-        verdict += f" {table.iloc[0]['characteristic']} decides most of the safety degree's variance."
+    verdict += deciding_in_words(table, failures)
     verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
     return Answer(question="risk", study=study, verdict=verdict, numbers=numbers, tables={"sensitivity": table})
+
+
+def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
+    """Which characteristic has the largest share of the safety degree's variance, and which shares are unsure."""
+    if table.empty:
+        return ""
+    index = "total" if table["degree_total"].notna().any() else "first"
+    first = table.iloc[0]
+    share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
+    words = ""
+    if np.isfinite(share):
+        name = first["characteristic"]
+        words = f" {name} has the largest share of the safety degree's variance, {share:.2f} ({low:.2f} to {high:.2f})."
+    of_output = {name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS}
+    for name, widths in of_output.items():
+        if widths.max() > UNSURE:
+            words += f" Shares of {OUTPUTS[name]} are unsure: intervals of up to {widths.max():.2f}."
+    if failures and of_output["unsafe"].isna().all():
+        words += f" Too few vehicles of the design are unsafe, or safe, for shares of that ({MIN_OUTCOMES})."
+    return words
 
 
 def _probability_in_words(study: Study, probability: float) -> str:

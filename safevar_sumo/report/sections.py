@@ -208,16 +208,17 @@ def _name_and_sentence(models: Mapping[str, type], name: str) -> str:
     """A model's name with the first sentence of its description; user code has the name alone."""
     if name not in models:
         return name
-    first_line = (models[name].__doc__ or "").strip().partition("\n")[0]
-    return f"{name} ({first_line.rstrip('.')})"
+    first_paragraph = " ".join((models[name].__doc__ or "").strip().partition("\n\n")[0].split())
+    return f"{name} ({first_paragraph.partition('. ')[0].rstrip('.')})"
 
 
 def trust(study: ReportedStudy) -> Answer:
     """How far the results agree with published data and with other fitted vehicle models, and what they leave out."""
     case, tables = study.case, dict[str, pd.DataFrame]()
+    fitted = "Published data were used to fit the vehicle; the " if case.study.spread else "The "
     verdict = (
-        "This study was not compared with published data: whether another simulator or a real vehicle behaves in the "
-        "same way is unknown."
+        f"{fitted}simulations of this study were not compared with published ones: whether another simulator or a real "
+        "vehicle behaves in the same way is unknown."
     )
     agreement = shipped_agreement(case.study)
     if len(agreement):

@@ -108,6 +108,14 @@ def test_a_gate_ends_with_code_3(condition: str, code: int, words: str, capfd: p
     assert words in capfd.readouterr().err
 
 
+def test_a_gate_on_a_table_names_the_row(capfd: pytest.CaptureFixture[str]) -> None:
+    typed = ["safevar-sumo", "list", "weathers", "--fail-if", "weathers.road_friction < 0.7"]
+    with patch("sys.argv", typed), pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 3
+    assert capfd.readouterr().err == "failed: weathers.road_friction = 0.59 < 0.7 in the row hard_rain\n"
+
+
 @pytest.mark.parametrize(
     ("change", "values"),
     [

@@ -35,6 +35,19 @@ def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder:
     assert throttle(folder / "mine.toml") == 0.1
 
 
+def test_an_error_of_an_installed_driving_system_has_its_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = folder / "site-packages"
+    installed.mkdir()
+    (installed / "bought.py").write_text(SCALAR + "    def drive(self, seen):\n        return 1 / 0\n")
+    sys.path.append(str(installed))
+    study = folder / "it.toml"
+    study.write_text('extends = "smoke"\nname = "it"\n[ads]\nmodel = "bought:Mine"\n')
+    with pytest.raises(UserCodeError, match=r"raised in drive: ZeroDivisionError.*bought\.py:\d+\)"):
+        throttle(study)
+    sys.path.remove(str(installed))
+    del sys.modules["bought"]
+
+
 def test_two_studies_with_modules_of_one_name_get_their_own_whatever_the_order(tmp_path: Path) -> None:
     for place, value in (("a", 0.2), ("b", 0.4)):
         (tmp_path / place).mkdir()

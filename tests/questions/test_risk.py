@@ -8,10 +8,12 @@ import math
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from safevar_sumo import risk, rules
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import HIGH, LOW, Answer
+from safevar_sumo.questions.risk import deciding_in_words
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
@@ -105,6 +107,20 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert row.density_low <= row.density <= row.density_high
     assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(0.09, abs=0.005)
     assert "of them have a above 7 N m and b below 3 N m; of all vehicles like that" in answer.verdict
+
+
+def test_the_verdict_says_which_shares_are_unsure() -> None:
+    """Of the safety degree an interval of 0.2, of the outcome one of 3.27; nothing of a table without shares."""
+    columns = {"degree_total": (0.6, 0.5, 0.7), "unsafe_total": (1.37, -0.26, 3.01)}
+    values = {f"{name}{end}": [x] for name, row in columns.items() for end, x in zip(("", LOW, HIGH), row, strict=True)}
+    frame = pd.DataFrame({"characteristic": ["a"], **values})
+    words = deciding_in_words(frame, 120)
+    assert "a has the largest share of the safety degree's variance, 0.60 (0.50 to 0.70)." in words
+    assert words.endswith("Shares of whether the vehicle is unsafe are unsure: intervals of up to 3.27.")
+    unknown = frame.assign(**dict.fromkeys([name for name in values if name.startswith("unsafe")], np.nan))
+    assert "Too few vehicles of the design are unsafe" in deciding_in_words(unknown, 1)
+    assert "Too few" not in deciding_in_words(unknown, 0)
+    assert deciding_in_words(frame.iloc[:0], 0) == ""
 
 
 def test_nothing_everything_and_too_little() -> None:

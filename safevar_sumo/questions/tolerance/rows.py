@@ -179,7 +179,7 @@ def describe(model: Model, settings: Mapping[str, FloatArray]) -> dict[str, Fail
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
     """A failure at a safety degree, such as `the car hits a pedestrian with 12 km/h in the test at 40 km/h`."""
-    if unsafe.points is not None:  # points are of the whole matrix
+    if unsafe.is_of_points:  # points are of the whole matrix
         return f"the car {unsafe.in_words}"
     test = "" if scenario.test_speed is None else f" in the test at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
     if unsafe.bound is not None and not collided:
