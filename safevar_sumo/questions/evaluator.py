@@ -213,15 +213,6 @@ class Evaluator:
 
         return self.region.draw_feasible(draw_next, number, filtered=feasible_after_filter)
 
-    def random_settings(self, number: int) -> FloatArray:
-        """The first `number` random vehicles of the study, uniform over the feasible part of the domain; `risk`
-        draws the same ones.
-        """
-        bounds, rng = self.characteristics, np.random.default_rng(self.study.search.seed)
-        return self.region.draw_feasible(
-            lambda count: bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower), number
-        )
-
     def at_each_point(self, settings: FloatArray, stage: str) -> CellResults:
         """The rated results of M settings, shape (M, n), at every point of a matrix.
 

@@ -17,6 +17,7 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
@@ -57,13 +58,15 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     Parameters
     ----------
     samples
-        Number of vehicles drawn evenly over the domain; one half yields the rules, the other half tests them.
+        Number of vehicles, drawn as [variation] says, without it evenly over the domain; one half yields the rules, the
+        other half tests them.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
     study, characteristics = evaluator.study, evaluator.characteristics
     criterion = evaluator.choose_criterion(unsafe, subject)
-    evaluations = evaluator.evaluate(evaluator.random_settings(samples), "settings over the whole domain")
+    vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
+    evaluations = evaluator.evaluate(vehicles, "settings over the whole domain")
     rows = np.arange(len(evaluations))
     training, testing = (evaluations.take(half[evaluations.valid[half]]) for half in np.split(rows, [len(rows) // 2]))
     is_unsafe, is_unsafe_in_test = criterion.of(training), criterion.of(testing)
@@ -80,8 +83,9 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     cells = [(conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes]
     table = tabulate("Where failures lie", COLUMNS, sorted(cells, key=lambda row: -row[4]))
     low, high = clopper_pearson(failures, total)
+    drawn = "drawn as [variation] says" if study.variation or study.correlations else "over the whole domain"
     verdict = (
-        f"{100 * failures / total:.2f} % of {total:,} vehicles over the whole domain are unsafe "
+        f"{100 * failures / total:.2f} % of {total:,} vehicles {drawn} are unsafe "
         f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
     )
     for row in table[table["density_low"] > failures / total].head(1).to_dict("records"):

@@ -109,6 +109,16 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert "of them have a above 7 N m and b below 3 N m; of all vehicles like that" in answer.verdict
 
 
+def test_rules_draw_as_the_variation_says() -> None:
+    """A characteristic that is always 8 of 0 to 10 decides nothing, and the share is that of `risk`."""
+    study = load_study(made_up_study(3), variation={"a": {"distribution": "fixed", "value": 8.0}})
+    by_rules, by_risk = (ask(study, unsafe="collision", samples=1000, pool=Plant(study, box)) for ask in (rules, risk))
+    assert by_rules.numbers["failures"] == by_risk.numbers["failures"]
+    assert "1,000 vehicles drawn as [variation] says are unsafe" in by_rules.verdict
+    (rule,) = by_rules.tables["rules"]["rule"]
+    assert rule.startswith("b below 3")
+
+
 def test_the_verdict_says_which_shares_are_unsure() -> None:
     """Of the safety degree an interval of 0.2, of the outcome one of 3.27; nothing of a table without shares."""
     columns = {"degree_total": (0.6, 0.5, 0.7), "unsafe_total": (1.37, -0.26, 3.01)}

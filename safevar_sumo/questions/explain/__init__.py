@@ -34,6 +34,7 @@ from safevar_sumo.questions.explain.failures import (
     compare_at_points,
     find_failures,
 )
+from safevar_sumo.questions.explain.margins import MARGINS, find_margins
 from safevar_sumo.questions.explain.moved import BORDERS, COLUMNS as MOVED_COLUMNS, find_moved_borders
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares, robustness_in_words
 from safevar_sumo.questions.model_spread import FITS_AT_ONCE
@@ -123,6 +124,7 @@ DISTINCT_COLUMNS: Columns = {
     solutions=SOLUTION_COLUMNS,
     characteristics=[*CHARACTERISTIC_COLUMNS, "needed_in_fits"],
     drivers=[*DRIVER_COLUMNS, "share_in_fits"],
+    margins=MARGINS,
     moved=MOVED_COLUMNS,
     distinct_causes=DISTINCT_COLUMNS,
 )
@@ -174,6 +176,7 @@ def explain(
         "causes": _causes_table(population, evaluator, holding, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **_statistics(evaluator, needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
+        "margins": tabulate("By the margin of the original", MARGINS, find_margins(population, evaluator, limit)),
         "moved": _moved_table(evaluator, of_chosen),
         "distinct_causes": _distinct_table(evaluator, [causes[row] for row in sample]),
     }
@@ -187,7 +190,7 @@ def explain(
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
     sentences = [_verdict(evaluator, population, kind, len(holding), tables["causes"]), _avoided_in_words(verdicts)]
-    sentences += counted_in_words(study, population.left_out) if kind == DRAWN else []
+    sentences += counted_in_words(study, len(population.left_out)) if kind == DRAWN else []
     verdict = " ".join([*filter(None, sentences), *constraints_in_words(study)])
     return Answer(question="explain", study=study, verdict=verdict, numbers=numbers, tables=tables, draw=draw_needed)
 

@@ -63,7 +63,8 @@ class Population(NamedTuple):
     otherwise
         Number of rows with another outcome than in the results.
     left_out
-        Number of drawn settings in whose encounter the original vehicle is not safe, which are no rows.
+        Settings in whose encounter the original vehicle does not keep its margin, which are no rows: drawn ones, or the
+        unsafe ones of a search; shape (L, n).
     """
 
     original: Evaluations
@@ -73,7 +74,7 @@ class Population(NamedTuple):
     rows: list[int]
     is_named: bool
     otherwise: int
-    left_out: int
+    left_out: FloatArray
 
 
 def find_failures(
@@ -103,15 +104,27 @@ def find_failures(
         chosen = list(dict.fromkeys([*named_rows, *distinct]))  # the named ones first
         settings, handles = table[characteristics].to_numpy(dtype=float)[chosen], handles_of(table)
         names, recorded = [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen]
-    evaluations, left_out = evaluator.evaluate(settings, TO_EXPLAIN), 0
+    evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
+    unsafe = unsafe or Unsafe.default_among(evaluations, original)
     if isinstance(subject, Study):
         counts = np.flatnonzero(~evaluations.infeasible)
-        left_out = len(evaluations) - len(counts)
+        left_out = settings[evaluations.infeasible]
         evaluations, names, recorded = evaluations.take(counts), [names[row] for row in counts], recorded[counts]
-    unsafe = unsafe or Unsafe.default_among(evaluations, original)
+    else:
+        left_out = _left_out_of_search(subject, unsafe)
     rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
     otherwise = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
     return Population(original, evaluations, names, unsafe, rows, bool(named), int(otherwise), left_out)
+
+
+def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
+    """The unsafe settings of a search in whose encounter the original vehicle does not keep its margin."""
+    evaluations = case.evaluations
+    names = [*case.characteristics.names]
+    if "feasible" not in evaluations or not {*names} <= {*evaluations}:
+        return np.zeros((0, len(names)))
+    rows = evaluations[~evaluations["feasible"].to_numpy(dtype=bool) & unsafe.rows(evaluations)]
+    return np.asarray(rows[names].drop_duplicates().to_numpy(dtype=float))
 
 
 def choose_failures(
