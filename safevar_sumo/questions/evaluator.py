@@ -269,7 +269,7 @@ class Evaluator:
         evaluations = self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain")
         return Unsafe.default_among(evaluations, original)
 
-    def parse_criterion(self, text: str) -> Unsafe:
+    def parse_criterion(self, text: Unsafe | str) -> Unsafe:
         """Parse the criterion that an option states.
 
         Raises what `Unsafe.parse` raises, and an error if the criterion is about points and the study is not rated.

@@ -69,8 +69,9 @@ def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = 
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
     assemble_both_systems(subject.study)
-    explained = explain.compute(subject, evaluator, solution=solution, unsafe=unsafe, limit=SIMULATION_LIMIT, fits=0)
-    criterion, causes = Unsafe.parse(explained.numbers["unsafe"]), explained.tables["causes"]
+    criterion = evaluator.choose_criterion(unsafe, subject)
+    explained = explain.compute(subject, evaluator, solution=solution, unsafe=criterion, limit=SIMULATION_LIMIT, fits=0)
+    causes = explained.tables["causes"]
     frame, originals = judge_causes(subject.study, causes, criterion, evaluator.progress)
     driven = frame[frame["opinion"] != "outside"]
     p, a12 = paired_test(*driven[["a_degree", "b_degree"]].dropna().to_numpy(float).T)

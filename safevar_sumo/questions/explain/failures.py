@@ -78,7 +78,7 @@ class Population(NamedTuple):
 
 
 def find_failures(
-    subject: Study | Case, evaluator: Evaluator, solutions: Sequence[str], criterion: str | None
+    subject: Study | Case, evaluator: Evaluator, solutions: Sequence[str], criterion: Unsafe | str | None
 ) -> Population:
     """Evaluate all solutions of results, or settings drawn from a study's whole domain.
 
