@@ -15,7 +15,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
@@ -80,6 +80,25 @@ class Case:
     @property
     def characteristics(self) -> CharacteristicSet:
         return CharacteristicSet.of(self.study)
+
+    @property
+    def settings(self) -> FloatArray:
+        """The original vehicle, then the solutions; shape (1 + M, n)."""
+        solutions = self.solutions[[*self.characteristics.names]].to_numpy(dtype=float)
+        return np.concatenate([self.characteristics.original[np.newaxis], solutions])
+
+    def simulated_as(self, study: Study, scoring: Scoring, evaluations: Evaluations) -> Case:
+        """The case of another form of its study, in which its settings have been simulated again."""
+        columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
+        columns["collision_speed"] = evaluations.collision_speed
+        solutions = self.solutions.drop(columns=[name for name in self.original if name not in evaluations.metrics])
+        return replace(
+            self,
+            study=study,
+            scoring=scoring,
+            original={metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics},
+            solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
+        )
 
     @property
     def weather(self) -> Weather:

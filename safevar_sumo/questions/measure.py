@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import check_name
@@ -77,18 +76,5 @@ def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
     study = study_by(case.study, unsafe)
     if study == case.study:
         return replace(case, stated=unsafe)
-    evaluator = evaluator.for_study(study, verified=0)
-    names = evaluator.characteristics.names
-    settings = case.solutions[[*names]].to_numpy(dtype=float)
-    evaluations = evaluator.evaluate(np.concatenate([evaluator.characteristics.original[np.newaxis], settings]), STAGE)
-    original, found = evaluations.take(np.arange(1)), evaluations.take(np.arange(1, len(evaluations)))
-    values = {name: found.column(name) for name in ("f_safe", *found.metrics)}
-    solutions = case.solutions.assign(outcome=found.outcome, collision_speed=found.collision_speed, **values)
-    return replace(
-        case,
-        stated=unsafe,
-        study=study,
-        original={name: float(value[0]) for name, value in original.metrics.items()},
-        solutions=solutions,
-        scoring=replace_in(case.scoring, metrics=assemble(study).measuring.scoring.metrics),
-    )
+    evaluations = evaluator.for_study(study, verified=0).evaluate(case.settings, STAGE)
+    return replace(case.simulated_as(study, assemble(study).measuring.scoring, evaluations), stated=unsafe)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -175,25 +175,12 @@ def case_at(case: Case, point: str) -> Case:
     InputError
         If the study has no such point.
     """
-    import numpy as np
-
     from safevar_sumo.sumo.matrix import at_point, evaluate
     from safevar_sumo.sumo.system import assemble
 
-    study, names = at_point(case.study, point), list(case.characteristics.names)
+    study = at_point(case.study, point)
     system = assemble(study)
-    scoring = system.measuring.scoring
-    settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[names].to_numpy(float)])
-    evaluations = evaluate(system, settings)
-    columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
-    solutions = case.solutions.drop(columns=[name for name in case.original if name not in evaluations.metrics])
-    return replace(
-        case,
-        study=study,
-        scoring=scoring,
-        original={metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics},
-        solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
-    )
+    return case.simulated_as(study, system.measuring.scoring, evaluate(system, case.settings))
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:

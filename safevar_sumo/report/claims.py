@@ -125,7 +125,7 @@ class Packed:
     def simulated(self) -> tuple[bytes, bytes]:
         """The original vehicle's evaluation, and the table of solutions, all simulated again."""
         characteristics, solutions = self.case.characteristics, self.case.solutions
-        settings = np.vstack([characteristics.original, solutions[list(characteristics.names)].to_numpy(float)])
+        settings = self.case.settings
         evaluations = evaluate_settings(self.case.study, settings, jobs=self._jobs, progress=self._progress)
         frame = evaluations_frame(characteristics.names, [(("", 0), evaluations.take(range(1, len(settings))))])
         frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
