@@ -31,7 +31,7 @@ from safevar_sumo.ads import PerVehicleAds, ScalarAds
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.batch import drive
+from safevar_sumo.sumo.batch import drive, observer_of
 from safevar_sumo.sumo.engine import open_world, sumo_options
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.network import copied_network, stage_network
@@ -119,7 +119,8 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
     """One setting after the other through one TraCI connection, the network reloaded each time."""
     for setting in settings:
         traci.load(command[1:])
-        drive(system, setting[None], SumoWorld(traci, 1))
+        world = SumoWorld(traci, 1)
+        drive(system, setting[None], world, observer_of(system.points[0].scenario, world, None))
 
 
 def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:

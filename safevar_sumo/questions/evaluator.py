@@ -30,9 +30,9 @@ CONFIDENCE = 0.95
 Found = TypeVar("Found")
 Interval = tuple[float, float]
 """Lower and upper end."""
-CRITERION_SETTINGS = 1024
+CRITERION_SETTINGS, FIRST_SETTINGS = 1024, 64
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
-a safety degree.
+a safety degree; and how many of them are tried first.
 """
 
 
@@ -266,7 +266,11 @@ class Evaluator:
         original = original or self.evaluate_original()
         if RATING_POINTS.name in original.metrics:  # a lost point depends on the original vehicle alone
             return Unsafe.default_among(original, original)
-        evaluations = self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain")
+        settings = self.feasible_settings(CRITERION_SETTINGS)
+        for rows in (settings[:FIRST_SETTINGS], settings):  # one collision decides
+            evaluations = self.evaluate(rows, "settings over the whole domain")
+            if evaluations.collided.any():
+                break
         return Unsafe.default_among(evaluations, original)
 
     def parse_criterion(self, text: Unsafe | str) -> Unsafe:

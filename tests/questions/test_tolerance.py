@@ -25,7 +25,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance import rows, search
-from safevar_sumo.questions.tolerance.alone import limits_alone
+from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.records import BoolArray, FloatArray
@@ -263,13 +263,13 @@ def test_a_limit_alone_ends_before_a_failure_that_the_search_for_limits_together
     study = made_up_study(2)
     own, other = (Model(k, Evaluator(study, Plant(study, one)), Unsafe()) for k, one in enumerate((nowhere, pocket)))
     scans = scan(own.evaluator, [0, 1], Unsafe())
-    met = np.array([[7.02, 5.0]])
-    alone = [limits_alone(scans, [0, 1], [own, other], 0, [other], one) for one in (met[:0], met)]
-    assert [[each.safe for each in limits] for limits in alone] == [
-        [(0.0, 10.0), (0.0, 10.0)],
-        [(0.0, pytest.approx(7.01, abs=0.01)), (0.0, 10.0)],
-    ]
-    assert alone[1][0].safe[1] <= 7.01
+    alone = AloneSearch(scans, [0, 1], [own, other])
+    alone.run(0)
+    assert [each.safe for each in alone.limits()] == [(0.0, 10.0), (0.0, 10.0)]
+    alone.meet([other], np.array([[7.02, 5.0]]))
+    assert [each.safe for each in alone.limits()] == [(0.0, pytest.approx(7.01, abs=0.01)), (0.0, 10.0)]
+    assert alone.limits()[0].safe[1] <= 7.01
+    assert pocket(alone.failures).all()
 
 
 def test_a_tooth_between_corners_is_found_and_left_out() -> None:

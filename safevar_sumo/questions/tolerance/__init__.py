@@ -22,7 +22,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, limit_criterion, models_of, with_points_between
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
-from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, limits_alone
+from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneSearch
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
 from safevar_sumo.questions.tolerance.levels import LevelSearch
 from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
@@ -30,7 +30,8 @@ from safevar_sumo.questions.tolerance.refusal import nearest_limits
 from safevar_sumo.questions.tolerance.rows import CHARACTERISTIC, LIMITS, limit_rows
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES, WHOLE_POINT_LOSS, OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
-from safevar_sumo.questions.tolerance.together import TEST_STAGE, LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.trial import TRIAL_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE, wider_rows
 from safevar_sumo.questions.tolerance.words import verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
@@ -135,7 +136,7 @@ def tolerance(
     members = evaluator.characteristics
     parameter = None if by is None else Parameter.parse(by, study)
     check_by(by, unsafe, together)
-    evaluator.plan(SCAN_STAGE, SEARCH_STAGE, TEST_STAGE, ALONE_STAGE, *([WIDER_STAGE] if study.wider else []))
+    evaluator.plan(SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, TRIAL_STAGE, *([WIDER_STAGE] if study.wider else []))
     columns = _columns_of(members.vehicle.names, characteristics)
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -152,18 +153,21 @@ def tolerance(
         scans = scan(evaluator, columns, criterion)
     is_safe = not criterion.of(original)[0]
     models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
+    judges = _denser(models, attack) if is_sought else models.members
+    search_alone = AloneSearch(scans, columns, judges)
+    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
+        search_alone.run(attack)
     found_together: LimitsTogether | None = None
     if is_sought and is_safe:
         all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
         everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
         known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, scans)]
         all_limits = {**specified, **everywhere}
-        found_together = find_limits_together(models, all_columns, all_limits, scans, np.concatenate(known), attack)
-    judges = _denser(models, attack) if is_sought else models.members
-    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
-        met = () if found_together is None else found_together.searched
-        failures = np.zeros((0, len(members))) if found_together is None else found_together.failures_alone
-        alone = limits_alone(scans, columns, judges, attack, met, failures)
+        while found_together is None or _is_refuted(found_together, search_alone.failures):
+            unsafe_settings = np.concatenate([*known, search_alone.failures])
+            found_together = find_limits_together(models, all_columns, all_limits, scans, unsafe_settings, attack)
+            search_alone.meet(found_together.searched, found_together.failures_alone)
+    alone = search_alone.limits()
     found = limit_rows(alone, found_together, specified, models.members)
     tables = {
         "limits": tabulate("Limits, rounded to the safe side", LIMITS, found.rows),
@@ -221,6 +225,11 @@ def _denser(models: Models, attack: int) -> list[Any]:
         return [*models.members]
     own, seed = models.own, models.own.evaluator.study.search.seed
     return [with_points_between(model, own.unsafe, np.random.default_rng((seed, 5, 0)))[0] for model in models.members]
+
+
+def _is_refuted(together: LimitsTogether, failures: FloatArray) -> bool:
+    """Whether limits together hold a setting that a limit alone had to move before."""
+    return together.box is not None and bool(together.box.holds(failures).any())
 
 
 def _columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:

@@ -68,6 +68,7 @@ class _Ends:
         assert scan.safe is not None
         self.item, self.column, self.scan = item, column, scan
         self.ends, members = [*scan.safe], own.evaluator.characteristics
+        self.failures = list[FloatArray]()
         self.beyond: list[Beyond] = [None, None]
         for side, last in enumerate((item.lower, item.upper)):
             values = [value for pair in scan.of_state("unsafe") for value in pair]
@@ -133,33 +134,42 @@ def carry_out(moves: Sequence[Move], model: Model) -> None:
             each.narrow(part)
 
 
-def limits_alone(
-    scans: Sequence[OneAtATimeScan],
-    columns: Sequence[int],
-    models: Sequence[Model],
-    budget: int,
-    met: Sequence[Model],
-    failures: FloatArray,
-    values: int = VALUES,
-) -> list[AloneLimit]:
-    """The limits alone that hold in all models, each at some `values`, from scans with the study's own fit, the first
-    model; and before the failures of one characteristic that the search for limits together met in some models, shape
-    (K, n).
+class AloneSearch:
+    """The search for limits alone that hold in all models, each at some `values`, from scans with the study's own fit,
+    the first model.
     """
-    if any(scan.safe is None for scan in scans):
-        return [AloneLimit(scan, None) for scan in scans]
-    ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True)]
-    encounters = models[0].evaluator.critical_encounters
-    encounters = np.concatenate([models[0].evaluator.characteristics.original[np.newaxis], encounters])
-    for model in models:
-        _move_before(ends, model, encounters, values)
-        while _move_before(ends, model, encounters, 2):
-            pass
-    for model in met if len(failures) else ():
-        _move(ends, model, [_alone_in(each, failures, model) for each in ends])
-    if len(models[0].evaluator.characteristics.scenario) and budget:
-        _attack_alone(ends, models, round(ATTACK_SHARE * budget))
-    return [each.limit() for each in ends]
+
+    def __init__(
+        self, scans: Sequence[OneAtATimeScan], columns: Sequence[int], models: Sequence[Model], values: int = VALUES
+    ) -> None:
+        self.scans, self.models, self.values = scans, models, values
+        is_safe = all(scan.safe is not None for scan in scans)
+        self.ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True) if is_safe]
+
+    def run(self, budget: int) -> None:
+        """Try values in all models, in the encounters that the scans met and in those of an attack on the limits."""
+        evaluator = self.models[0].evaluator
+        encounters = np.concatenate([[evaluator.characteristics.original], evaluator.critical_encounters])
+        for model in self.models if self.ends else ():
+            _move_before(self.ends, model, encounters, self.values)
+            while _move_before(self.ends, model, encounters, 2):
+                pass
+        if len(evaluator.characteristics.scenario) and budget:
+            _attack_alone(self.ends, self.models, round(ATTACK_SHARE * budget))
+
+    def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
+        """Move the limits before failures of one characteristic, shape (K, n), that another search met."""
+        for model in models if len(failures) and self.ends else ():
+            _move(self.ends, model, [_alone_in(each, failures, model) for each in self.ends])
+
+    @property
+    def failures(self) -> FloatArray:
+        """Settings beyond the limits that failed in some model, shape (K, n)."""
+        rows = [failure for each in self.ends for failure in each.failures]
+        return np.array(rows).reshape(-1, len(self.models[0].evaluator.characteristics))
+
+    def limits(self) -> list[AloneLimit]:
+        return [each.limit() for each in self.ends] or [AloneLimit(scan, None) for scan in self.scans]
 
 
 def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, number: int) -> bool:
@@ -202,6 +212,7 @@ def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -
         for (number, side), move in moves.items():
             ends[number].ends[side] = move.safe
             ends[number].beyond[side] = move.failure, model
+            ends[number].failures.append(move.failure)
         has_moved = True
     return has_moved
 

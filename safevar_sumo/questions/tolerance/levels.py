@@ -15,7 +15,7 @@ from safevar_sumo.questions.attack import Attack, attack
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models, models_of, with_points_between
-from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, Beyond, Move, carry_out, limits_alone
+from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond, Move, carry_out
 from safevar_sumo.questions.tolerance.by_parameter import (
     Parameter,
     cells_between,
@@ -116,7 +116,10 @@ class LevelSearch:
             return Level(value, None, models)
         judges = self._judges(models, low, value)
         inside = self._inside(known, own.evaluator)
-        alone = limits_alone(scans, self.columns, judges, self.budget, [own], inside, numbers[1])
+        search = AloneSearch(scans, self.columns, judges, numbers[1])
+        search.meet([own], inside)
+        search.run(self.budget)
+        alone = search.limits()
         if before is not None and before.alone is not None:
             alone = [_after(each, earlier) for each, earlier in zip(alone, before.alone, strict=True)]
         if not self.limits:

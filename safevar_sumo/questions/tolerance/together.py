@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.attack import Attack, attack
-from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Model, Models, with_points_between
+from safevar_sumo.questions.attack import Attack
+from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
+from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
 from safevar_sumo.questions.tolerance.settlement import Settlement
+from safevar_sumo.questions.tolerance.trial import Trial, Trials
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
-MAX_UNSAFE_SHARE = 0.003
-"""Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 MAX_BOXES, MAX_GROWTHS = 40, 12
 """Maximum number of boxes that are tested; and of tests of one whose limits have moved out."""
-KNOWN = 32
-"""Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
 PROMISE_POINTS = 256
 """Number of Sobol points, and of corners, at which specified limits are tested, all others as in the original."""
-TEST_STAGE = "test of the limits together"
 
 
 class LimitsTogether(NamedTuple):
@@ -95,113 +89,6 @@ class LimitsTogether(NamedTuple):
         }
 
 
-class _Failures(NamedTuple):
-    """Unsafe settings, shape (K, n), and the model at the points where they are."""
-
-    model: Model
-    settings: FloatArray
-
-
-class _Test(NamedTuple):
-    """What the test of a box gave: failures, or the proof, the attack and its models."""
-
-    failures: list[_Failures]
-    corners: Mapping[int, float]
-    judges: Sequence[Model] = ()
-    attack: Attack | None = None
-    proof: Proof | None = None
-    left_out: int = 0
-
-
-class _BoxTest:
-    """The test of boxes: all corners with each fit, those first in which earlier boxes failed, an attack over all fits,
-    and settings drawn at random. Progress is shown by the evaluator of the question.
-    """
-
-    def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
-        self.models, self.budget, self.evaluator = models, budget, evaluator
-        self.seed = models[0].evaluator.study.search.seed
-        self.tests, self._first = 0, {0}
-
-    def of(self, box: Box, attempt: int) -> _Test:
-        """Test a box; the first part that finds failures ends it."""
-        corners = box.corners(self.seed, attempt)
-        of_fits = len(corners) + (len(self.models) - 1) * min(len(corners), MAX_CORNERS)
-        with self.evaluator.stage(TEST_STAGE, of_fits + self.budget + proof_size(self.tests + 1, MAX_UNSAFE_SHARE)):
-            return self._of(box, corners, attempt)
-
-    def _of(self, box: Box, corners: FloatArray, attempt: int) -> _Test:
-        of_each, lefts = corners[:MAX_CORNERS], dict[int, FloatArray]()
-        failures = self._failing_corners(of_each, self._first, lefts)
-        if failures:
-            return _Test(failures, {})
-        orders = {number: np.argsort(left, kind="stable") for number, left in lefts.items()}
-        worst = [
-            of_each[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
-            for number in range(len(self.models))
-        ]
-        test = self._attack(box, worst, attempt)
-        failures = test.failures or self._failing_corners(of_each, {*range(len(self.models))} - self._first, lefts)
-        own = self.models[0]
-        if not failures and len(corners) > MAX_CORNERS:  # corners of a study that searches its scenario
-            others = corners[MAX_CORNERS:]
-            failures = list(filter(None, [_failures(own, others, own.left(others, TEST_STAGE))]))
-        if failures:
-            return test._replace(failures=failures)
-        least = {
-            model.fit: model.unsafe.value(float(lefts[row].min(initial=np.inf)))
-            for row, model in enumerate(self.models)
-        }
-        return self._prove(box, test._replace(corners=least), attempt)
-
-    def _failing_corners(self, corners: FloatArray, numbers: set[int], lefts: dict[int, FloatArray]) -> list[_Failures]:
-        """The unsafe corners in some models, which are the first in later tests; `lefts` takes what all leave."""
-        for number in sorted(numbers):
-            lefts[number] = self.models[number].left(corners, TEST_STAGE)
-        failing = [number for number in sorted(numbers) if lefts[number].min(initial=np.inf) < 0]
-        self._first |= {*failing}
-        found = [_failures(self.models[number], corners, lefts[number]) for number in failing]
-        return [each for each in found if each]
-
-    def _attack(self, box: Box, worst: Sequence[FloatArray], attempt: int) -> _Test:
-        own, judges, left_out = self.models[0], list[Model](), list[int]()
-        if not self.budget:
-            return _Test([], {}, self.models)
-        for model in self.models:
-            denser, number = with_points_between(model, own.unsafe, np.random.default_rng((self.seed, 5, attempt)))
-            judges.append(denser)
-            left_out.append(number)
-        rng = np.random.default_rng((self.seed, 4, attempt))
-        lefts: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TEST_STAGE) for model in judges]
-        found = attack(box, lefts, worst, self.budget, rng)
-        failures = [
-            _failures(model, found.settings[found.judges == number], found.left[found.judges == number])
-            for number, model in enumerate(judges)
-        ]
-        return _Test([each for each in failures if each], {}, judges, found, left_out=left_out[0])
-
-    def _prove(self, box: Box, test: _Test, attempt: int) -> _Test:
-        self.tests += 1
-        own = self.models[0]
-        model = test.judges[0] if test.judges else own
-
-        def judge(settings: FloatArray) -> Judgement:
-            evaluations = model.evaluate(settings, TEST_STAGE)
-            failed = ~evaluations.valid & ~evaluations.infeasible
-            return Judgement(model.left_by(evaluations) < 0, failed, ~evaluations.infeasible)
-
-        rng = np.random.default_rng((self.seed, 1, attempt))
-        proof, unsafe = prove(lambda number: box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self.tests)
-        failures = _failures(model, unsafe, np.full(len(unsafe), -1.0))
-        return test._replace(proof=proof, failures=[failures] if failures else [])
-
-
-def _failures(model: Model, settings: FloatArray, left: FloatArray) -> _Failures | None:
-    """The settings that leave less than nothing, and the model at the points where they do; None if none does."""
-    unsafe = settings[left < 0]
-    return _Failures(model.at_worst_points(unsafe, TEST_STAGE), unsafe) if len(unsafe) else None
-
-
 def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
     """The worst setting of a promise in each fit in which it is unsafe."""
     seed = models[0].evaluator.study.search.seed
@@ -264,18 +151,17 @@ def find_limits_together(
     if own.fit in broken:
         return nothing
     start = _start(search, columns, scans)
-    test = _BoxTest(members, budget, models.own.evaluator)
+    trials = Trials(members, budget, models.own.evaluator)
     for number in range(1, MAX_BOXES + 1):
-        with test.evaluator.stage(SEARCH_STAGE):
+        with trials.evaluator.stage(SEARCH_STAGE):
             sides = search.best(start) if inner is None or number > 1 else search.sides_of(inner)
         if sides is None:
             return _without_box(nothing, search, number)
-        box = search.printed(sides)
-        found = test.of(box, number)
-        if not found.failures:
-            return _grown(nothing, search, test, box, found, number)
-        with test.evaluator.stage(SEARCH_STAGE):
-            _learn(search, found)
+        box, settlement = search.printed(sides), Settlement(search)
+        if not _learn(search, trials, trials.first(box, number)):
+            passed = _grown(settlement, trials, box, number)
+            if passed is not None:
+                return _result(nothing, settlement, passed, number)
     return _without_box(nothing, search, MAX_BOXES)
 
 
@@ -285,36 +171,42 @@ def _without_box(nothing: LimitsTogether, search: BoxSearch, boxes: int) -> Limi
     return nothing._replace(boxes=boxes, searched=searched, failures_alone=search.failures_alone)
 
 
-def _learn(search: BoxSearch, test: _Test) -> None:
-    """Take failures, and the models in which they are, into a search."""
-    for failures in test.failures:
-        search.join(failures.model)
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
-        search.learn(failures.settings)
+def _learn(search: BoxSearch, trials: Trials, trial: Trial) -> bool:
+    """Take failures, and the models in which they are, into a search; whether there are any."""
+    with trials.evaluator.stage(SEARCH_STAGE):
+        for failures in trial.failures:
+            search.join(failures.model)
+            search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+            search.learn(failures.settings)
+    return bool(trial.failures)
 
 
-def _grown(
-    nothing: LimitsTogether, search: BoxSearch, test: _BoxTest, box: Box, found: _Test, number: int
-) -> LimitsTogether:
-    """The limits together from a box that passed its test, whose limits have moved out as far as they can; where what
-    grew fails its tests, the box itself.
+def _grown(settlement: Settlement, trials: Trials, box: Box, number: int) -> Trial | None:
+    """The trial that a box passes whose limits have moved out as far as they can; None if too many boxes fail.
+
+    Where a box fails, a limit of it moves in, or of the box from which it grew, whichever stays larger.
     """
-    settlement = Settlement(search)
-    with test.evaluator.stage(SEARCH_STAGE):
+    search, passed = settlement.search, None
+
+    def volume(one: Box) -> float:
+        return float(search.log_volume(search.sides_of(one)))
+
+    with trials.evaluator.stage(SEARCH_STAGE):
         wider = settlement.of(box)
     for growth in range(1, MAX_GROWTHS + 1):
-        volumes = [search.log_volume(search.sides_of(each)) for each in (box, wider)]
-        if volumes[1] <= volumes[0]:
-            break
-        found_wider = test.of(wider, number + growth)
-        with test.evaluator.stage(SEARCH_STAGE):
-            if found_wider.failures:
-                _learn(search, found_wider)
-                wider = settlement.cut(wider)
-            else:
-                box, found = wider, found_wider
+        trial = trials.whole(wider, number + growth)
+        if _learn(search, trials, trial):
+            rest = settlement.cut(box)
+            passed = passed if rest is box else None
+            box = rest
+            wider = max(settlement.cut(wider), box, key=volume)
+        else:
+            passed, box = trial, wider
+            with trials.evaluator.stage(SEARCH_STAGE):
                 wider = settlement.of(box)
-    return _result(nothing, search, settlement, box, found, number)
+        if passed is not None and volume(wider) <= volume(box):
+            break
+    return passed
 
 
 def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]) -> FloatArray:
@@ -333,32 +225,31 @@ def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATime
     return start
 
 
-def _result(
-    nothing: LimitsTogether, search: BoxSearch, settlement: Settlement, box: Box, test: _Test, number: int
-) -> LimitsTogether:
-    """The limits together from a box that passed its test; a box that leaves no characteristic any room is none."""
+def _result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int) -> LimitsTogether:
+    """The limits together from a box that passed its trial; a box that leaves no characteristic any room is none."""
+    search, box = settlement.search, trial.box
     of_vehicle = search.characteristics.of_vehicle
     is_open = search.is_free & of_vehicle
     has_room = not is_open.any() or bool((search.sides_of(box)[is_open] > 0).any())
     least = [np.nan, np.nan]
-    if test.attack is not None:
-        judges = [test.judges[judge] for judge in test.attack.judges]
-        values = [model.unsafe.value(left) for model, left in zip(judges, test.attack.left.tolist(), strict=True)]
+    if trial.attack is not None:
+        judges = [trial.judges[judge] for judge in trial.attack.judges]
+        values = [model.unsafe.value(left) for model, left in zip(judges, trial.attack.left.tolist(), strict=True)]
         of_own = [value for value, model in zip(values, judges, strict=True) if model.fit == 0]
         worst = nothing.members[0].unsafe.worst
         least = [worst(values, default=np.nan), worst(of_own, default=np.nan)]
-    points = [len(model.evaluator.study.matrix.tests) for model in test.judges[:1] if model.evaluator.study.matrix]
+    points = [len(model.evaluator.study.matrix.tests) for model in trial.judges[:1] if model.evaluator.study.matrix]
     own_tests = nothing.members[0].evaluator.study.matrix
     return nothing._replace(
         box=box if has_room else None,
-        proof=test.proof,
-        attack=test.attack,
+        proof=trial.proof,
+        attack=trial.attack,
         least=(least[0], least[1]),
         between=sum(points) - (len(own_tests.tests) if own_tests else 0),
-        between_left_out=test.left_out,
+        between_left_out=trial.left_out,
         boxes=number,
         beyond=settlement.beyond(box),
-        corners=test.corners,
-        searched=(*nothing.members, *search.models, *test.judges),
+        corners=trial.corners,
+        searched=(*nothing.members, *search.models, *trial.judges),
         failures_alone=search.failures_alone,
     )

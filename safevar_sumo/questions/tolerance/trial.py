@@ -1,0 +1,154 @@
+"""The trial of a box: its corners in all fits, an attack over all fits, and settings drawn at random."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.attack import Attack, attack
+from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Model, with_points_between
+from safevar_sumo.records import FloatArray
+
+MAX_UNSAFE_SHARE = 0.003
+"""Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
+KNOWN = 32
+"""Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
+FIRST_SHARE = 0.2
+"""Share of the attack's budget of a first trial, before limits have moved out."""
+TRIAL_STAGE = "test of the limits together"
+
+
+class Failures(NamedTuple):
+    """Unsafe settings, shape (K, n), and the model at the points where they are."""
+
+    model: Model
+    settings: FloatArray
+
+
+class Trial(NamedTuple):
+    """What the trial of a box gave: failures, or its corners, the attack, its models and the proof.
+
+    Attributes
+    ----------
+    corners
+        The least that the corners keep with each fit [m].
+    judges
+        The models that the attack met, with points between those of the study's matrix.
+    left_out
+        Number of such points that do not count.
+    """
+
+    box: Box
+    failures: Sequence[Failures] = ()
+    corners: Mapping[int, float] = {}
+    judges: Sequence[Model] = ()
+    attack: Attack | None = None
+    proof: Proof | None = None
+    left_out: int = 0
+
+
+class Trials:
+    """The trials of boxes in some models; `budget` simulations attack each. Progress is shown by the evaluator of the
+    question.
+    """
+
+    def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
+        self.models, self.budget, self.evaluator = models, budget, evaluator
+        self.seed = models[0].evaluator.study.search.seed
+        self._proofs, self._failing = 0, {0}
+        """Number of proofs so far; numbers of the models in which corners of earlier boxes failed, which come first."""
+
+    def first(self, box: Box, attempt: int) -> Trial:
+        """Try the corners in the models in which earlier boxes failed, and a short attack."""
+        corners, budget = box.corners(self.seed, attempt)[:MAX_CORNERS], round(FIRST_SHARE * self.budget)
+        with self.evaluator.stage(TRIAL_STAGE, len(self._failing) * len(corners) + budget):
+            lefts = self._left(corners, self._failing)
+            return self._failed(box, corners, lefts) or self._attack(box, corners, lefts, budget, attempt)
+
+    def whole(self, box: Box, attempt: int) -> Trial:
+        """Try all corners in all models, the whole attack, and settings drawn at random; the first part that finds
+        failures is the last.
+        """
+        all_corners, others = box.corners(self.seed, attempt), {*range(len(self.models))} - self._failing
+        corners, own = all_corners[:MAX_CORNERS], self.models[0]
+        of_fits = len(all_corners) + (len(self.models) - 1) * len(corners)
+        total = of_fits + self.budget + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)
+        with self.evaluator.stage(TRIAL_STAGE, total):
+            lefts = self._left(corners, self._failing)
+            failed = self._failed(box, corners, lefts)
+            if failed:
+                return failed
+            trial = self._attack(box, corners, lefts, self.budget, attempt)
+            if trial.failures:
+                return trial
+            lefts |= self._left(corners, others)
+            # The study's own fit meets more corners in a study that searches its scenario.
+            more = all_corners[MAX_CORNERS:]
+            failures = failures_of(own, more, own.left(more, TRIAL_STAGE)) if len(more) else []
+            failed = self._failed(box, corners, lefts)
+            if failed or failures:
+                return trial._replace(failures=[*(failed.failures if failed else ()), *failures])
+            least = {
+                model.fit: model.unsafe.value(float(lefts[number].min(initial=np.inf)))
+                for number, model in enumerate(self.models)
+            }
+            return self._prove(trial._replace(corners=least), attempt)
+
+    def _left(self, corners: FloatArray, numbers: Iterable[int]) -> dict[int, FloatArray]:
+        """What corners leave in some models, by their numbers."""
+        return {number: self.models[number].left(corners, TRIAL_STAGE) for number in sorted(numbers)}
+
+    def _failed(self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray]) -> Trial | None:
+        """The trial whose corners fail in some models, which later ones try first; None if none fails."""
+        failures = [one for number in lefts for one in failures_of(self.models[number], corners, lefts[number])]
+        self._failing |= {number for number, left in lefts.items() if (left < 0).any()}
+        return Trial(box, failures) if failures else None
+
+    def _attack(
+        self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], budget: int, attempt: int
+    ) -> Trial:
+        """Attack a box, beginning at its worst corners in each model, or in the first."""
+        if not budget:
+            return Trial(box, judges=self.models)
+        own, judges, left_out = self.models[0], list[Model](), list[int]()
+        for model in self.models:
+            denser, number = with_points_between(model, own.unsafe, np.random.default_rng((self.seed, 5, attempt)))
+            judges.append(denser)
+            left_out.append(number)
+        orders = {number: np.argsort(left, kind="stable") for number, left in lefts.items()}
+        worst = [
+            corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
+            for number in range(len(self.models))
+        ]
+        rows: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
+        found = attack(box, rows, worst, budget, np.random.default_rng((self.seed, 4, attempt)))
+        failures = [
+            one
+            for number, model in enumerate(judges)
+            for one in failures_of(model, found.settings[found.judges == number], found.left[found.judges == number])
+        ]
+        return Trial(box, failures, judges=judges, attack=found, left_out=left_out[0])
+
+    def _prove(self, trial: Trial, attempt: int) -> Trial:
+        self._proofs += 1
+        model = trial.judges[0]
+
+        def judge(settings: FloatArray) -> Judgement:
+            evaluations = model.evaluate(settings, TRIAL_STAGE)
+            failed = ~evaluations.valid & ~evaluations.infeasible
+            return Judgement(model.left_by(evaluations) < 0, failed, ~evaluations.infeasible)
+
+        rng = np.random.default_rng((self.seed, 1, attempt))
+        proof, unsafe = prove(lambda number: trial.box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self._proofs)
+        return trial._replace(proof=proof, failures=failures_of(model, unsafe, np.full(len(unsafe), -1.0)))
+
+
+def failures_of(model: Model, settings: FloatArray, left: FloatArray) -> list[Failures]:
+    """The settings that leave less than nothing, and the model at the points where they do; empty if none does."""
+    unsafe = settings[left < 0]
+    return [Failures(model.at_worst_points(unsafe, TRIAL_STAGE), unsafe)] if len(unsafe) else []
