@@ -120,8 +120,12 @@ def _characteristics() -> Iterator[tuple[Any, ...]]:
 
 
 def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The first paragraph of each model's docstring."""
-    return ((name, " ".join((getdoc(model) or "").partition("\n\n")[0].split())) for name, model in models.items())
+    return ((name, description_of(model)) for name, model in models.items())
+
+
+def description_of(model: Any) -> str:
+    """The first paragraph of a model's docstring."""
+    return " ".join((getdoc(model) or "").partition("\n\n")[0].split())
 
 
 def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]]:

@@ -20,6 +20,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.errors import warn
 from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.words import change_texts, counted_in_words, number_of, question_command
 from safevar_sumo.records import FloatArray, JsonObject, Outcome
@@ -148,7 +149,7 @@ def tested(study: ReportedStudy) -> Answer:
     """The tested vehicle, driving system and scenario, and the search."""
     case = study.case
     models = [
-        f"{title}: {_name_and_sentence(known, table.model)}"
+        f"{title}: {name_and_sentence(known, table.model)}"
         for title, known, table in (
             ("Vehicle", VEHICLES, case.study.vehicle),
             ("Driving system", ADS, case.study.ads),
@@ -204,12 +205,9 @@ def _search(study: ReportedStudy) -> str:
     )
 
 
-def _name_and_sentence(models: Mapping[str, type], name: str) -> str:
-    """A model's name with the first sentence of its description; user code has the name alone."""
-    if name not in models:
-        return name
-    first_paragraph = " ".join((models[name].__doc__ or "").strip().partition("\n\n")[0].split())
-    return f"{name} ({first_paragraph.partition('. ')[0].rstrip('.')})"
+def name_and_sentence(models: Mapping[str, type], name: str) -> str:
+    """A model's name with its description; user code has the name alone."""
+    return f"{name} ({description_of(models[name]).rstrip('.')})" if name in models else name
 
 
 def trust(study: ReportedStudy) -> Answer:

@@ -11,6 +11,7 @@ import pytest
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import words
+from safevar_sumo.questions.case import load_cases
 from safevar_sumo.study import load_study
 from tests.in_process import json_of, searched
 
@@ -88,3 +89,22 @@ def test_without_words_every_number_stays(
         table.pop("remarks", None)
     assert numbers_of(tables[0]) == numbers_of(tables[1])
     assert said["verdict"] != silent["verdict"]
+
+
+@pytest.mark.slow
+def test_half_of_the_originals_is_said_by_every_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also by one that asks another question first: nothing collides among the solutions of a short search."""
+    (tmp_path / "tiny.toml").write_text(STUDY.replace("evaluations = 100", "evaluations = 60"))
+    searched(load_study(str(tmp_path / "tiny.toml")), tmp_path / "results")
+    monkeypatch.chdir(tmp_path)
+    assert load_cases(["results"])[0].unsafe.is_half
+    for typed in (
+        ("opinion", "results"),
+        ("explain", "results", "--fits", "0", "--limit", "200", "--top", "1"),
+        ("risk", "results", "--samples", "64"),
+        ("rules", "results", "--samples", "64"),
+        ("tolerance", "results", "--attack", "50", *FEW),
+    ):
+        answer = json_of(*typed)
+        assert answer["numbers"]["unsafe"].startswith("below="), typed
+        assert "half of the original's, a screening limit" in answer["verdict"], typed

@@ -22,6 +22,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo
+from safevar_sumo.ads import ADS
 from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.ask import find_question, parse_question
@@ -31,9 +32,11 @@ from safevar_sumo.report.page import answer_or_reason, answer_to, usual_question
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.results import handles_of
 from safevar_sumo.results.manifest import read_manifest, write_manifest
+from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
+from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import run, searched
 from tests.report.conftest import ASK, page_of
 
@@ -192,6 +195,15 @@ def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path)
     assert answer_or_reason(*arguments).verdict.startswith("No answer: ")
     with pytest.raises(InputError):
         answer_to(*arguments)
+
+
+def test_the_sentence_about_a_model_is_whole() -> None:
+    for models in (ADS, VEHICLES, SCENARIOS):
+        for name in models:
+            text = sections.name_and_sentence(models, name)
+            assert text.count("(") == text.count(")"), text
+            assert not text.endswith((" its)", " the)", ",)")), text
+    assert sections.name_and_sentence(ADS, "aeb").endswith("falls below its braking distances)")
 
 
 def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
