@@ -31,7 +31,8 @@ from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import system_at_worst_point
-from safevar_sumo.sumo.system import System, assemble, create_shipped_models
+from safevar_sumo.sumo.models import create_shipped_models
+from safevar_sumo.sumo.system import System, assemble
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -48,15 +48,17 @@ _user_modules: set[str] = set()
 """Names of all modules that user code has loaded, as far as is known."""
 
 
-class Lookup(NamedTuple):
-    """Looks up the names of a study.
+class Lookup:
+    """Looks up the names of a study, each class once.
 
-    `folders`, searched first, are those of the study's file and of the files
-    that it extends; `files` are the paths of its data files by the names that it gives them.
+    `folders`, searched first, are those of the study's file and of the files that it extends; `files` are the paths of
+    its data files by the names that it gives them.
     """
 
-    folders: Sequence[str] = ()
-    files: Mapping[str, str] = MappingProxyType({})
+    def __init__(self, folders: Sequence[str] = (), files: Mapping[str, str] = MappingProxyType({})) -> None:
+        self.folders = folders
+        self.files = files
+        self._classes = dict[tuple[str, tuple[type, ...]], Member]()
 
     @classmethod
     def of(cls, study: Study) -> Lookup:
@@ -95,6 +97,8 @@ class Lookup(NamedTuple):
 
         `otherwise` is what the study may give in place of a class, for the error.
         """
+        if (name, bases) in self._classes:
+            return self._classes[name, bases]
         member = self.find(shipped, name, key)
         if member.code is None:
             return member
@@ -103,7 +107,8 @@ class Lookup(NamedTuple):
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError("", f"{member.code.name} {reason}", expected, member.code.definition())
-        return member._replace(target=checked_class(member.code, base))
+        member = self._classes[name, bases] = member._replace(target=checked_class(member.code, base))
+        return member
 
     def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
         """Parameters of a member; for user code, the names of the study's data files become absolute paths.

@@ -26,10 +26,11 @@ from safevar_sumo.questions.multi_body import (
 from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, Sensors, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.base import Characteristics, DelayedSignal
+from safevar_sumo.vehicles.base import Characteristics
 from safevar_sumo.vehicles.carla import AIR_DENSITY, FRONTAL_AREA, WHEEL_MASS
 from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
+from safevar_sumo.vehicles.sensors import DelayedSignal
 
 METRES_PER_CM = 0.01  # m
 

@@ -10,18 +10,17 @@ from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION as LOCATION_DIMENSION,
     SPEED_DIMENSION as SPEED_DIMENSION,
     VUT as VUT,
-    Lane as Lane,
     Point as Point,
     PreCrash as PreCrash,
     Scenario as Scenario,
     Scene as Scene,
-    World as World,
     WorldScenario as WorldScenario,
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.from_file import OpenScenario as OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
+from safevar_sumo.scenarios.roads import Lane as Lane, World as World
 from safevar_sumo.scenarios.stop import Stop
 from safevar_sumo.scenarios.tracks import Track as Track, TrackScenario as TrackScenario, travelled as travelled
 from safevar_sumo.shipped import shipped_table

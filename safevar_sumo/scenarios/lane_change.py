@@ -15,8 +15,9 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.ahead import HEADWAYS, LANE_WIDTH, VEHICLE_SPEED, next_lane
-from safevar_sumo.scenarios.base import Grade, PreCrash, Roads, Scenario, XmlChanges
+from safevar_sumo.scenarios.base import Grade, PreCrash, Scenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
+from safevar_sumo.scenarios.roads import Roads
 from safevar_sumo.scenarios.tracks import (
     BODIES,
     DEPARTURE,

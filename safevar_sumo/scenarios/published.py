@@ -15,22 +15,19 @@ from safevar_sumo.records import KMH_PER_MS, BoolArray, Encounter, FloatArray, T
 from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
 from safevar_sumo.scenarios.base import (
     CROSSING_LANE,
-    NETWORK_KEY,
     PEDESTRIAN,
     VUT,
-    Frame,
     Grade,
     Layout,
     PreCrash,
-    Roads,
     Scenario,
     Scene,
-    World,
     WorldScenario,
     XmlChanges,
     as_text,
 )
 from safevar_sumo.scenarios.crossing import Crossing
+from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, Roads, World
 from safevar_sumo.study import searched
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]

@@ -8,8 +8,9 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import STANDSTILL, Encounter, Trace
-from safevar_sumo.scenarios.base import VUT, Frame, Grade, Roads, Scene, World, WorldScenario, XmlChanges
+from safevar_sumo.scenarios.base import VUT, Grade, Scene, WorldScenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Speed
+from safevar_sumo.scenarios.roads import Frame, Roads, World
 from safevar_sumo.scenarios.tracks import KMH
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
-from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Roads, Scenario, XmlChanges, as_text
+from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Scenario, XmlChanges, as_text
+from safevar_sumo.scenarios.roads import Roads
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""

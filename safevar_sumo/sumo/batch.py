@@ -33,12 +33,11 @@ from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, Scenario, Sce
 from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
-from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.network import copied_network, stage_networks
 from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
-from safevar_sumo.sumo.stage import Stage
+from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.stage_world import StageWorld, start_frame
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import TOUCH_OVERLAP, ZERO, BoolArray, Contact, FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
-from safevar_sumo.scenarios.base import NETWORK_KEY, Frame, ScenarioMemory, World as ScenariosWorld
+from safevar_sumo.scenarios.base import ScenarioMemory
+from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World as ScenariosWorld
 from safevar_sumo.scenarios.tracks import corners_of
 from safevar_sumo.vehicles import SumoType
 
@@ -55,6 +56,14 @@ class Body(NamedTuple):
     def columns(cls, bodies: Sequence[Body]) -> Body:
         """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape (M,)."""
         return cls._make(np.array(column) for column in zip(*bodies, strict=True))
+
+
+def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
+    """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's
+    `MSVehicle::getDeltaPos`.
+    """
+    acceleration = (new_speed - old_speed) / step
+    return (old_speed + 0.5 * (acceleration * step)) * step
 
 
 class Film(NamedTuple):

@@ -23,7 +23,8 @@ from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError, about, did_you_mean
 from safevar_sumo.scenarios import Lane, Scenario
-from safevar_sumo.scenarios.base import XmlChanges, lane_through
+from safevar_sumo.scenarios.base import XmlChanges
+from safevar_sumo.scenarios.roads import lane_through
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
 from safevar_sumo.sumo.copies import ensure_cached, parse_xml, write_demand, write_roads

@@ -15,8 +15,9 @@ import numpy as np
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
-from safevar_sumo.scenarios.base import Frame, ScenarioMemory
-from safevar_sumo.sumo.bodies import Body, Motion
+from safevar_sumo.scenarios.base import ScenarioMemory
+from safevar_sumo.scenarios.roads import Frame
+from safevar_sumo.sumo.bodies import Body, Motion, distance_covered
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.vehicles import SumoType
 
@@ -26,14 +27,6 @@ EXTENT_MARGIN = 0.01
 """Margin of the extents [m]; an actor outside its extent is not checked for a collision."""
 PARALLEL_COSINE = 1 - 1e-9
 """Smallest absolute cosine of the angle between two parallel vehicles, which may drive in opposite directions."""
-
-
-def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
-    """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's
-    `MSVehicle::getDeltaPos`.
-    """
-    acceleration = (new_speed - old_speed) / step
-    return (old_speed + 0.5 * (acceleration * step)) * step
 
 
 class RecordedWorld:

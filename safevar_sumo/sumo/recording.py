@@ -20,7 +20,7 @@ from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
-from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.scenarios.roads import lane_through
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached

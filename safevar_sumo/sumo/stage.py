@@ -9,9 +9,11 @@ import numpy as np
 
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Quantity, Trace
 from safevar_sumo.scenarios import Scene, Track, TrackScenario
+from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import SCREEN
-from safevar_sumo.sumo.bodies import TOUCH, Body, Motion, distance_between, find_overlaps
+from safevar_sumo.sumo.bodies import TOUCH, Body, Motion, distance_between, distance_covered, find_overlaps
 from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
+from safevar_sumo.vehicles import SumoType
 
 APPROACH_SPEED = 0.5
 """Closing speed above which a vehicle approaches a body ahead [m/s]; once it is never faster again, it has avoided it.
@@ -20,6 +22,8 @@ LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
 LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a closing speed that is a divisor [m/s]."""
+LANE = Frame((0.0, 0.0), (1.0, 0.0))
+"""The coordinates of the vehicle's lane, in which tracks are."""
 BLOCK = 16_384
 """Number of distances that are computed at once: so many fit into a processor's cache."""
 OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
@@ -259,3 +263,43 @@ class _Seen(NamedTuple):
     closing: FloatArray
     is_passed: BoolArray
     visible: BoolArray
+
+
+class LaneWorld:
+    """N vehicles on a stage, which move by SUMO's ballistic update."""
+
+    frame = LANE
+
+    def __init__(self, stage: Stage, start_speeds: FloatArray, step: float) -> None:
+        self.n = stage.n
+        self.step_length = step
+        self._stage = stage
+        self._front = np.zeros(stage.n)
+        self._speed = start_speeds
+        self._sample = 0
+
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+        return self._motion(np.ones(self.n, dtype=bool))
+
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+        covered = distance_covered(self._speed, speeds, self.step_length)
+        self._front = np.where(is_open, self._front + covered, self._front)
+        self._speed = np.where(is_open, speeds, self._speed)
+        self._sample += 1
+        return self._motion(is_open)
+
+    def _motion(self, is_open: BoolArray) -> Motion:
+        hits = self._stage.hits(self._sample, self._front, self._speed, is_open)
+        fronts = np.zeros((self.n, 2))
+        fronts[:, 0] = self._front
+        return Motion(fronts, self._speed, hits)
+
+    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
+        return self._stage.bodies(vehicles, self._front, self._speed)
+
+    def vehicle_length(self, actor: str) -> float:
+        return self._stage.length
+
+    @property
+    def vehicle_width(self) -> float:
+        return self._stage.width

@@ -14,14 +14,13 @@ import numpy as np
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
-from safevar_sumo.scenarios.base import Frame
+from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
 from safevar_sumo.sumo.bodies import Body, Motion
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.moving import Column, row
 from safevar_sumo.sumo.network import Network, copied_network
-from safevar_sumo.sumo.stage import Stage
+from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
 

@@ -1,67 +1,38 @@
-"""Assembles the parts of a study: looks up its models by name, and creates the models with their parameters."""
+"""A study's parts, ready to simulate: models, points, measures and constraints, which fit each other."""
 
 from __future__ import annotations
 
-import inspect
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from itertools import product
-from pathlib import Path
+from functools import cached_property
 from threading import RLock
-from typing import Any
 
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
-from safevar_sumo.errors import InputError, about, check_name, subject
-from safevar_sumo.output import file_beside
-from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of, unload_user_modules, user_errors
+from safevar_sumo.ads import Ads
+from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import (
-    SCENARIOS,
-    VUT,
-    OpenScenario,
-    Point,
-    Scenario,
-    TrackScenario,
-    WorldScenario,
-    equals_clear,
-    weather_of,
-)
-from safevar_sumo.scenarios.base import check_fields
-from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
-from safevar_sumo.study import (
-    WORST,
-    MatrixTest,
-    MetricsTable,
-    ModelTable,
-    Study,
-    VehicleTable,
-    Weather,
-    user_code_names,
-)
+from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
+from safevar_sumo.study import WORST, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
-from safevar_sumo.sumo.network import copied_network, is_network, is_shipped, stage_networks
+from safevar_sumo.sumo.models import create_ads, create_scenario, create_vehicle, matrix_points
+from safevar_sumo.sumo.network import copied_network, stage_networks
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
-from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
+from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
 from safevar_sumo.vehicles.base import Prepared
 
 _ONE_AT_A_TIME = RLock()
 """Held while a system is assembled, which unloads users' modules and may drive in SUMO."""
-CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
-"""The legal forms of a controller written for TraCI."""
 
 
 UNKNOWN_TO_DRIVER = (
@@ -208,7 +179,11 @@ def assemble(study: Study) -> System:
 
 def _assemble(study: Study) -> System:
     unload_user_modules()  # so that each system has the code as it is now, and no state of another one
-    vehicle, ads, scenario, weather = models_of(study)
+    lookup = Lookup.of(study)
+    vehicle = create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
+    ads = create_ads(study.ads, lookup)
+    scenario = create_scenario(study.scenario, lookup)
+    weather = weather_of(study.weather)
     is_shipped_vehicle = study.vehicle.model in VEHICLES
     check_units(study, vehicle)
     check_plausible(study, vehicle)
@@ -221,9 +196,9 @@ def _assemble(study: Study) -> System:
         )
         raise InputError("", problem, expected)
     rater = rater_of(study)
-    matrix = _matrix_points(expand_protocol(study, weather))
+    matrix = matrix_points(expand_protocol(study, weather), lookup)
     has_stops = any(one.brakes_fully for one in (scenario, *(point.scenario for point in matrix)))
-    measuring = measuring_of(study, Lookup.of(study), has_stops=has_stops)
+    measuring = measuring_of(study, lookup, has_stops=has_stops)
     metrics = [metric.name for metric in measuring.scoring.metrics]
     tables_of_metrics = {
         "published": study.published,
@@ -295,147 +270,3 @@ def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scen
     """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
     limit = study.scenario.margin + _contact_of(scenario, scenes)
     return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
-
-
-def models_of(study: Study) -> tuple[Vehicle, Ads, Scenario, Weather]:
-    """The study's models with their parameters; raises the errors of `assemble`."""
-    lookup = Lookup.of(study)
-    vehicle = _create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
-    ads = _create_ads(study.ads, lookup)
-    return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather)
-
-
-def create_shipped_models(study: Study) -> None:
-    """Create the shipped models of a study, which refuse parameters that they do not have; raises InputError."""
-    with about(study.source):
-        lookup = Lookup.of(study)
-        for kind, shipped, table in (
-            ("vehicle", VEHICLES, study.vehicle),
-            ("ads", ADS, study.ads),
-            ("scenario", SCENARIOS, study.scenario),
-        ):
-            if table.model in shipped and not getattr(table, "kind", ""):
-                _, create = _class_and_creator(kind, shipped, table, lookup)
-                create()
-        if not user_code_names(study):
-            _matrix_points(study)
-
-
-def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
-    """The ADS of a controller written for TraCI: a function `step(traci, vehicle_id)` or a class with that method."""
-    name = f"ads.model = {table.model!r}"
-    with substitute_traci():
-        member = lookup.find({}, table.model, "ads.model")
-        controller = member.target
-        parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
-        is_class = inspect.isclass(controller)
-        step: Any = getattr(controller, "step", None) if is_class else controller
-        try:
-            inspect.signature(step).bind(*[None] * (2 + is_class), **({} if is_class else parameters))
-        except (TypeError, ValueError) as error:
-            problem = f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
-            raise InputError("", problem, CONTROLLER_FORMS) from None
-        create: Callable[[], Controller]
-        if is_class:
-            create = partial(instance_of, member, parameters, name, "ads.parameters")
-            create()  # so that wrong parameters raise errors here
-        else:
-            create = partial(partial, controller, **parameters)  # the function with its parameters
-    return TraciController(create)
-
-
-def _matrix_points(study: Study) -> tuple[Point, ...]:
-    """The points of a study's matrix; raises an error if several points share a name."""
-    points: list[Point] = []
-    for test in () if study.matrix is None else study.matrix.tests:
-        with about(f"{subject()}: test {test.name!r}"):
-            points += _points_of(test, study)
-    for name, count in Counter(point.name for point in points).items():
-        if count > 1:
-            legal = "unique names of tests, and each value once"
-            raise InputError("", f"matrix.tests: {count} points are {name!r}", legal)
-    if study.matrix is None or not study.matrix.point:
-        return tuple(points)
-    by_name = {point.name: point for point in points}
-    check_name("", f"matrix.point = {study.matrix.point!r}", study.matrix.point, by_name)
-    return (by_name[study.matrix.point],)
-
-
-def _points_of(test: MatrixTest, study: Study) -> Iterator[Point]:
-    """The points of a test of the study's matrix."""
-    model = test.model or study.scenario.model
-    shared = study.scenario.parameters if model == study.scenario.model else {}
-    for values in product(*test.over.values()):
-        over = dict(zip(test.over, values, strict=True))
-        table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
-        scenario = _create_scenario(table, Lookup.of(study))
-        if not study.scenario.search:
-            scenario.check()
-        for weather in map(weather_of, test.weathers or [study.weather]):
-            name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
-            parameters = {"test": test.name, **over, "weather": weather.name}
-            yield Point(scenario, weather, name, tuple(parameters.items()))
-
-
-def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
-    """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the
-    study.
-
-    A folder with sources has priority, because a results directory beside the study may have the same name.
-    """
-    paths = [path for folder in folders if is_network(path := Path(folder, scenario.network))]
-    if not paths or is_shipped(scenario.network):
-        return scenario
-    with_sources = [path for path in paths if path.is_file() or any(path.glob("*.xml"))]
-    network = str((with_sources or paths)[0])
-    if isinstance(scenario, msgspec.Struct):
-        return msgspec.structs.replace(scenario, network=network)
-    vars(scenario)["network"] = network
-    return scenario
-
-
-def _class_and_creator(
-    kind: str, shipped: Mapping[str, type], table: ModelTable | VehicleTable, lookup: Lookup, *bases: type
-) -> tuple[Member, Callable[[], Any]]:
-    """The class that the table `kind` names, and the function that creates an instance with the table's parameters."""
-    traci = f'with ads.kind = "traci" {CONTROLLER_FORMS}' if kind == "ads" else ""
-    member = lookup.class_of(shipped, table.model, f"{kind}.model", *bases, otherwise=traci)
-    parameters = lookup.with_paths(member, table.parameters, f"{kind}.parameters")
-    name = f"{kind}.model = {table.model!r}"
-    return member, partial(instance_of, member, parameters, name, f"{kind}.parameters")
-
-
-def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
-    member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
-    vehicle: Vehicle = create()
-    if member.code is not None and not isinstance(getattr(vehicle, "UNITS", None), Mapping):
-        raise member.code.wrong("__init__", "an object without UNITS", "units of the characteristics by name")
-    return vehicle
-
-
-def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
-    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, TrackScenario, WorldScenario)
-    scenario: Scenario = create()
-    if member.code is not None:
-        further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
-        check_fields(member.code, scenario, **further)
-    if isinstance(scenario, OpenScenario):
-        scenario.file = file_beside(scenario.name, lookup.folders) or scenario.file
-        scenario.remarks()  # refuses what the file has and nobody can play
-    return _locate_network(scenario, lookup.folders)
-
-
-def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
-    if table.kind == "traci":
-        return _create_traci_controller(table, lookup)
-    if table.kind == "fmu":
-        path = file_beside(table.model, lookup.folders)
-        if not path:
-            raise InputError("", f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
-        code = UserCode(f"ads.model = {table.model!r}")
-        fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
-        fleet.max_vehicles = MAX_INSTANCES
-        return fleet
-    member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
-    ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
-    return PerVehicleAds(create, member.code) if member.code and isinstance(ads, ScalarAds) else ads

@@ -15,7 +15,19 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.engine import traci_api
-from safevar_sumo.sumo.traci_commands import COMMANDS, DRIVER_COMMANDS, CommandedSpeed
+from safevar_sumo.sumo.traci_commands import (
+    CALLS,
+    COMMANDS,
+    CONSTANT,
+    DEFAULT_VARIABLES,
+    DRIVER_COMMANDS,
+    LISTS,
+    POSITIONS,
+    SENSED,
+    SUBSCRIPTIONS,
+    VARIABLES,
+    CommandedSpeed,
+)
 from safevar_sumo.sumo.world import Api, SumoWorld
 from safevar_sumo.vehicles import Sensors
 
@@ -27,110 +39,6 @@ Values = dict[str, Value]
 Variables = dict[int, tuple[str, Arguments]]
 """Requested variables, each with its function and that function's arguments after the actor's id."""
 
-LISTS = ("getIDList", "getIDCount")
-POSITIONS = ("getPosition", "getPosition3D")
-MOTION = (*POSITIONS, "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
-SENSED: Mapping[str, tuple[str, ...]] = {
-    "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
-    "person": MOTION,
-}
-"""Functions, by domain, that return values of other actors that sensors can measure."""
-TYPE_PROPERTIES = (
-    "getLength",
-    "getWidth",
-    "getHeight",
-    "getMinGap",
-    "getVehicleClass",
-    "getAccel",
-    "getDecel",
-    "getEmergencyDecel",
-    "getMaxSpeed",
-    "getTau",
-    "getMass",
-)
-CONSTANT = ("getTypeID", *TYPE_PROPERTIES)
-"""Functions that return properties of actors that are visible at once or follow from the actor's type."""
-OWN = (
-    "getLeader",
-    "getRoute",
-    "getRouteID",
-    "getRouteIndex",
-    "getDistance",
-    "getDrivingDistance",
-    "getAllowedSpeed",
-    "getSpeedMode",
-    "getWaitingTime",
-    "getNextTLS",
-    "getFollowSpeed",
-    "getSecureGap",
-    "getStopSpeed",
-)
-"""Functions that return values of the vehicle under test alone."""
-SUBSCRIPTIONS = ("subscribe", "getSubscriptionResults", "getAllSubscriptionResults")
-CALLS: Mapping[str, tuple[str, ...]] = {
-    "vehicle": (*LISTS, *SENSED["vehicle"], *CONSTANT, *OWN, *COMMANDS, *SUBSCRIPTIONS),
-    "person": (*LISTS, *MOTION, *CONSTANT, *SUBSCRIPTIONS),
-    "simulation": (
-        "getTime",
-        "getDeltaT",
-        "getDistance2D",
-        "getDistanceRoad",
-        "convert2D",
-        "convertGeo",
-        "convertRoad",
-    ),
-    "edge": (*LISTS, "getLaneNumber", "getFromJunction", "getToJunction", "getAngle"),
-    "lane": (
-        *LISTS,
-        "getEdgeID",
-        "getLength",
-        "getWidth",
-        "getShape",
-        "getMaxSpeed",
-        "getAllowed",
-        "getDisallowed",
-        "getLinkNumber",
-        "getLinks",
-        "getFoes",
-    ),
-    "junction": (*LISTS, "getPosition", "getShape"),
-    "trafficlight": (
-        *LISTS,
-        "getRedYellowGreenState",
-        "getPhase",
-        "getPhaseDuration",
-        "getNextSwitch",
-        "getProgram",
-        "getControlledLanes",
-        "getControlledLinks",
-    ),
-    "vehicletype": (*LISTS, *TYPE_PROPERTIES),
-    "route": (*LISTS, "getEdges"),
-}
-"""The functions that a controller may call, by domain."""
-VARIABLES: Mapping[str, str] = {
-    "VAR_POSITION": "getPosition",
-    "VAR_POSITION3D": "getPosition3D",
-    "VAR_SPEED": "getSpeed",
-    "VAR_ANGLE": "getAngle",
-    "VAR_ROAD_ID": "getRoadID",
-    "VAR_LANE_ID": "getLaneID",
-    "VAR_LANE_INDEX": "getLaneIndex",
-    "VAR_LANEPOSITION": "getLanePosition",
-    "VAR_LANEPOSITION_LAT": "getLateralLanePosition",
-    "VAR_SPEED_LAT": "getLateralSpeed",
-    "VAR_ACCELERATION": "getAcceleration",
-    "VAR_SIGNALS": "getSignals",
-    "VAR_LEADER": "getLeader",
-    "VAR_DISTANCE": "getDistance",
-    "VAR_ALLOWED_SPEED": "getAllowedSpeed",
-    "VAR_LENGTH": "getLength",
-    "VAR_WIDTH": "getWidth",
-    "VAR_TYPE": "getTypeID",
-    "VAR_MAXSPEED": "getMaxSpeed",
-}
-"""TraCI's variables for subscriptions, each with the function that returns the same value."""
-DEFAULT_VARIABLES = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 INVALID_NUMBER = -1073741824
 """Value that SUMO returns for a property of an actor that is not on the road."""
 LEADER_RANGE = 1000.0

@@ -12,7 +12,8 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
-from safevar_sumo.scenarios.base import Frame, ScenarioMemory, lane_through
+from safevar_sumo.scenarios.base import ScenarioMemory
+from safevar_sumo.scenarios.roads import Frame, lane_through
 from safevar_sumo.sumo.bodies import Body, Film, Motion
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType

@@ -1,4 +1,4 @@
-"""The contract of a vehicle model; slopes, sensors and delayed signals."""
+"""The contract of a vehicle model, and slopes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Legal, Returned
-from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, IntArray, Observation
+from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
@@ -75,92 +75,6 @@ class SumoType(NamedTuple):
     tau: FloatArray | None = None
 
 
-LONGEST_DELAY = 3600.0
-"""Longest delay [s]."""
-
-
-SPARE = 32
-"""Number of further samples for which a history has room before it is copied."""
-
-
-class DelayedSignal:
-    """A signal of N vehicles, each with its own delay, which ends between two samples: a newer and an older one.
-
-    Attributes
-    ----------
-    samples
-        The last L samples, newest first, shape (L, ..., N).
-    newer
-        For every value of a sample, its number in the newer sample, counted over all values of `samples`; shape
-        (..., N).
-    share
-        The older sample's share, shape (N,).
-    """
-
-    __slots__ = ("_begin", "_room", "newer", "samples", "share")
-
-    def __init__(self, samples: FloatArray, newer: IntArray, share: FloatArray, room: _Room | None = None) -> None:
-        if room is None:
-            room = _Room(samples)
-        self._room = room
-        self._begin = room.begin
-        self.samples = room.samples[room.begin : room.begin + len(samples)]
-        self.newer = newer
-        self.share = share
-
-    @classmethod
-    def of(cls, sample: FloatArray, delay: FloatArray, step: float) -> DelayedSignal:
-        """A history for delays [s], shape (N,), filled with the first sample, shape (..., N).
-
-        Raises
-        ------
-        InputError
-            If a delay is longer than any run.
-        """
-        longest = float(np.max(delay))
-        age = delay / step
-        if not longest <= LONGEST_DELAY:
-            raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s")
-        whole_steps = np.floor(age)
-        newer = whole_steps.astype(np.intp) * sample.size + np.arange(sample.size).reshape(sample.shape)
-        return cls(np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0), newer, age - whole_steps)
-
-    def where(self, chosen: BoolArray, other: DelayedSignal) -> DelayedSignal:
-        """This history of the `chosen` vehicles, shape (N,), and another one, of equal length, of all others."""
-        samples = np.where(chosen, self.samples, other.samples)
-        newer = np.where(chosen, self.newer, other.newer)
-        return DelayedSignal(samples, newer, np.where(chosen, self.share, other.share))
-
-    def extended(self, sample: FloatArray) -> DelayedSignal:
-        """The history with a new sample at its front and the oldest one dropped."""
-        room = self._room
-        if room.begin != self._begin or not room.begin:  # another history goes on there, or it is full
-            room = _Room(self.samples)
-        room.begin -= 1
-        room.samples[room.begin] = sample
-        return DelayedSignal(self.samples, self.newer, self.share, room)
-
-    def delayed(self) -> FloatArray:
-        """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (..., N)."""
-        newer = self.samples.take(self.newer)
-        older = self.samples[1:].take(self.newer)
-        with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
-            signal = newer * (1 - self.share) + older * self.share
-        np.copyto(signal, newer, where=np.isnan(signal))
-        return signal
-
-
-class _Room:
-    """Room for `SPARE` samples before those of a history, which grows towards the `begin`."""
-
-    __slots__ = ("begin", "samples")
-
-    def __init__(self, samples: FloatArray) -> None:
-        self.begin = SPARE
-        self.samples = np.empty((SPARE + len(samples), *samples.shape[1:]))
-        self.samples[SPARE:] = samples
-
-
 class Sensors(NamedTuple):
     """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on
     distances [-].
@@ -176,25 +90,6 @@ class Sensors(NamedTuple):
     def perfect(cls, n: int) -> Sensors:
         """Sensors without latency and with unlimited range."""
         return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
-
-
-DELAYED = ("gap", "closing_speed", "lateral", "lateral_speed", "obstacle_speed", "obstacle_width", "obstacle")
-"""What sensors report of an obstacle."""
-
-
-def sensed_observation(
-    seen: Observation, past: DelayedSignal | None, latency: FloatArray, reach: FloatArray, step: float
-) -> tuple[Observation, DelayedSignal]:
-    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; and the history for
-    the next call.
-    """
-    sample = np.empty((len(DELAYED), *seen.gap.shape))
-    for row, name in enumerate(DELAYED):
-        sample[row] = getattr(seen, name)
-    past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
-    then = dict(zip(DELAYED, past.delayed(), strict=True))
-    is_detected = then["gap"] <= reach * seen.visibility
-    return seen._replace(**then | {"gap": np.where(is_detected, then["gap"], np.inf)}), past
 
 
 Prepared = Any
@@ -346,7 +241,7 @@ class Vehicle:
 
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
     """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist of states."""
-    if isinstance(steady, DelayedSignal):
+    if hasattr(steady, "where"):
         return steady.where(is_rolling, rest)
     if isinstance(steady, tuple):
         columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]

@@ -6,31 +6,26 @@ degraded sensors.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.vehicles.base import (
-    DELAYED,
     FRICTION,
     LEVEL,
     MASS,
     SECONDS,
     Characteristics,
-    DelayedSignal,
     Plausible,
     Positive,
     Prepared,
-    Sensors,
     Slope,
     SumoType,
-    Vehicle,
-    sensed_observation,
 )
+from safevar_sumo.vehicles.sensors import DELAYED, SensingState, SensingVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 
 TANGENT_DECIMALS = 12
@@ -39,76 +34,6 @@ RELEASED_BRAKE = 1e-6
 """Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command that fades out between
 two steps must not hold the engine off.
 """
-
-
-class SensingState(NamedTuple):
-    """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the wheels [m/s^2].
-
-    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation. `frame` is what the
-    sensors last reported, in the order of `DELAYED`, where they may lose frames.
-    """
-
-    speed: FloatArray
-    throttle: FloatArray
-    brake: FloatArray
-    gear: FloatArray
-    seen: DelayedSignal | None
-    brake_commands: DelayedSignal
-    acceleration: FloatArray
-    frame: FloatArray | None = None
-
-
-class SensingVehicle(Vehicle):
-    """A vehicle with delayed sensors of limited range and a delayed brake.
-
-    Its constants, which `prepare` returns, have a `step` [s], the vehicle's `mass` [kg], the accelerations `drive` and
-    `brake` by full pedals [m/s^2], the dead time `brake_delay` of the brake [s], `max_speed` [m/s], the sensors'
-    `latency` [s] and `sensor_range` [m], and the `slope`.
-    """
-
-    __slots__ = ()
-
-    def sensors(self, prepared: Prepared) -> Sensors:
-        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
-
-    def sense(self, prepared: Prepared, state: SensingState, seen: Observation) -> tuple[Observation, SensingState]:
-        """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
-        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
-        return sensed, state._replace(seen=past)
-
-    def at_rest(self, prepared: Prepared) -> SensingState:
-        zeros = np.zeros_like(prepared.mass)
-        commands = DelayedSignal.of(zeros, prepared.brake_delay, prepared.step)
-        return SensingState(zeros, zeros, zeros, np.ones_like(zeros), None, commands, zeros)
-
-    def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
-        """The steady state: the pedals balance the slope, the only resistance."""
-        rest = self.at_rest(prepared)
-        back = prepared.slope.back
-        throttle, brake = (
-            np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / prepared.drive, -back / prepared.brake)
-        )
-        commands = DelayedSignal.of(brake, prepared.brake_delay, prepared.step)
-        return SensingState(speed, throttle, brake, rest.gear, None, commands, rest.acceleration + back)
-
-    def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
-        p = prepared
-        commands = state.brake_commands.extended(command.brake)
-        brake = commands.delayed()
-        acceleration = self._acceleration(p, state, command.throttle, brake)
-        highest_speed = np.maximum(p.max_speed, state.speed)
-        speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed)
-        return state._replace(
-            speed=speed,
-            acceleration=(speed - state.speed) / p.step + p.slope.back,
-            throttle=np.where(brake > 0, 0.0, command.throttle),
-            brake=brake,
-            brake_commands=commands,
-        )
-
-    @abstractmethod
-    def _acceleration(self, p: Prepared, state: SensingState, throttle: FloatArray, brake: FloatArray) -> FloatArray:
-        """Acceleration by the wheels with these positions of the pedals [m/s^2]."""
 
 
 class _PreparedSumo(NamedTuple):

@@ -17,9 +17,8 @@ from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import drive
-from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points
-from safevar_sumo.sumo.stage import Stage
+from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import Vehicle, calibration_drive

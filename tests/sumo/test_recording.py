@@ -21,9 +21,9 @@ from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
+from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import at_point
-from safevar_sumo.sumo.recorded_world import distance_covered
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo

@@ -21,9 +21,9 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
-from safevar_sumo.vehicles.base import DelayedSignal
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
+from safevar_sumo.vehicles.sensors import DelayedSignal
 from tests.made_up import seen
 from tests.vehicles.runs import (
     STEP,
