@@ -121,6 +121,8 @@ def study(
     """
     as_written = load_study(study)
     directory = out or Path("results") / as_written.name
+    if unsafe is not None and (status or dry_run):
+        raise InputError("unsafe", f"beside {'status' if status else 'dry_run'}, which judge no vehicle", "a search")
     if status:
         return summarise(load(directory))
     search = as_written.search

@@ -65,6 +65,13 @@ def test_a_criterion_that_is_none_is_refused(text: str) -> None:
             Unsafe.parse(text)
 
 
+def test_points_of_a_rating_are_of_no_point_of_its_matrix() -> None:
+    rated = load_study("euro_ncap_rating")
+    assert study_by(rated, Unsafe.parse("rating_points < 35")).matrix == rated.matrix
+    with pytest.raises(InputError, match="study 'wear' has no metric 'rating_points'"):
+        study_by(load_study("wear"), Unsafe.parse("rating_points < 35"))
+
+
 @pytest.mark.slow
 def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
     """The worn car stops nearest to a pedestrian at another point than where it had to brake hardest."""
@@ -115,6 +122,7 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
 def test_a_study_refuses_a_criterion_before_it_searches(folder: Path) -> None:
     refused("study", "tiny.toml", "--unsafe", "hardness > 5", message=("study 'tiny' has no metric 'hardness'",))
     assert not (folder / "results").exists()
+    refused("study", "tiny.toml", "--status", "--unsafe", "drac > 5", message=("--unsafe: beside status",))
 
 
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
