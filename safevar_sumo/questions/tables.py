@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from safevar_sumo.questions.bars import LEGEND
 from safevar_sumo.terminal import WholeTable
 
 LOW, HIGH = "_low", "_high"
@@ -207,8 +208,13 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         if len(blocks[-1]) > len(labels) and 1 + sum(map(_least_width, [*blocks[-1], column])) > width:
             blocks.append([*labels])
         blocks[-1].append(column)
+    bars = [bar.blocks for bar in frame.attrs.get("bars", ())]
+    if bars and columns:
+        yield WholeTable(
+            frame.attrs["title"], [(labels[0].head, False, labels[0].texts), (LEGEND["text"], False, bars)]
+        )
     for number, block in enumerate(filter(None, blocks)):
-        title = "" if number else frame.attrs.get("title", "")
+        title = "" if number or bars else frame.attrs.get("title", "")
         yield WholeTable(title, [(column.head, column.is_number, column.texts) for column in block])
     for column in long:
         yield from (f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True))
@@ -227,13 +233,18 @@ def html_table(frame: pd.DataFrame) -> str:
         f'<th scope="col"{css} title="{escape(column.meaning)}">{escape(column.head)}</th>'
         for css, column in zip(classes, columns, strict=True)
     )
-    rows = (
-        "".join(f"<td{css}>{escape(cell)}</td>" for css, cell in zip(classes, cells, strict=True))
+    names = [f' data-head="{escape(column.head)}"' for column in columns]
+    rows = [
+        "".join(f"<td{css}{name}>{escape(cell)}</td>" for css, name, cell in zip(classes, names, cells, strict=True))
         for cells in zip(*(column.texts for column in columns), strict=True)
-    )
-    body = "\n".join(f"<tr>{row}</tr>" for row in rows)
+    ]
     title = escape(frame.attrs.get("title", ""))
-    table = f"<table><caption>{title}</caption><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table>"
+    if bars := frame.attrs.get("bars"):
+        heads = f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>{heads}'
+        rows = [f'<td class="label" data-head="range">{bar.svg}</td>{row}' for bar, row in zip(bars, rows, strict=True)]
+    body = "\n".join(f"<tr>{row}</tr>" for row in rows)
+    legend = f" <small>({LEGEND['html']})</small>" if bars else ""
+    table = f"<table><caption>{title}{legend}</caption><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table>"
     return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>' if body else ""
 
 

@@ -27,7 +27,7 @@ from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
-from safevar_sumo.report.sections import ReportedStudy, commands, replays, tested, trust
+from safevar_sumo.report.sections import ReportedStudy, commands, facts, replays, tested, trust
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
@@ -239,6 +239,7 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
         "is_bad": any(answer.failures for answer in answers),
         "shortfall": study.case.shortfall,
         "later_changes": study.later_changes,
+        "facts": facts(study),
         "front": Markup(replace(front, tables=dict(list(front.tables.items())[:1])).render("html")),
         "verdicts": [*sections[1 : len(answers)], sections[-1]],
         "replays": list(replays(study, progress)),

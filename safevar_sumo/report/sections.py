@@ -175,6 +175,23 @@ def tested(study: ReportedStudy) -> Answer:
     )
 
 
+def facts(study: ReportedStudy) -> list[tuple[str, str]]:
+    """What a signature under the page is about, each with its name: the results, how they were computed, and of the
+    first answer the scope, the fits and the attack.
+    """
+    numbers = {name: value for answer in study.answers[:1] for name, value in answer.numbers.items()}
+    rows = [
+        ("Results", f"{study.directory.name}, seed {study.case.study.search.seed}"),
+        ("Versions", ", ".join(f"{name} {value}" for name, value in study.versions.items())),
+    ]
+    if numbers.get("fits"):
+        rows.append(("Fits", f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"))
+    if numbers.get("attacked") and numbers["at_most"] is not None:
+        uncertainty = f", and at most {100 * numbers['at_most']:.2f} % of evenly drawn cars are unsafe"
+        rows.append(("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}"))
+    return rows
+
+
 def _remarks(texts: Sequence[str]) -> pd.DataFrame:
     return tabulate("Remarks", {"remark": Column("", "what to bear in mind")}, [(text,) for text in texts])
 

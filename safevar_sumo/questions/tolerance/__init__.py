@@ -17,6 +17,7 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.bars import bars_of
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, limit_criterion, models_of, with_points_between
@@ -46,6 +47,9 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.case import Case
 
+LIMITS_TITLE = (
+    "Limits, rounded to the safe side; a car beyond one has the others at theirs unless a sentence says which"
+)
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
@@ -170,9 +174,11 @@ def tolerance(
     alone = search_alone.limits()
     found = limit_rows(alone, found_together, specified, models.members)
     tables = {
-        "limits": tabulate("Limits, rounded to the safe side", LIMITS, found.rows),
+        "limits": tabulate(LIMITS_TITLE, LIMITS, found.rows),
         "intervals": tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans)),
     }
+    domains = [(one.characteristic.lower, one.characteristic.upper) for one in scans]
+    tables["limits"].attrs["bars"] = bars_of(tables["limits"], domains)
     if found_together is not None and len(models.members) + len(models.left_out) > 1:
         tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, _fit_rows(models, found_together))
     if is_rated(study):
@@ -313,7 +319,8 @@ def _draw(answer: Answer, scans: Sequence[OneAtATimeScan]) -> Figure:
         _draw_profile(axis, one, row, column)
     figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT_SIZE)
     dashed = "; below a dashed line: collisions" if column == SAFETY_DEGREE else ""
-    marks = "dot: the original vehicle; hatched: unsafe; light: limits of all together;\nline: specified"
+    ranges = "light: limits of all together;\nbar below: limits alone"
+    marks = f"dot: the original vehicle; hatched: unsafe; {ranges}; line: specified"
     figure.supxlabel(f"{marks}{dashed}", fontsize=FONT_SIZE)
     return figure
 
@@ -327,6 +334,8 @@ def _draw_profile(axis: Axes, one: OneAtATimeScan, row: Mapping[Any, Any], colum
         axis.axvspan(low, high, facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
     if not pd.isna(row["together_low"]):
         axis.axvspan(row["together_low"], row["together_high"], facecolor=SKY_BLUE, alpha=0.25, linewidth=0)
+    ends_alone = (row["alone_low"], row["alone_high"])
+    axis.plot(ends_alone, (0.03, 0.03), transform=axis.get_xaxis_transform(), color=BLUE, linewidth=4, alpha=0.5)
     for value in (row["specified_low"], row["specified_high"]):
         if not pd.isna(value):
             axis.axvline(value, color=VERMILION, linewidth=1.5)

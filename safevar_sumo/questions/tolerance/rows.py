@@ -218,7 +218,7 @@ def _sentence(
 
 
 def _vehicle_in_words(item: Characteristic, box: Any, members: CharacteristicSet, failure: Failure) -> str:
-    """The vehicle that fails just beyond a limit: `at 0.81, with the other characteristics at their limits`."""
+    """The vehicle that fails just beyond a limit: `at 0.81`, with what the table's title does not say of the others."""
     others = [number for number, member in enumerate(members) if not member.is_scenario and member.name != item.name]
     values = failure.setting[others]
     is_corner = bool((np.isclose(values, box.lower[others]) | np.isclose(values, box.upper[others])).all())
@@ -228,5 +228,5 @@ def _vehicle_in_words(item: Characteristic, box: Any, members: CharacteristicSet
         for number in others
         if failure.setting[number] != members.original[number]
     ]
-    rest = "the other characteristics at their limits" if is_corner else ", ".join(named)
+    rest = "" if is_corner else ", ".join(named)
     return f"at {value:.6g}{item.suffix}{f', with {rest}' if rest else ''}"

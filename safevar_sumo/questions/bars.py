@@ -1,0 +1,83 @@
+"""Limits that are looked at: each characteristic's domain as a bar, in SVG for pages and in blocks for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+CELLS = 16
+"""Width of a bar on the terminal [characters]."""
+WIDTH, HEIGHT = 120, 14
+"""Size of a bar on a page [px]."""
+LEGEND = {
+    "text": "bar: █ together, ▒ alone, · domain, o original, | specified",
+    "html": "range: dark together, light alone, outline the domain, dot the original, tick the specified limit",
+}
+
+
+class Bar(NamedTuple):
+    """A domain, and in it the ranges together and alone, the original and the specified limits, as shares from 0 to 1;
+    a range is empty where there is none.
+    """
+
+    original: float
+    together: tuple[float, ...]
+    alone: tuple[float, ...]
+    specified: tuple[float, ...]
+
+    @property
+    def blocks(self) -> str:
+        """The bar in block characters; a range fills the cells whose middle is in it."""
+        middles = (np.arange(CELLS) + 0.5) / CELLS
+        cells = np.full(CELLS, "·")
+        for ends, letter in ((self.alone, "▒"), (self.together, "█")):
+            if ends:
+                cells[(middles >= ends[0]) & (middles <= ends[1])] = letter
+        for share, letter in (*((share, "|") for share in self.specified), (self.original, "o")):
+            cells[min(int(share * CELLS), CELLS - 1)] = letter
+        return "".join(cells)
+
+    @property
+    def svg(self) -> str:
+        """The bar as inline SVG, whose colours are those of the page."""
+        inside = WIDTH - HEIGHT
+
+        def x(share: float) -> str:
+            return f"{HEIGHT / 2 + inside * share:.1f}"
+
+        def rectangle(ends: tuple[float, ...], name: str) -> str:
+            if not ends:
+                return ""
+            width = f"{max(inside * (ends[1] - ends[0]), 1):.1f}"
+            return f'<rect class="{name}" x="{x(ends[0])}" y="3" width="{width}" height="{HEIGHT - 6}"/>'
+
+        ranges = [rectangle(ends, name) for ends, name in ((self.alone, "alone"), (self.together, "together"))]
+        ticks = [f'<path class="tick" d="M{x(share)} 0v{HEIGHT}"/>' for share in self.specified]
+        parts = [
+            *ranges,
+            rectangle((0, 1), "domain"),
+            *ticks,
+            f'<circle cx="{x(self.original)}" cy="{HEIGHT / 2:g}" r="3"/>',
+        ]
+        size = f'width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}"'
+        return f'<svg class="bar" {size} aria-hidden="true">{"".join(parts)}</svg>'
+
+
+def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> list[Bar]:
+    """The bars of a table of limits, whose characteristics have these domains."""
+    bars = []
+    for row, (lower, upper) in zip(limits.to_dict("records"), domains, strict=True):
+        shares = {
+            name: tuple(
+                float(np.clip((row[end] - lower) / (upper - lower), 0, 1))
+                for end in (f"{name}_low", f"{name}_high")
+                if not pd.isna(row[end])
+            )
+            for name in ("together", "alone", "specified")
+        }
+        original = float(np.clip((row["original"] - lower) / (upper - lower), 0, 1))
+        bars.append(Bar(original, **shares))
+    return bars
