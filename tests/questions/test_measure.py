@@ -65,6 +65,7 @@ def test_a_criterion_that_is_none_is_refused(text: str) -> None:
             Unsafe.parse(text)
 
 
+@pytest.mark.slow
 def test_points_of_a_rating_are_of_no_point_of_its_matrix() -> None:
     rated = load_study("euro_ncap_rating")
     assert study_by(rated, Unsafe.parse("rating_points < 35")).matrix == rated.matrix
