@@ -64,7 +64,7 @@ class Unsafe:
     below this limit [m, or -m/s]; with `points`, at most that many points of a rating; with a `bound`, a metric of the
     study beyond a limit, or a collision (points of a rating are of no run: these alone).
 
-    `contact` is the safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre.
+    `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
     """
 
     below: float | None = None

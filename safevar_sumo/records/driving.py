@@ -272,8 +272,8 @@ class SimulationRuns:
 
     @property
     def middles_apart(self) -> float:
-        """How far the middles of bodies that touch are apart [m], in a scenario that measures from centre to centre: it
-        states the obstacle's length; else 0.
+        """How far the middles of bodies that touch are apart [m], in a scenario that states the obstacle's length; else
+        0.
         """
         length = float(np.max(self.trace.obstacle_length))
         return round((self.trace.vehicle_length + length) / 2, LENGTH_DECIMALS) if length else 0.0

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.base import PreCrash, Scenario
 from safevar_sumo.scenarios.euro_ncap import (
     SAME_DIRECTION,
@@ -63,17 +63,17 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
     ] = 50.0
 
     @property
-    def gap(self) -> Any:
+    def gap(self) -> Quantity:
         """Gap to the target at the start [m]."""
         raise NotImplementedError
 
     @property
-    def target_speed_at(self) -> Callable[[Any], Any]:
+    def target_speed_at(self) -> Callable[[Quantity], Quantity]:
         """The target's speed [m/s] as a function of the time [s]."""
         raise NotImplementedError
 
     @property
-    def offset(self) -> Any:
+    def offset(self) -> Quantity:
         """Distance of the target's rear to the right of the lane's middle [m]."""
         return lateral_offset(self.impact_location, self.vut_width)
 
@@ -139,17 +139,17 @@ class Along(TargetAhead, frozen=True, kw_only=True):
         return f"{super().obstacle()} ahead"
 
     @property
-    def duration(self) -> Any:
+    def duration(self) -> Quantity:
         """Length of a run [s]."""
         return self.time_to_impact + self.time_after
 
     @property
-    def gap(self) -> Any:
+    def gap(self) -> Quantity:
         """Gap to the target at the start, which closes in the time to impact [m]."""
         return self.test_speed * self.time_to_impact - self._profile.travelled(self.time_to_impact)
 
     @property
-    def target_speed_at(self) -> Callable[[Any], Any]:
+    def target_speed_at(self) -> Callable[[Quantity], Quantity]:
         """The target's speed [m/s] as a function of the time [s]."""
         return self._profile.speed_at
 
@@ -209,7 +209,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     border = "headway"
 
     @property
-    def duration(self) -> Any:
+    def duration(self) -> Quantity:
         """Length of a run [s]: the target has stopped braking by then."""
         end = self._time_to_impact()
         if self._target_brakes:
@@ -218,7 +218,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return end + self.time_after
 
     @property
-    def gap(self) -> Any:
+    def gap(self) -> Quantity:
         """Gap to the target at the start [m]."""
         return self.parameter("headway") * self.speed * KMH
 
@@ -244,14 +244,14 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return self.pre_crash == PreCrash.LEAD_DECELERATING
 
     @property
-    def _target_speed(self) -> Any:
+    def _target_speed(self) -> Quantity:
         """Speed of the target at the start [m/s]."""
         slower_speed = 20.0 + np.maximum(self.speed - STEADY_SPEED_LIMIT, 0.0)
         default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(self.pre_crash, self.speed)
         return (default if self.target_speed is None else self.target_speed) * KMH
 
     @property
-    def target_speed_at(self) -> Callable[[Any], Any]:
+    def target_speed_at(self) -> Callable[[Quantity], Quantity]:
         """The target's speed [m/s] as a function of the time [s]."""
         first_speed = self._target_speed
         brakes_at = self.brakes_at
@@ -262,7 +262,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return lambda time: np.maximum(first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed)
 
     @np.errstate(all="ignore")  # of the speeds that do not count
-    def _time_to_impact(self) -> Any:
+    def _time_to_impact(self) -> Quantity:
         """Time to the impact if the vehicle does not brake [s].
 
         The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until

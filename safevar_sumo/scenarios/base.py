@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
-from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
 from safevar_sumo.scenarios.roads import Frame, Roads, World
 from safevar_sumo.study import FreeParameter, Weather, free_parameters
 
@@ -114,12 +114,12 @@ class Layout(NamedTuple):
     """
 
     frame: Frame
-    front: Any
-    speed: Any
+    front: Quantity
+    speed: Quantity
     target: str
     along: FloatArray | None
-    left: Any
-    speeds: Any
+    left: Quantity
+    speeds: Quantity
     backwards: BoolArray | bool = False
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
 from safevar_sumo.scenarios.base import PreCrash, Scenario
 from safevar_sumo.scenarios.euro_ncap import (
@@ -77,9 +77,9 @@ class _Start(NamedTuple):
     side: float
     direction: Direction
     extent: BodySize
-    impact_left: Any
-    distance_to_impact: Any
-    time_to_impact: Any
+    impact_left: Quantity
+    distance_to_impact: Quantity
+    time_to_impact: Quantity
     profile: SpeedProfile
 
     @classmethod
@@ -217,7 +217,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return self.parameter("target") in PERSONS
 
     @property
-    def duration(self) -> Any:
+    def duration(self) -> Quantity:
         """Length of a run [s]."""
         return _Start.of(self).time_to_impact + self.time_after
 
@@ -246,7 +246,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 yield f"{row}, leaves {lead:g} s before", replace(middle, hidden=False, lead=lead)
         yield from next_lane(self.speed, HEADWAYS[::4], self.vut_length, self.vut_width)
 
-    def _parked_cars(self, impact: Any) -> list[Track]:
+    def _parked_cars(self, impact: Quantity) -> list[Track]:
         """The parked cars beside the lane, and the row that hides the target."""
         front = impact - PARKED_GAP
         left = -self.vut_width / 2 - PARKED_GAP - PARKED_WIDTH / 2

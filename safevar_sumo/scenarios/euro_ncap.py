@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.records import Quantity
 from safevar_sumo.scenarios.base import Grade, PreCrash
 from safevar_sumo.scenarios.tracks import KMH, VUT_LENGTH, VUT_WIDTH, BodySize, TrackScenario
 from safevar_sumo.shipped import shipped_table
@@ -93,12 +94,12 @@ class SpeedProfile(NamedTuple):
     `run_up` [m]; or of N targets, in arrays.
     """
 
-    begin: Any
-    speed: Any
+    begin: Quantity
+    speed: Quantity
     run_up: float
 
     @classmethod
-    def with_arrival(cls, distance: Any, time: Any, speed: Any, run_up: float) -> SpeedProfile:
+    def with_arrival(cls, distance: Quantity, time: Quantity, speed: Quantity, run_up: float) -> SpeedProfile:
         """The profile that covers `distance` [m] by `time` [s].
 
         Past the run-up, distance = speed * (time - begin) - run_up.
@@ -118,7 +119,7 @@ class SpeedProfile(NamedTuple):
         return cls(begin, speed, run_up)
 
     @np.errstate(all="ignore")  # where there is no run-up
-    def travelled(self, time: Any) -> Any:
+    def travelled(self, time: Quantity) -> Quantity:
         """Distance covered [m] at a time [s]."""
         elapsed = np.maximum(time - self.begin, 0.0)
         return np.where(
@@ -128,7 +129,7 @@ class SpeedProfile(NamedTuple):
         )[()]
 
     @np.errstate(all="ignore")
-    def speed_at(self, time: Any) -> Any:
+    def speed_at(self, time: Quantity) -> Quantity:
         """Speed [m/s] at a time [s]."""
         elapsed = time - self.begin
         rising = self.speed * self.speed / (2 * np.float64(self.run_up)) * elapsed
@@ -136,7 +137,7 @@ class SpeedProfile(NamedTuple):
         return np.where(elapsed < 0, 0.0, steady)[()]
 
 
-def lateral_offset(location: Any, width: float) -> Any:
+def lateral_offset(location: Quantity, width: float) -> Quantity:
     """Distance of an impact location [% of `width`] from the middle of the front [m].
 
     It is below 0 on the side from which `location` counts.
@@ -178,7 +179,7 @@ class ProtocolTest(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unkn
         return TESTS[self.test].pre_crash
 
     @property
-    def test_speed(self) -> Any:
+    def test_speed(self) -> Quantity:
         """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 

@@ -124,28 +124,28 @@ class OpenScenario(TrackScenario):
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "_found"}
 
-    def _of_scenes(self, values: Sequence[float]) -> Any:
+    def _of_scenes(self, values: Sequence[float]) -> Quantity:
         """A number, or an array for N encounters."""
         is_searched = any(np.ndim(value) for value in self.values.values() if not isinstance(value, str))
         return np.array(values) if is_searched else values[0]
 
     @property
-    def duration(self) -> Any:
+    def duration(self) -> Quantity:
         """Length of a run [s]."""
         return self._of_scenes([scene.played.duration for scene in self._scenes])
 
     @property
-    def test_speed(self) -> Any:
+    def test_speed(self) -> Quantity:
         """The speed that Ego holds, and the vehicle under test until its driving system acts [m/s]."""
         return self._of_scenes([scene.played.speed for scene in self._scenes])
 
     @property
-    def start_speed(self) -> Any:
+    def start_speed(self) -> Quantity:
         """The same [m/s]."""
         return self.test_speed
 
     @property
-    def depends_until(self) -> Any:
+    def depends_until(self) -> Quantity:
         """The time until which motions depend on an Ego that holds its speed [s]."""
         return self._of_scenes([scene.played.depends_until for scene in self._scenes])
 

@@ -7,13 +7,13 @@ bodies that stay parallel to the lanes.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import HEADWAYS, LANE_WIDTH, VEHICLE_SPEED, next_lane
 from safevar_sumo.scenarios.base import Grade, PreCrash, Scenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
@@ -54,7 +54,7 @@ class LaneChange(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknow
     network: str = "two_lanes"
 
     @property
-    def test_speed(self) -> Any:
+    def test_speed(self) -> Quantity:
         """Speed that the vehicle holds until its driving system acts [m/s]."""
         return self.start_speed
 
@@ -68,7 +68,7 @@ class LaneChange(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknow
         """A car stays in the next lane."""
         return next_lane(self.speed, HEADWAYS, self.vut_length, self.vut_width)
 
-    def moved(self, times: FloatArray) -> Any:
+    def moved(self, times: FloatArray) -> Quantity:
         """Distance that the car has moved sideways [m]."""
         return np.minimum(self.lateral_speed * np.maximum(times - BEGINS_AT, 0.0), LANE_WIDTH)
 
@@ -118,7 +118,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     border = "gap"
 
     @property
-    def first_speed(self) -> Any:
+    def first_speed(self) -> Quantity:
         """Speed of the other car at the start [m/s]."""
         return (np.maximum(self.speed - 20.0, 10.0) if self.target_speed is None else self.target_speed) * KMH
 
@@ -176,7 +176,7 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     border = "headway"
 
     @property
-    def duration(self) -> Any:
+    def duration(self) -> Quantity:
         """Length of a run [s]."""
         return BEGINS_AT + self.headway + (CAR.length + self.gap) / self.start_speed + self.time_after
 

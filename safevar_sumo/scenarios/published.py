@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import product
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import KMH_PER_MS, BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.records import KMH_PER_MS, BoolArray, Encounter, FloatArray, Quantity, Trace
 from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
 from safevar_sumo.scenarios.base import (
     CROSSING_LANE,
@@ -132,7 +132,7 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
         return changes
 
-    def _front(self, roads: Roads) -> Any:
+    def _front(self, roads: Roads) -> Quantity:
         """Position of the vehicle's front on its lane at the start [m]; None as in the traffic file."""
         if self.distance is None:
             return None
@@ -255,7 +255,7 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
         return {} if self.distance is None else {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
 
     @property
-    def _front(self) -> Any:
+    def _front(self) -> Quantity:
         """Position of the vehicle's front on its lane at the start [m]."""
         return VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
 

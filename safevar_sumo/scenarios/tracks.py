@@ -186,7 +186,7 @@ class TrackScenario(Scenario):
     network = "along"
     sensor_setback = 0.0
     if TYPE_CHECKING:
-        speed: Any
+        speed: Quantity
 
         @property
         def vut_length(self) -> float: ...
@@ -197,7 +197,7 @@ class TrackScenario(Scenario):
         vut_width = VUT_WIDTH
 
     @property
-    def start_speed(self) -> Any:
+    def start_speed(self) -> Quantity:
         """Speed of the vehicle at the start [m/s]."""
         return self.speed * KMH
 

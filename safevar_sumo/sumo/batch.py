@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +25,7 @@ from safevar_sumo.records import (
     FloatArray,
     Observation,
     Outcome,
+    Quantity,
     SimulationRuns,
     Trace,
 )
@@ -293,7 +293,7 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
         )
 
 
-def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, ...]:
+def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]:
     """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres' friction (a number if
     all points share it), time step and, unless all roads are level and dry, slope and water.
     """

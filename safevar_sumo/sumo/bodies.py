@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -35,13 +35,15 @@ class Body(NamedTuple):
 
     middle: FloatArray
     along: FloatArray
-    length: Any
-    width: Any
-    speed: Any
-    drift: Any = ZERO
+    length: Quantity
+    width: Quantity
+    speed: Quantity
+    drift: Quantity = ZERO
 
     @classmethod
-    def behind(cls, front: FloatArray, along: FloatArray, length: Any, width: Any, speed: FloatArray | float) -> Body:
+    def behind(
+        cls, front: FloatArray, along: FloatArray, length: Quantity, width: Quantity, speed: FloatArray | float
+    ) -> Body:
         """The body whose front's middle is at `front`, or M such bodies."""
         middle = front - along * (np.asarray(length)[..., np.newaxis] / 2)
         return cls(middle, along, length, width, speed, np.zeros_like(speed))

@@ -18,7 +18,7 @@ from msgspec import msgpack, to_builtins
 
 from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_errors
-from safevar_sumo.records import FloatArray, IntArray
+from safevar_sumo.records import FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
 from safevar_sumo.scenarios.roads import lane_through
 from safevar_sumo.shipped import PACKAGE
@@ -84,8 +84,8 @@ class Recording:
     """
 
     step_length: float
-    start: Any
-    speed: Any
+    start: Quantity
+    speed: Quantity
     length: float
     width: float
     way: LaneSequence

@@ -84,7 +84,7 @@ class System:
 
     @cached_property
     def contact(self) -> float:
-        """The safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre."""
+        """The safety degree at which bodies touch [m]: 0, or half of both lengths between middles."""
         return _contact_of(self.points[0].scenario, self.scenes)
 
     def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
@@ -249,7 +249,7 @@ def _assemble(study: Study) -> System:
 
 
 def _contact_of(scenario: Scenario, scenes: Scenes) -> float:
-    """The safety degree at which bodies touch [m]: 0, or half of both lengths from centre to centre."""
+    """The safety degree at which bodies touch [m]: 0, or half of both lengths between middles."""
     if not scenario.centre_to_centre:
         return 0.0
     assert isinstance(scenario, WorldScenario)

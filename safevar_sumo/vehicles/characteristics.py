@@ -10,13 +10,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, Quantity
 from safevar_sumo.study import Study, plain_values, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
@@ -137,7 +136,7 @@ class Characteristic:
                 f"{expected}{self.suffix}{otherwise}{hint}",
             )
 
-    def is_legal(self, values: Any, *, beyond: bool) -> Any:
+    def is_legal(self, values: Quantity, *, beyond: bool) -> Quantity:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
         A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0 if the domain is,

@@ -98,8 +98,8 @@ def repair(
         Wear that is promised, such as "treadDepth >= 3"; may be repeated. Characteristics that no promise names stay as
         in the original; "all" promises the whole domain. By default the study's [repair.promise], else its [limits].
     margin
-        Distance to keep from a collision [m], between bumpers where the safety degree is from centre to centre; by
-        default the model's error that the study states, else 0.3 m.
+        Distance to keep from a collision [m], between bumpers; by default the model's error that the study states, else
+        0.3 m.
     unsafe
         What is unsafe instead: a collision, a safety degree below X, or a metric such as "drac > 6".
     change
