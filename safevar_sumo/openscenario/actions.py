@@ -263,10 +263,8 @@ def assign_route_action(player: Player, action: Element, actor: Actor) -> list[R
 
 def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """FollowTrajectoryAction: at the actor's speed, or at the times of the vertices, even speeds in between."""
-    trajectory = action.find("TrajectoryRef/Trajectory")
-    trajectory = part(action, "Trajectory") if trajectory is None else trajectory
     start = None if actor.at is None else actor.at.pose
-    line = line_of(trajectory, player.network, player.place_of, start)
+    line = line_of(_trajectory(action), player.network, player.place_of, start)
     actor.at = Place(line, number(action, "initialDistanceOffset", 0.0), 0.0)
     actor.sideways = None
     timing = action.find("TimeReference/Timing")
@@ -292,6 +290,12 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
 
     actor.stations = Motion(now, station)
     return [running]
+
+
+def _trajectory(action: Element) -> Element:
+    """The trajectory of a FollowTrajectoryAction; in version 1.0 it had no TrajectoryRef around it."""
+    found = action.find("TrajectoryRef/Trajectory")
+    return part(action, "Trajectory") if found is None else found
 
 
 PRIVATE: dict[str, Callable[[Player, Element, Actor], list[Running]]] = {
@@ -339,7 +343,7 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
     if player.ego in actors and player.has_begun and leaf.tag == "FollowTrajectoryAction":
         player.ignored.add(f"{leaf.tag} of {player.ego.name}")
         # It is a record of a run; the driving system drives anew.
-        line = line_of(part(leaf, "TrajectoryRef/Trajectory"), player.network, player.place_of)
+        line = line_of(_trajectory(leaf), player.network, player.place_of)
         player.ego_turns([piece.start.facing for piece in line.pieces])
         return []
     if player.sample and player.ego in actors:

@@ -189,6 +189,8 @@ def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
         body = next((each for each in entity if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
         if body is None:
             raise unsupported(f"{name} is no Vehicle, Pedestrian or MiscObject")
+        if body.find("Trailer") is not None:
+            raise unsupported(f"the Trailer of {name} is not supported")
         middle, size = part(body, "BoundingBox/Center"), part(body, "BoundingBox/Dimensions")
         length, width = number(size, "length"), number(size, "width")
         if not (0 < length <= 100 and 0 < width <= 100):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.openscenario.actors import Actor, Array
+from safevar_sumo.openscenario.actors import STEP, Actor, Array
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
 from safevar_sumo.openscenario.places import Way
@@ -36,6 +36,61 @@ def compared(condition: Element, values: Array, limit: str = "value", otherwise:
     return RULES[rule](values, number(condition, limit))
 
 
+def holds(player: Player, trigger: Element | None, window: slice) -> Array:
+    """At which samples of a window a trigger (class Trigger) holds; without one at all."""
+    found = np.full(window.stop - window.start, trigger is None)
+    for group in () if trigger is None else trigger.findall("ConditionGroup"):
+        conditions = [_condition(player, each, window) for each in group.findall("Condition")]
+        found = found | np.logical_and.reduce(conditions)
+    return found
+
+
+def _condition(player: Player, condition: Element, window: slice) -> Array:
+    """Class Condition: with its edge, after its delay; it is unknown before it is asked for the first time."""
+    first, seen = player.seen.setdefault(id(condition), (window.start, np.zeros(len(player.times) + 1, bool)))
+    seen[window] = _value(player, condition, window)
+    samples = np.arange(window.start, window.stop) - round(number(condition, "delay", 0.0) / STEP)
+    now = (samples >= first) & seen[samples]
+    has_before, before = samples > first, seen[samples - 1]
+    match condition.get("conditionEdge", "none"):
+        case "none":
+            return now
+        case "rising":
+            return now & has_before & ~before
+        case "falling":
+            return ~now & has_before & before
+        case "risingOrFalling":
+            return has_before & (now != before)
+    raise unsupported(f"conditionEdge {condition.get('conditionEdge')} is not supported")
+
+
+def _value(player: Player, condition: Element, window: slice) -> Array:
+    kind = part(condition, "*")
+    inner = part(kind, "EntityCondition/*" if kind.tag == "ByEntityCondition" else "*")
+    if kind.tag == "ByValueCondition" and inner.tag in BY_VALUE:
+        return BY_VALUE[inner.tag](player, inner, window)
+    if kind.tag != "ByEntityCondition" or inner.tag not in BY_ENTITY:
+        raise unsupported(f"{inner.tag} is not supported")
+    if inner.get("direction", "longitudinal") != "longitudinal":
+        raise unsupported(f"{inner.tag} with direction = {inner.get('direction')} is not supported")
+    triggering = part(kind, "TriggeringEntities")
+    actors = [player.other(each) for each in triggering.findall("EntityRef")]
+    values = [BY_ENTITY[inner.tag](player, inner, actor, window) & (actor.deleted > player.now) for actor in actors]
+    rule = triggering.get("triggeringEntitiesRule")
+    if rule == "all":
+        return np.logical_and.reduce(values)
+    return np.logical_or.reduce(values) ^ (rule == "none")
+
+
+def watched(player: Player, trigger: Element | None) -> list[str]:
+    """Conditions of a trigger that watch Ego."""
+    found = []
+    for kind in () if trigger is None else trigger.iter("ByEntityCondition"):
+        if any(each.get("entityRef") == player.ego.name for each in kind.iter()):
+            found.append(part(kind, "EntityCondition/*").tag)
+    return found
+
+
 # By value
 
 
@@ -46,10 +101,15 @@ def simulation_time_condition(player: Player, condition: Element, window: slice)
 
 def storyboard_element_state_condition(player: Player, condition: Element, window: slice) -> Array:
     """StoryboardElementStateCondition: transitions hold at the moment at which they happen."""
-    kind, state = attribute(condition, "storyboardElementType").lower(), attribute(condition, "state")
-    key = kind, attribute(condition, "storyboardElementRef")
-    times, never = player.times[window], np.inf
-    began, ended = player.begun.get(key, never), player.ended.get(key, never)
+    kind, name = attribute(condition, "storyboardElementType").lower(), attribute(condition, "storyboardElementRef")
+    times, state = player.times[window], attribute(condition, "state")
+    began, ended = (
+        min(
+            (time for (of, path), time in states.items() if of == kind and f"::{path}".endswith(f"::{name}")),
+            default=np.inf,
+        )
+        for states in (player.begun, player.ended)
+    )
     match state:
         case "completeState":
             return times >= ended - 1e-9
@@ -150,7 +210,7 @@ def acceleration_condition(player: Player, condition: Element, actor: Actor, win
     """AccelerationCondition [m/s^2]: in the last step."""
     before = np.arange(window.start, window.stop) - 1
     change = actor.speed[window] - actor.speed[np.maximum(before, 0)]
-    return compared(condition, change / (player.times[1] - player.times[0]))
+    return compared(condition, change / STEP)
 
 
 def collision_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:

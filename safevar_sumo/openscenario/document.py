@@ -40,6 +40,8 @@ def root_of(file: str) -> Element:
 def _parsed(file: str, modified: int, size: int) -> Element:
     try:
         root: Element = parse(file, forbid_dtd=True).getroot()
+        for element in root.iter():
+            element.tag = element.tag.rpartition("}")[2]  # without a namespace
         return root
     except DefusedXmlException as error:
         problem = f"{file!r} has a document type or entities ({type(error).__name__})"
@@ -60,7 +62,7 @@ def number(element: Element, name: str, default: float | None = None) -> float:
     """A number of an element, or the default if the element does not have it."""
     if default is not None and name not in element.attrib:
         return default
-    text = attribute(element, name)
+    text = literal(attribute(element, name), {})
     try:
         return float(text)
     except ValueError:
@@ -163,7 +165,7 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     InputError
         If the file is no concrete one, or something that it names is not there.
     """
-    root = _copy(root_of(file))
+    root = copy.deepcopy(root_of(file))
     header = root.find("FileHeader")
     if root.tag != "OpenSCENARIO" or header is None or header.get("revMajor") != "1":
         raise unsupported(f"{file!r} is no OpenSCENARIO XML 1.x", "a file with FileHeader revMajor = 1")
@@ -192,11 +194,6 @@ def beside(folder: str, path: str) -> str:
     return os.path.normpath(os.path.join(folder, path.replace("\\", "/")))
 
 
-def _copy(element: Element) -> Element:
-    """A copy of a tree, without comments and declarations of parameters that are read from the original."""
-    return copy.deepcopy(element)
-
-
 def _resolve(element: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]) -> None:
     """Replace values and references to catalogs below an element; `catalogs` collects the files that are read."""
     for key, text in element.attrib.items():
@@ -221,7 +218,7 @@ def _referenced(child: Element, values: Values, folders: tuple[str, ...], catalo
         attribute(each, "parameterRef").lstrip("$"): literal(attribute(each, "value"), values)
         for each in child.iter("ParameterAssignment")
     }
-    entry = _copy(found)
+    entry = copy.deepcopy(found)
     _resolve(entry, values_of(declared(found), given, values), folders, catalogs)
     return entry
 

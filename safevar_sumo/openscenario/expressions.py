@@ -56,6 +56,7 @@ MAX_LENGTH = 1000
 
 def literal(text: str, values: Values) -> str:
     """An attribute's value with its parameters and expressions replaced."""
+    text = text.strip()
     if text.startswith("${") and text.endswith("}"):
         found = evaluate(text[2:-1], values)
         return str(found).lower() if isinstance(found, bool) else repr(found)

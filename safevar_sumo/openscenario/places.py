@@ -45,6 +45,18 @@ class Way(Line):
             pieces += own if is_forward else [piece.reversed() for piece in reversed(own)]
         return cls(pieces, chain=chain, network=network)
 
+    @classmethod
+    def onward(cls, network: Network, name: str, is_forward: bool) -> Way:
+        """The way along a road and straight on along those that follow, as far as there is one such road."""
+        way, following = cls.of(network, ((name, is_forward),)), [(name, is_forward)]
+        while len(following) == 1 and way.is_straight and len(way.chain) <= MAX_DETOUR:
+            found = way
+            ways = [one for one in network.ways(*way.chain[-1]) if not network.road(one[0]).flaw]
+            following = [one for one in ways if cls.of(network, (*found.chain, one)).is_straight]
+            if len(following) == 1:
+                way = cls.of(network, (*found.chain, *following))
+        return way
+
     def road_at(self, distance: float, left: float = 0.0) -> Crossing:
         """The road at a distance, and the place on it."""
         assert self.network is not None
@@ -132,7 +144,7 @@ def on_road(road: Road, network: Network, s: float, t: float, facing: Element | 
     along = road.line.pose(s).facing
     turn = oriented(facing, along, -along if against else along) / along
     is_forward = turn.real >= AHEAD
-    way = Way.of(network, ((road.id, is_forward),))
+    way = Way.onward(network, road.id, is_forward)
     return Place(way, s, t, turn) if is_forward else Place(way, road.length - s, -t, -turn)
 
 

@@ -238,11 +238,12 @@ def _network(file: str, modified: int) -> Network:
     root = root_of(file)
     if root.tag != "OpenDRIVE":
         raise unsupported(f"{file!r} is no OpenDRIVE file")
-    roads = {attribute(element, "id"): _road(element) for element in root.iter("road")}
+    roads = {attribute(element, "id"): _road(element) for element in root.findall("road")}
     junctions = {
         attribute(junction, "id"): [
             (attribute(one, "incomingRoad"), attribute(one, "connectingRoad"), attribute(one, "contactPoint"))
             for one in junction.findall("connection")
+            if "connectingRoad" in one.attrib
         ]
         for junction in root.findall("junction")
     }
@@ -274,6 +275,8 @@ def _road(element: Element) -> Road:
         pieces = [_piece(each, name) for each in element.findall("planView/geometry")]
     except InputError as error:
         flaw = error.problem
+    if element.find("lanes//border") is not None:
+        flaw = f"the road {name} has lanes with borders; supported: width"
     return Road(name, pieces, flaw, sections, offsets, links, element.get("rule") == "LHT")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Running, Shape, actors_of
-from safevar_sumo.openscenario.conditions import BY_ENTITY, BY_VALUE, REACTIONS
+from safevar_sumo.openscenario.conditions import REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import (
     Document,
     Element,
@@ -68,21 +68,28 @@ class Played(NamedTuple):
     numbers: list[str]
 
 
+Key = tuple[str, str]
+"""An element in conditions on states: its kind, and its name after those of all around it, joined by `::`."""
+
+
 @dataclass
 class Event:
-    """An Event (class Event) of a maneuver, a group and an act, and its actions that go on, by name."""
+    """An Event (class Event): its kind and path, those of its maneuver, group, act and story, and its actions that go
+    on, by name.
+    """
 
     element: Element
-    names: tuple[tuple[str, str], ...]
+    key: Key
+    outer: list[Key]
     actors: list[Actor]
-    running: dict[str, list[Running]] = field(default_factory=dict)
+    running: dict[Key, list[Running]] = field(default_factory=dict)
     has_begun: bool = False
     has_ended: bool = False
 
     @property
-    def key(self) -> tuple[str, str]:
-        """The event in conditions on states."""
-        return "event", attribute(self.element, "name")
+    def name(self) -> str:
+        """The event in remarks."""
+        return attribute(self.element, "name")
 
     @property
     def moves(self) -> bool:
@@ -95,18 +102,18 @@ class Act:
     """An Act (class Act) and its events."""
 
     element: Element
+    key: Key
     events: list[Event]
     has_begun: bool = False
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """The act in conditions on states."""
-        return "act", attribute(self.element, "name")
 
     @property
     def has_ended(self) -> bool:
         """Whether all of it is over."""
         return self.has_begun and all(event.has_ended for event in self.events)
+
+
+def _below(outer: Key, element: Element) -> Key:
+    return element.tag.lower(), f"{outer[1]}::{attribute(element, 'name')}"
 
 
 class Player:
@@ -126,17 +133,21 @@ class Player:
             attribute(each, "name"): attribute(each, "value")
             for each in document.root.findall("VariableDeclarations/VariableDeclaration")
         }
-        self.begun: dict[tuple[str, str], float] = {}
-        self.ended: dict[tuple[str, str], float] = {}
+        self.begun: dict[Key, float] = {}
+        self.ended: dict[Key, float] = {}
         self.dependences: dict[str, float] = {}
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
         self.has_begun, self._changes = False, 0
         """Whether Init is over; how many events have begun or ended."""
         self.stop = math.inf
-        self._seen: dict[int, tuple[int, Array]] = {}
+        self.seen: dict[int, tuple[int, Array]] = {}
         self._board = part(document.root, "Storyboard")
-        self._acts = [self._act(each) for each in self._board.findall("Story/Act")]
+        self._acts = [
+            self._act(each, ("story", attribute(story, "name")))
+            for story in self._board.findall("Story")
+            for each in story.findall("Act")
+        ]
 
     # What actions and conditions ask
 
@@ -178,70 +189,40 @@ class Player:
         """Note a remark, once."""
         self.remarks[text] = None
 
-    # Triggers
-
-    def _holds(self, trigger: Element | None, window: slice) -> Array:
-        """At which samples of a window a trigger (class Trigger) holds; without one at all."""
-        holds = np.full(window.stop - window.start, trigger is None)
-        for group in () if trigger is None else trigger.findall("ConditionGroup"):
-            conditions = [self._condition(each, window) for each in group.findall("Condition")]
-            holds = holds | np.logical_and.reduce(conditions)
-        return holds
-
-    def _condition(self, condition: Element, window: slice) -> Array:
-        """Class Condition: with its edge, after its delay; it is unknown before it is asked for the first time."""
-        first, seen = self._seen.setdefault(id(condition), (window.start, np.zeros(len(self.times) + 1, bool)))
-        seen[window] = self._value(condition, window)
-        samples = np.arange(window.start, window.stop) - round(number(condition, "delay", 0.0) / STEP)
-        now = (samples >= first) & seen[samples]
-        edge = condition.get("conditionEdge", "none")
-        if edge == "none":
-            return now
-        has_before, before = samples > first, seen[samples - 1]
-        match edge:
-            case "rising":
-                return now & has_before & ~before
-            case "falling":
-                return (samples >= first) & ~seen[samples] & has_before & before
-            case "risingOrFalling":
-                return has_before & (seen[samples] != before)
-        raise unsupported(f"conditionEdge {edge} is not supported")
-
-    def _value(self, condition: Element, window: slice) -> Array:
-        kind = part(condition, "*")
-        inner = part(kind, "EntityCondition/*" if kind.tag == "ByEntityCondition" else "*")
-        if kind.tag == "ByValueCondition" and inner.tag in BY_VALUE:
-            return BY_VALUE[inner.tag](self, inner, window)
-        if kind.tag != "ByEntityCondition" or inner.tag not in BY_ENTITY:
-            raise unsupported(f"{inner.tag} is not supported")
-        triggering = part(kind, "TriggeringEntities")
-        actors = [self.other(each) for each in triggering.findall("EntityRef")]
-        values = [BY_ENTITY[inner.tag](self, inner, actor, window) & (actor.deleted > self.now) for actor in actors]
-        join = np.logical_or if triggering.get("triggeringEntitiesRule") == "any" else np.logical_and
-        return join.reduce(values)
-
-    def _watched(self, trigger: Element | None) -> list[str]:
-        """Conditions of a trigger that watch Ego."""
-        found, name = [], self.ego.name
-        for kind in () if trigger is None else trigger.iter("ByEntityCondition"):
-            inner = part(kind, "EntityCondition/*")
-            if any(each.get("entityRef") == name for each in kind.iter()):
-                found.append(inner.tag)
-        return found
-
     # The storyboard
 
-    def _act(self, element: Element) -> Act:
-        events, act_name = [], ("act", attribute(element, "name"))
+    def _act(self, element: Element, story: Key) -> Act:
+        act_key, events = _below(story, element), []
         for group in element.findall("ManeuverGroup"):
-            actors = part(group, "Actors")
+            actors, group_key = part(group, "Actors"), _below(act_key, group)
             if actors.get("selectTriggeringEntities") == "true":
                 raise unsupported("Actors with selectTriggeringEntities = true is not supported")
             own = [self.other(each) for each in actors.findall("EntityRef")]
             for maneuver in group.findall("Maneuver"):
-                names = ("maneuver", attribute(maneuver, "name")), ("maneuvergroup", attribute(group, "name")), act_name
-                events += [Event(event, names, own) for event in maneuver.findall("Event")]
-        return Act(element, events)
+                key = _below(group_key, maneuver)
+                outer = [key, group_key, act_key, story]
+                events += [Event(event, _below(key, event), outer, own) for event in maneuver.findall("Event")]
+                self._remark_repeats(group, maneuver)
+        found = Act(element, act_key, events)
+        self._refuse_reactions(found)
+        return found
+
+    def _remark_repeats(self, group: Element, maneuver: Element) -> None:
+        for one in (group, *maneuver.findall("Event")):
+            if (times := number(one, "maximumExecutionCount", 1)) > 1:
+                kind = "event" if one.tag == "Event" else "group"
+                self.remark(f"the {kind} {attribute(one, 'name')} is played once, of up to {times:g} times")
+
+    def _refuse_reactions(self, one: Act) -> None:
+        """Refuse an act that moves somebody and an event that moves somebody, if only a run can begin them."""
+        moving = [event.element for event in one.events if event.moves]
+        for element in (one.element, *moving) if moving else ():
+            for kind in watched(self, element.find("StartTrigger")):
+                if kind in REACTIONS:
+                    waits = (
+                        f"the {element.tag.lower()} {attribute(element, 'name')} waits for a {kind} of {self.ego.name}"
+                    )
+                    raise unsupported(f"{waits}, which only a run can tell")
 
     def initialise(self) -> None:
         """Class Init: places first, then speeds, then all others, as the order of the list is none in time."""
@@ -276,11 +257,10 @@ class Player:
         while not is_settled:
             before = len(self.begun), len(self.ended), self._changes
             for one in self._acts:
-                if not one.has_begun and self._holds(one.element.find("StartTrigger"), now)[0]:
+                if not one.has_begun and holds(self, one.element.find("StartTrigger"), now)[0]:
                     one.has_begun = True
                     self.begun.setdefault(one.key, self.now)
                     self._note_ego(one.element)
-                    self._check(one)
                 if one.has_begun and one.key not in self.ended:
                     self._settle_act(one, now)
             is_settled = before == (len(self.begun), len(self.ended), self._changes)
@@ -289,29 +269,20 @@ class Player:
 
     def _settle_act(self, one: Act, now: slice) -> None:
         stop = one.element.find("StopTrigger")
-        is_stopped = stop is not None and len(stop) > 0 and bool(self._holds(stop, now)[0])
+        is_stopped = stop is not None and len(stop) > 0 and bool(holds(self, stop, now)[0])
         for event in one.events:
             if is_stopped and not event.has_ended:
                 self._cut(event)
-            elif not event.has_begun and self._holds(event.element.find("StartTrigger"), now)[0]:
+            elif not event.has_begun and holds(self, event.element.find("StartTrigger"), now)[0]:
                 self._begin(event, one)
             if event.has_begun and not event.has_ended:
                 self._finish(event)
-        for place in range(3):  # maneuvers, groups and the act
-            for name in dict.fromkeys(event.names[place] for event in one.events):
-                self.begun.setdefault(name, self.now)
-                if all(event.has_ended for event in one.events if event.names[place] == name):
-                    self.ended.setdefault(name, self.now)
+        for key in dict.fromkeys(key for event in one.events for key in event.outer[:3]):
+            self.begun.setdefault(key, self.now)
+            if all(event.has_ended for event in one.events if key in event.outer):
+                self.ended.setdefault(key, self.now)
         if not one.events:
             self.ended.setdefault(one.key, self.now)
-
-    def _check(self, one: Act) -> None:
-        """Refuse events that only a run can begin."""
-        for event in one.events:
-            for kind in self._watched(event.element.find("StartTrigger")) if event.moves else ():
-                if kind in REACTIONS:
-                    waits = f"the event {event.key[1]} waits for a {kind} of {self.ego.name}"
-                    raise unsupported(f"{waits}, which only a run can tell")
 
     def _begin(self, event: Event, one: Act) -> None:
         """Begin an event: `override` ends the others of its maneuver, `skip` waits for none."""
@@ -319,7 +290,7 @@ class Player:
         others = [
             other
             for other in one.events
-            if other is not event and other.names == event.names and other.has_begun and not other.has_ended
+            if other is not event and other.outer == event.outer and other.has_begun and not other.has_ended
         ]
         event.has_begun = True
         self._changes += 1
@@ -333,14 +304,14 @@ class Player:
         if event.moves:
             self._note_ego(event.element)
         for action in event.element.findall("Action"):
-            name = attribute(action, "name")
-            self.begun.setdefault(("action", name), self.now)
-            event.running[name] = [running for each in action for running in act(self, each, event.actors)]
+            key = _below(event.key, action)
+            self.begun.setdefault(key, self.now)
+            event.running[key] = [running for each in action for running in act(self, each, event.actors)]
 
     def _finish(self, event: Event) -> None:
-        done = [name for name, running in event.running.items() if all(one.is_done(self.now) for one in running)]
-        for name in done:
-            self.ended.setdefault(("action", name), self.now)
+        done = [key for key, running in event.running.items() if all(one.is_done(self.now) for one in running)]
+        for key in done:
+            self.ended.setdefault(key, self.now)
         if len(done) == len(event.running):
             self._end(event)
 
@@ -352,15 +323,15 @@ class Player:
 
     def _cut(self, event: Event) -> None:
         """End an event before its time."""
-        for name, running in event.running.items():
+        for key, running in event.running.items():
             for one in running:
                 for actor in event.actors:
                     actor.end(one)
-            self.ended.setdefault(("action", name), self.now)
+            self.ended.setdefault(key, self.now)
         self._end(event)
 
     def _note_ego(self, element: Element) -> None:
-        for kind in self._watched(element.find("StartTrigger")):
+        for kind in watched(self, element.find("StartTrigger")):
             self.depends(self.ego, self.now, f"{element.tag} {attribute(element, 'name')}: {kind} of {self.ego.name}")
 
     def _next(self, last: int) -> int:
@@ -383,9 +354,9 @@ class Player:
                 end = one.element.find("StopTrigger")
                 triggers += [end] if end is not None and len(end) else []
         for trigger in triggers:
-            holds = self._holds(trigger, window)
-            if holds.any():
-                last = min(last, window.start + int(np.argmax(holds)))
+            found = holds(self, trigger, window)
+            if found.any():
+                last = min(last, window.start + int(np.argmax(found)))
         return last
 
     def play(self) -> None:
@@ -395,7 +366,7 @@ class Player:
         while True:
             self.settle()
             is_asked = math.isinf(self.stop) and stop is not None and len(stop) > 0
-            if is_asked and self._holds(stop, slice(self.sample, self.sample + 1))[0]:
+            if is_asked and holds(self, stop, slice(self.sample, self.sample + 1))[0]:
                 self.stop = self.now
                 final = min(final, self.sample + round(AFTER / STEP))
             if self.sample >= final:
@@ -464,6 +435,8 @@ def _moved(actor: Actor, samples: slice) -> Moved:
 
 def _remark(player: Player) -> None:
     """What the user should know of what was not played."""
+    if player.document.root.find("Entities/ScenarioObject/ObjectController") is not None:
+        player.ignored.add("ObjectController")
     if player.ignored:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")
     for actor in player.actors.values():
@@ -472,6 +445,4 @@ def _remark(player: Player) -> None:
     for one in player._acts:
         for event in one.events:
             if event.moves and not event.has_begun:
-                player.remark(f"the event {event.key[1]} never fires")
-            if (times := number(event.element, "maximumExecutionCount", 1)) > 1:
-                player.remark(f"the event {event.key[1]} is played once, of up to {times:g} times")
+                player.remark(f"the event {event.name} never fires")
