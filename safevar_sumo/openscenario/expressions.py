@@ -9,6 +9,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from safevar_sumo.errors import InputError
 
 Values = Mapping[str, str]
@@ -63,6 +65,15 @@ def literal(text: str, values: Values) -> str:
     if text.startswith("$"):
         return _value(text[1:], values)
     return text
+
+
+def text_of(value: Any) -> str:
+    """A value as a file has it."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool | np.bool_):
+        return str(bool(value)).lower()
+    return repr(int(value) if float(value).is_integer() else float(value))
 
 
 def compare(rule: str, value: str, limit: str) -> bool:

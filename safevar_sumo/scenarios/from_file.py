@@ -4,37 +4,33 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.openscenario import STEP, Moved, Played, play
+from safevar_sumo.openscenario import STEP, Moved, Played, play, text_of
 from safevar_sumo.records import FloatArray, Quantity
-from safevar_sumo.scenarios.tracks import Track, TrackScenario
+from safevar_sumo.scenarios.tracks import VUT_LENGTH, VUT_WIDTH, Track, TrackScenario
 from safevar_sumo.study import FreeParameter
 
 WIDEST = 1e9
 """Largest size of a parameter of a file, which says itself what it allows."""
 AWAY_SPEED = 90.0
 """Speed at which a deleted entity, a point without size, leaves the scene to the left [m/s]."""
-KEPT_SCENES = 1000
-"""Number of played scenes that a process keeps: one of 20 s with three bodies takes about 250 kB."""
 DIGITS = 9
 """Decimals of the places in tracks [m]: the last bits of a sine differ between machines."""
 
 
 class _Scene(NamedTuple):
-    """A played scene in coordinates of Ego's lane, and its length [s]."""
+    """A played scene, and its bodies in coordinates of Ego's lane."""
 
     played: Played
     bodies: dict[str, Moved]
 
 
-@lru_cache(maxsize=KEPT_SCENES)
-def _scene(file: str, stamp: tuple[int, ...], ego: str, values: tuple[tuple[str, str], ...]) -> _Scene:
-    played = play(file, dict(values), ego)
+def _scene(file: str, ego: str, values: Mapping[str, str]) -> _Scene:
+    played = play(file, values, ego)
     start = played.start
     return _Scene(
         played,
@@ -98,6 +94,9 @@ class OpenScenario(TrackScenario):
             except InputError as error:
                 name = os.path.basename(self.file)
                 raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
+            if len({scene.played.ego for scene in found}) > 1:
+                problem = f"the body of {self.ego} depends on a searched parameter"
+                raise InputError("scenario.search", problem, "values of it in the matrix")
         return found
 
     def _played(self) -> Sequence[_Scene]:
@@ -107,19 +106,9 @@ class OpenScenario(TrackScenario):
             for name, value in self.values.items()
         }
         return [
-            _scene(
-                self.file, self._stamp, self.ego, tuple((name, text_of(column[k])) for name, column in columns.items())
-            )
+            _scene(self.file, self.ego, {name: text_of(column[k]) for name, column in columns.items()})
             for k in range(n)
         ]
-
-    @property
-    def _stamp(self) -> tuple[int, ...]:
-        """When the file was changed."""
-        try:
-            return (os.stat(self.file).st_mtime_ns,)
-        except OSError:
-            raise InputError("", f"there is no file {self.file!r}", "the path of a file") from None
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "_found"}
@@ -171,8 +160,11 @@ class OpenScenario(TrackScenario):
         return f"{played.dependence} at {played.depends_until:.1f} s"
 
     def remarks(self) -> list[str]:
-        """What of the file has no effect here, or never happens."""
-        return self._scenes[0].played.remarks
+        """What of the file has no effect here, or never happens, and that the vehicle has Ego's body."""
+        played, car = self._scenes[0].played, f"{VUT_LENGTH:.2f} m x {VUT_WIDTH:.2f} m"
+        body = f"{played.ego.length:.2f} m x {played.ego.width:.2f} m"
+        differs = [] if body == car else [f"the vehicle has {self.ego}'s body, {body}, not that of other tests, {car}"]
+        return [*played.remarks, *differs]
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """All entities but Ego; beyond the end of the scene they go on as they move there."""
@@ -211,10 +203,3 @@ def _sampled(column: Any, samples: FloatArray) -> Any:
     share = np.maximum(inside - below, 0.0)
     share[share < 1e-6] = 0.0
     return column[below] + share * (column[np.minimum(below + 1, len(column) - 1)] - column[below])
-
-
-def text_of(value: Any) -> str:
-    """A value as a file has it."""
-    if isinstance(value, bool | np.bool_):
-        return str(bool(value)).lower()
-    return value if isinstance(value, str) else repr(int(value) if float(value).is_integer() else float(value))

@@ -326,6 +326,7 @@ def data_files(study: Study) -> dict[str, str]:
                 raise InputError(study.source, problem, f"the path of a file or folder, relative to {places[0]}")
             paths[name] = found[0]
     if study.scenario.model == MODEL:
+        tests = () if study.matrix is None else study.matrix.tests
         with about(study.source):
-            paths |= files_of(study.scenario.parameters, study.origin.places)
+            paths |= files_of(study.scenario.parameters, tests, study.origin.places)
     return paths

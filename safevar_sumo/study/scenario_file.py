@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.openscenario import constraints_of, open_file, read
+from safevar_sumo.errors import InputError, unknown_name, warn
+from safevar_sumo.openscenario import constraints_of, open_file, play, read, text_of
 from safevar_sumo.openscenario.logical import Source, originals
 from safevar_sumo.study.parameters import free_parameters
-from safevar_sumo.study.schema import Parameters, Weather
+from safevar_sumo.study.schema import MatrixTest, Parameters, Weather
 
 MODEL = "openscenario"
 """The scenario that plays a file."""
@@ -32,18 +33,31 @@ def path_of(name: str, places: Sequence[str]) -> str:
     raise InputError("", f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)")
 
 
-def files_of(scenario: Parameters, places: Sequence[str]) -> dict[str, str]:
-    """The paths of all files that a scenario from a file depends on, by themselves."""
-    file = scenario.get("file")
-    if not isinstance(file, str):
+def files_of(scenario: Parameters, tests: Sequence[MatrixTest], places: Sequence[str]) -> dict[str, str]:
+    """The paths of all files that a scenario from a file depends on at any point of a matrix, by themselves.
+
+    Texts alone choose catalogs and roads, so points that differ in numbers are read once.
+    """
+    if not isinstance(scenario.get("file"), str):
         return {}
-    path = path_of(file, places)
-    given = {name: str(value) for name, value in scenario.items() if name not in ("file", "ego")}
-    try:
-        document = read(path, given)
-    except InputError as error:
-        raise InputError("", f"scenario.file = {file!r}: {error.problem}", error.legal) from None
-    return {name: name for name in (path, *document.catalogs, document.road)}
+    points = {}
+    for test in tests or (MatrixTest(name=""),):
+        values = {**scenario, **test.parameters}
+        over = {name: column for name, column in test.over.items() if any(isinstance(one, str) for one in column)}
+        numbers = {name: column[0] for name, column in test.over.items() if name not in over}
+        for combination in product(*over.values()):
+            point = {**values, **numbers, **dict(zip(over, combination, strict=True))}
+            points[frozenset(item for item in point.items() if isinstance(item[1], str))] = point
+    files: dict[str, str] = {}
+    for point in points.values():
+        path = path_of(point["file"], places)
+        given = {name: text_of(value) for name, value in point.items() if name not in ("file", "ego")}
+        try:
+            document = read(path, given)
+        except InputError as error:
+            raise InputError("", f"scenario.file = {point['file']!r}: {error.problem}", error.legal) from None
+        files |= {name: name for name in (path, *document.catalogs, document.road)}
+    return files
 
 
 def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
@@ -89,8 +103,11 @@ def _expanded(tables: Raw, offered: Source, places: Sequence[str]) -> Parameters
     kept = {key: value for key, value in scenario.items() if key not in ("file", "ego", "values")}
     result = {**tables, "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains}}
     matrix = tables.get("matrix")
+    searched = {name: domain["original"] for name, domain in domains.items() if name in offered.values}
     has_tests = isinstance(matrix, dict) and bool(matrix.get("tests"))
-    points = [{}] if has_tests else _points(rest, fixed, domains)
+    points = [{}] if has_tests else _points(rest, {**fixed, **searched})
+    if len(points) > 1:
+        points = _playable(offered.concrete, scenario.get("ego", "Ego"), {**fixed, **searched}, points)
     if len(points) == 1:
         parameters.update(points[0])
     else:
@@ -126,21 +143,40 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
     return domain
 
 
-def _points(rest: Source, fixed: Parameters, domains: Parameters) -> list[Parameters]:
-    """The combinations of all values that are not searched, at the original values of those that are."""
+def _points(rest: Source, given: Parameters) -> list[Parameters]:
+    """The combinations of all values that nothing else gives."""
     total = int(np.prod([float(len(choice.sets)) for choice in rest.choices])) if rest.choices else 1
     if total > 50 * MOST_POINTS:
         raise _too_many(rest, total)
-    given = {name: str(value) for name, value in fixed.items()}
-    own = {name: repr(domain["original"]) for name, domain in domains.items() if name in rest.values}
     points = []
-    for combination in rest.combinations({**given, **own}):
+    for combination in rest.combinations({name: text_of(value) for name, value in given.items()}):
         points.append({name: _plain(value) for name, value in combination.items()})
         if len(points) > MOST_POINTS:
             raise _too_many(rest, total)
     if not points:
         raise InputError("scenario", "the file's constraints exclude every combination of its values")
     return points
+
+
+def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameters]) -> list[Parameters]:
+    """The points that can be played; a warning says how many cannot, and why."""
+    played, problems = [], {}
+    for point in points:
+        try:
+            play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego)
+        except InputError as problem:
+            problems[" and ".join(f"{name} = {value}" for name, value in point.items())] = problem
+        else:
+            played.append(point)
+    if problems:
+        first, error = next(iter(problems.items()))
+        if not played:
+            raise error
+        left_out = (
+            f"{len(problems)} of {len(points)} combinations of the file's values cannot be played and are left out"
+        )
+        warn(f"{left_out}; the first is {first}: {error.problem}")
+    return played
 
 
 def _too_many(rest: Source, total: int) -> InputError:
@@ -175,7 +211,7 @@ def _constraints(
     low, high = (np.array([float(domains[name][end]) for name in names]) for end in ("lower", "upper"))
     found: dict[str, Parameters] = {}
     for point in points:
-        given = {name: str(value) for name, value in {**fixed, **point}.items()}
+        given = {name: text_of(value) for name, value in {**fixed, **point}.items()}
         for bound in constraints_of(offered.concrete, given, names, low, high):
             weights = {name: weight for name, weight in zip(names, bound.weights, strict=True) if weight}
             table = {"sum": weights, bound.kind: bound.limit, "unit": "-", "meaning": bound.text}

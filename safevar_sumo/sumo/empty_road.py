@@ -31,7 +31,8 @@ def why_no_verdict(system: System) -> str:
     problems = {
         result.point.name: problem
         for result in results
-        if not result.point.scenario.brakes_fully and (problem := _problem(result.runs))
+        if not result.point.scenario.brakes_fully
+        and (problem := _problem(result.runs, result.point.scenario.test_speed))
     }
     if not problems:
         return ""
@@ -45,14 +46,18 @@ def why_no_verdict(system: System) -> str:
     )
 
 
-def _problem(runs: SimulationRuns) -> str:
-    """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing."""
+def _problem(runs: SimulationRuns, test_speed: float | None) -> str:
+    """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing.
+
+    Who still has its test speed at the end has driven as it should, if nobody was there to be reached.
+    """
     trace = runs.trace
     end = int(np.count_nonzero(trace.active)) + 1  # the sample after the last active one ended the run
     gap, speed, brake, position = (values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return "brakes without an obstacle"
-    if gap[-1] <= 0 or runs.outcome[0] == Outcome.COLLISION:
+    keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
+    if gap[-1] <= 0 or keeps_speed or runs.outcome[0] == Outcome.COLLISION:
         return ""
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
