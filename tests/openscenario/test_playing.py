@@ -253,3 +253,10 @@ def test_an_ego_in_the_left_lane_drives_against_s(tmp_path: Path) -> None:
     played = play(write(tmp_path, ego=private("Ego", teleport(at(1, 500)), speed(20))), {})
     assert played.start.facing == -1
     assert played.start.place == pytest.approx(10 + 500 - 3.5 + 22j)
+
+
+def test_a_state_is_that_of_the_element_with_its_whole_path(tmp_path: Path) -> None:
+    for name in ("Event", "Maneuver of Car::Event", "Story::Act::Group of Car::Maneuver of Car::Event"):
+        done = f"<StoryboardElementStateCondition storyboardElementType='event' storyboardElementRef='{name}' state='completeState'/>"
+        file = write(tmp_path, event(speed(20, "linear", "time", 3), AT_ONCE.format(2)), stop=trigger(done, ""))
+        assert play(file, {}).duration == pytest.approx(5 + 4, abs=2 * STEP)

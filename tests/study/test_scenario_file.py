@@ -146,3 +146,18 @@ def test_who_is_deleted_is_not_hit(tmp_path: Path) -> None:
 def test_refusals(scenario: dict[str, Any], problem: str) -> None:
     with pytest.raises(InputError, match=problem):
         load_study("wear", scenario={"file": LOGICAL, **scenario})
+
+
+def test_combinations_that_nobody_can_play_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    speeds = '<ParameterDeclaration name="v" parameterType="double" value="10"/>'
+    write(tmp_path, car=(teleport(at(-2, 100)), speed("$v")), parameters=speeds)
+    elements = "".join(f'<Element value="{value}"/>' for value in (5, -5, 10))
+    row = f'<DeterministicSingleParameterDistribution parameterName="v"><DistributionSet>{elements}</DistributionSet></DeterministicSingleParameterDistribution>'
+    path = tmp_path / "values.xosc"
+    path.write_text(
+        f'<OpenSCENARIO><FileHeader revMajor="1" revMinor="2"/><ParameterValueDistribution><ScenarioFile filepath="scenario.xosc"/><Deterministic>{row}</Deterministic></ParameterValueDistribution></OpenSCENARIO>'
+    )
+    with pytest.warns(match=r"1 of 3 combinations .* the first is v = -5: Car drives backwards"):
+        study = study_of(str(path))
+    assert study.matrix is not None
+    assert [test.over for test in study.matrix.tests] == [{"v": [5]}, {"v": [10]}]
