@@ -13,6 +13,7 @@ from safevar_sumo.ads.reference_drivers import (
     DECELERATION_ROUNDING,
     HARDEST_BRAKING,
     JERK,
+    LEAST_DIVISOR,
     Reaction,
     ReferenceDriver,
     StartThrottle,
@@ -36,6 +37,8 @@ class _Perceiving(NamedTuple):
         Time since a leader began to brake harder than `leader_braking` [s], negative before.
     first_gap
         Gap at which the driver first saw who is in the way now [m]; infinite for nobody.
+    nearness
+        `critical_ttc` less the time to collision at the last call [s].
     """
 
     reaction: Reaction
@@ -44,6 +47,7 @@ class _Perceiving(NamedTuple):
     stray_time: FloatArray
     braking_time: FloatArray
     first_gap: FloatArray
+    nearness: FloatArray
 
 
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
@@ -94,7 +98,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         reaction = ReferenceDriver.start(self, n, nominal, step)
         never = np.full(n, -1.0)
         nowhere = np.full(n, np.inf)
-        return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere)
+        return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere, -nowhere)
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         is_same = seen.obstacle == memory.reaction.leader
@@ -106,9 +110,18 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         braking_time = np.where(is_same & (memory.braking_time >= 0), memory.braking_time + reaction.step, begun)
         still_brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
         brakes = (braking_time >= self.perception_time - TIME_ROUNDING) & ((seen.closing_speed > 0) | still_brakes)
-        is_near = time_to_reach(seen) < self.critical_ttc
-        danger = is_in_way & (brakes | (is_near & ~still_brakes))
+        nearness = self.critical_ttc - time_to_reach(seen)
+        danger = is_in_way & (brakes | ((nearness > 0) & ~still_brakes))
         is_followed = is_same & np.isfinite(memory.first_gap)
+        since = np.where(
+            brakes,
+            braking_time - self.perception_time,
+            np.minimum(
+                np.where(is_followed, reaction.step, np.maximum(memory.stray_time - self.perception_time, 0.0)),
+                _time_above_zero(nearness, np.where(is_same, memory.nearness, 0.0), reaction.step),
+            ),
+        )
+        since = np.minimum(np.maximum(since, 0.0), reaction.step)
         first_gap = np.where(is_in_way, np.where(is_followed, memory.first_gap, seen.gap), np.inf)
         command, reaction = self.react(
             seen,
@@ -121,9 +134,12 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
             self.lets_go,
             still_brakes,
             _following(seen, is_in_way, first_gap),
+            since,
         )
         braking_time = np.where(is_in_way, braking_time, -1.0)
-        return command, memory._replace(reaction=reaction, braking_time=braking_time, first_gap=first_gap)
+        return command, memory._replace(
+            reaction=reaction, braking_time=braking_time, first_gap=first_gap, nearness=nearness
+        )
 
     def _perceive(self, seen: Observation, memory: _Perceiving, is_same: BoolArray) -> tuple[BoolArray, _Perceiving]:
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
@@ -138,12 +154,18 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         appeared_in_way = np.where(is_first_sight, appears_in_way, memory.appeared_in_way)
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         strays_now = is_sighted & (deviation >= self.stray)
-        new_stray_time = np.where(strays_now, 0.0, -1.0)
+        strayed = (deviation - self.stray) / np.maximum(np.abs(seen.lateral_speed), LEAST_DIVISOR)
+        new_stray_time = np.where(strays_now, np.minimum(strayed, memory.reaction.step), -1.0)
         stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
         is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
         )
+
+
+def _time_above_zero(now: FloatArray, before: FloatArray, step: float) -> FloatArray:
+    """How long of the last step a quantity that changes evenly was above 0 [s]; all of it if it was so before."""
+    return np.where(before < 0, step * now / np.maximum(now - before, LEAST_DIVISOR), step)
 
 
 def _cuts_in(seen: Observation) -> BoolArray:

@@ -128,6 +128,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         lets_go: float = 0.0,
         still_brakes: BoolArray | bool = False,
         following: FloatArray | float = np.inf,
+        since: FloatArray | float = 0.0,
     ) -> tuple[Command, Reaction]:
         """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
 
@@ -150,6 +151,9 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             Whether a leader still brakes, shape (N,).
         following
             Upper limit of the acceleration when following a leader [m/s^2].
+        since
+            Time for which a danger that is new has lasted, less than a step [s], shape (N,): a driver looks all the
+            time.
         """
         nominal = memory.nominal
         step = memory.step
@@ -162,18 +166,26 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         danger_lasts = is_ahead & ((seen.closing_speed > 0) | still_brakes | still_blocks)
         is_aware = memory.danger_time >= 0
         is_reacting = np.where(is_aware, danger_lasts, danger)
-        danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, 0.0), -1.0)
-        was_braking, is_braking = (time >= reaction_time - TIME_ROUNDING for time in (memory.danger_time, danger_time))
+        danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, since), -1.0)
+        # How long of the last step, and of the next one, it brakes.
+        braked_time, braking_time = (
+            np.minimum(time + step - reaction_time, step) for time in (memory.danger_time, danger_time)
+        )
+        was_braking = braked_time > TIME_ROUNDING
+        is_braking = braking_time > TIME_ROUNDING
         intended_before = memory.intended_deceleration
         felt_before = memory.felt_deceleration
         braked = np.maximum(intended_before - felt_before, 0.0)
         felt = np.where(was_braking, felt_before, np.maximum(-memory.acceleration(seen) - braked, 0.0))
-        # A step has the mean of the deceleration that rises within it.
-        rise = np.where(was_braking, jerk * step, jerk * step / 2)
-        rising = np.minimum(np.maximum(intended_before, felt) + rise, deceleration)
         # In its first step it feels how the vehicle coasts.
-        intended = np.where(is_braking, rising, np.where(is_reacting & is_aware, lets_go, 0.0))
-        brake = np.minimum(initial_brake + np.maximum(intended - felt, 0.0) / nominal.braking, 1.0)
+        released = np.where(is_reacting & is_aware, lets_go, 0.0)
+        # A step has the mean of the deceleration that rises within it.
+        begin = np.maximum(intended_before, felt)
+        rise = jerk * np.where(is_braking, braking_time, step)
+        share = np.where(is_braking, braking_time / step, 0.0)
+        mean = share * np.minimum(begin + rise / 2, deceleration) + (1 - share) * np.maximum(released, felt)
+        intended = np.where(is_braking, np.minimum(begin + rise, deceleration), released)
+        brake = np.minimum(initial_brake + np.maximum(mean - felt, 0.0) / nominal.braking, 1.0)
         if (step_index := round(seen.time / step)) < len(start):
             calm = Command(np.full_like(brake, start[step_index]), np.zeros_like(brake))
         else:

@@ -53,10 +53,9 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
         if free is None:
             continue
         own = getattr(point.scenario, border, None)
-        default = Domain(
-            unit=free.unit, original=free.upper if own is None else own, lower=free.lower, upper=free.upper
-        )
-        domain = evaluator.study.scenario.search.get(border, default)
+        own = free.upper if own is None else min(max(own, free.lower), free.upper)
+        widest = Domain(unit=free.unit, original=own, lower=free.lower, upper=free.upper)
+        domain = evaluator.study.scenario.search.get(border, widest)
         study = _with_border(evaluator.study, point, border, domain)
         with_driver = evaluator.for_study(study, verified=0)
         vehicle = original[evaluator.characteristics.of_vehicle]
