@@ -80,7 +80,8 @@ def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
 def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
     page, latex = ANSWER.render("html"), ANSWER.render("latex")
     assert "<p>Two parts &lt;are&gt; old.</p>" in page
-    assert '<td class="label">a &lt; b &amp; 1 %</td>' in page
+    assert ">a &lt; b &amp; 1 %</td>" in page
+    assert '<td data-head="length [m]">' in page, "on a phone a cell carries its heading"
     assert page == ANSWER._repr_html_()
     assert r"a < b \& 1 \%" in latex
     assert r"c\_d" in latex
