@@ -67,11 +67,12 @@ def original_of(system: Any) -> FloatArray:
 
 
 def drawn(system: Any, number: int, seed: int) -> FloatArray:
-    """The original vehicle and settings at random."""
+    """The original vehicle and settings at random, those that a region allows."""
     members = system.characteristics
     settings = np.random.default_rng(seed).uniform(members.lower, members.upper, (number, len(members)))
     settings[0] = members.original
-    return np.asarray(members.filter(settings))
+    settings = np.asarray(members.filter(settings))
+    return settings[system.region.feasible(settings)]
 
 
 def made_up_evaluations(safety: Any, **columns: Any) -> Evaluations:
