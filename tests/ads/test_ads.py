@@ -295,6 +295,7 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     speed = np.repeat([30, 40, 60], 2) / 3.6
     deceleration = np.tile([3.0, 2.5], 3)

@@ -178,6 +178,7 @@ def test_a_run_refuses_what_its_command_refuses(options: dict[str, Any], error: 
                 ask("smoke", jobs=options["jobs"])
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     Path("script.py").write_text(
         "import safevar_sumo as sv\nprint('begun')\n"

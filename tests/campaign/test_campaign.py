@@ -79,6 +79,7 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
         assert len(share) < 3 or max(numbers.values()) - min(numbers.values()) <= 1
 
 
+@pytest.mark.slow
 def test_a_run_in_other_hands_is_left_to_them_and_named(
     study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

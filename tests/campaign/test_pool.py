@@ -60,6 +60,7 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
     assert not processes()
 
 
+@pytest.mark.slow
 def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(tmp_path: Path) -> None:
     with open_pool(2) as pool:
         jobs = [(tmp_path / str(k), int(k == 1)) for k in range(4)]
@@ -78,6 +79,7 @@ def take(task: Task, seconds: float) -> None:
         time.sleep(seconds)
 
 
+@pytest.mark.slow
 def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(pool: Pool) -> None:
     study = load_study("smoke", search={"time_limit": 0.2})
     why = "two workers were lost at the same work, 9: a batch took longer than the time limit"
@@ -188,6 +190,7 @@ def half(number: float) -> float:
     return number / 2
 
 
+@pytest.mark.slow
 def test_functions_share_out_the_workers_of_a_pool_and_end_together() -> None:
     """Each gives two jobs to one of two workers; one that fails ends the others, which would ask for ever."""
     with open_pool(2) as pool:

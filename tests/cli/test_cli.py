@@ -154,6 +154,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert "from centre to centre: bodies touch at 4.70 m" in remark
 
 
+@pytest.mark.slow
 def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     replace = os.replace
 
@@ -215,6 +216,7 @@ def test_before_a_total_is_known_a_terminal_says_searching() -> None:
     assert re.fullmatch(r"searching [━╸╺ ]+", last)
 
 
+@pytest.mark.slow
 def test_what_user_code_prints_leaves_the_json_alone(in_tmp: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Also what other processes and compiled code print."""
     Path("loud.py").write_text(

@@ -103,6 +103,7 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
     assert "evaluations before" not in fewer
 
 
+@pytest.mark.slow
 def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what_is_asked_for(whole: Path) -> None:
     simulated = len(load_runs(whole).evaluations)
     again = ("study", "small.toml", "--out", str(whole))

@@ -78,6 +78,7 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
     assert "interrupted" in ended(process, 130)
 
 
+@pytest.mark.slow
 def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path) -> None:
     Path("temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}

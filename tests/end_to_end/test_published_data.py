@@ -100,6 +100,7 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
     assert np.allclose(frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1))
 
 
+@pytest.mark.slow
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()

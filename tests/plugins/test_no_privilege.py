@@ -109,6 +109,7 @@ def test_a_driving_system_in_a_users_file_is_the_same(name: str, in_tmp: Path) -
     assert_equal(ours, theirs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", each(ALGORITHMS))
 def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(name: str, in_tmp: Path) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""

@@ -36,6 +36,7 @@ def counts_of(answer: sv.Answer) -> tuple[int, int, int]:
     return tuple(answer.numbers[name] for name in ("only_a_unsafe", "only_b_unsafe", "both"))  # type: ignore[return-value]
 
 
+@pytest.mark.slow
 def test_what_another_version_avoids_is_what_simulations_say() -> None:
     wear, earlier = sv.load_study("wear", **ONE_TEST), sv.load_study("wear", **ONE_TEST, **LONGER)
     answer = sv.compare(wear, earlier, samples=32, unsafe="collision", pool=POOL)
@@ -55,6 +56,7 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
     assert both < 16, "most vehicles with random changes of all characteristics collide in both"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", [(), ("treadDepth >= 3", "brakeTorque >= 0.8")])
 def test_settings_lie_on_lines_from_the_original_and_within_the_limits(limits: tuple[str, ...]) -> None:
     wear = sv.load_study("wear", **ONE_TEST)
@@ -130,6 +132,7 @@ def test_a_slower_sensor_meets_the_same_changes() -> None:
     assert "sensorLatency 0.05 and 0.15 s" in answer.verdict
 
 
+@pytest.mark.slow
 def test_without_benign_scenes_nothing_is_called_better() -> None:
     wear, early = (
         load_study("wear", **ONE_TEST),
@@ -143,6 +146,7 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
     assert answer.numbers["metres_earlier"] > 0
 
 
+@pytest.mark.slow
 def test_margin_and_rounding_are_those_of_tolerance() -> None:
     smoke, later = load_study("smoke"), load_study("smoke", name="later")
     answer = sv.compare(smoke, later, samples=8, pool=POOL)

@@ -135,6 +135,7 @@ def test_an_undefined_measure_is_counted(folder: Path) -> None:
     assert 0 < undefined < simulated, "some of all collide"
 
 
+@pytest.mark.slow
 def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
     """300 cars within the limits together: none brakes harder, and none collides."""
     few = ("--characteristics", "tireFric,maxBrakeTorque")

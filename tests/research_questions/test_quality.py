@@ -336,6 +336,7 @@ def test_tables_have_the_promised_columns(name: str, columns: str) -> None:
         assert all(isinstance(count, int) for count in counts if count is not None)
 
 
+@pytest.mark.slow
 def test_the_tests_of_each_question_are_a_family_and_the_needed_runs_count_after_the_correction() -> None:
     """Runs that are all apart: Holm multiplies the smallest p-value of RQ1, 2 / 2^n, by its 8 tests, and that of RQ2,
     2 / C(2n, n), by its 7: 11 and 7 runs are needed where 8 and 5 would be without the correction.

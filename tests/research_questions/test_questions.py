@@ -169,6 +169,7 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
 
 
+@pytest.mark.slow
 def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> None:
     case = three_algorithms()
     means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
@@ -288,6 +289,7 @@ def test_a_reader_chooses_the_level_of_significance() -> None:
     )
 
 
+@pytest.mark.slow
 def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
     case = three_algorithms()
     counts = [(name, run, 9, 5, 7 if name == "nsga2" else run % 3) for name in case.algorithms for run in range(8)]
@@ -404,6 +406,7 @@ def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
     assert [one.name for one in pair] == [clearer, other]
 
 
+@pytest.mark.slow
 def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> None:
     """Equal ones of two runs are not equal solutions of a run."""
     rows = [row("nsga2", run) for run in (0, 0, 0, 1)] + [row("rs", 0)]

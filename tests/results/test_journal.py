@@ -268,6 +268,7 @@ def test_a_journal_of_another_study_or_run_is_refused(
         opened(tmp_path / "a.jsonl", journal_head(study, run, ("a", "b")))
 
 
+@pytest.mark.slow
 def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     code = "from safevar_sumo.results import Journal\nfrom pathlib import Path\n"

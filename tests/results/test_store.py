@@ -267,6 +267,7 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     assert contents(copied) == before
 
 
+@pytest.mark.slow
 def test_altered_journals_are_simulated_again_and_those_without_checksums_are_read_with_a_note(
     copied: Path, slippery: Path
 ) -> None:
