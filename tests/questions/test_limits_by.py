@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo import tolerance
+from safevar_sumo import explain, tolerance
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.attack import Attack, attack, attack_all
 from safevar_sumo.questions.box import Box
@@ -20,7 +20,7 @@ from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from tests.in_process import refused, run
+from tests.in_process import ROOT, files_of, refused, run
 
 SEARCHED = """
 extends = "wear"
@@ -210,3 +210,16 @@ def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(
             assert result.evaluations.f_safe.min() >= answer.numbers["margin"], (row, result.point.name)
     assert any(row["fails_first"] for row in rows)
     assert "up to 35 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in rows[1]["scope"]
+
+
+@pytest.mark.slow
+def test_the_page_on_an_occurrence_says_what_explain_says(tmp_path: Path) -> None:
+    text = files_of("docs/occurrence.md")["occurrence.toml"]
+    file = tmp_path / "occurrence.toml"
+    file.write_text(text)
+    found = explain(str(file), fits=0, jobs=2)
+    assert len(text.splitlines()) <= 10
+    assert found.verdict.partition(" (")[0] in (ROOT / "docs/occurrence.md").read_text()
+    shares = {row["characteristic"]: row["in_some"] for row in found.to_dict()["tables"]["characteristics"]["rows"]}
+    assert [name for name, share in shares.items() if share == 0] == ["sensorRange"]
+    assert found.numbers["original_outcome"] == "stopped"
