@@ -91,7 +91,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_po
     assert [sorted(changes) for changes in answer.tables["causes"]["changes"]] == [["brakeTorque"]]
     assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [None] * 3
     results = SimpleNamespace(case=case, study=case.study, original=record(original, row=0))
-    verdict = _verdict(results, assemble(case.study))
+    verdict = _verdict(results, case, assemble(case.study))
     kept = evaluations.column("rating_points")[case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]]
     assert f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
 
