@@ -157,10 +157,11 @@ class Packed:
     def code(self) -> list[str]:
         """The user code that would run: files of the pack, and what the study and the questions name.
 
-        Networks count, since SUMO's options beside them may name files to write.
+        Networks count, since SUMO's options beside them may name files to write; scenes of OpenSCENARIO do not.
         """
         study, prefix = self.case.study, f"{CODE}/"
-        files = [name.removeprefix(prefix) for name in self.files if name.startswith(prefix)]
+        names = [name for name in self.files if not name.endswith((".xosc", ".xodr"))]
+        files = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
         named = [name for name in (*study.search.algorithms, *self.packed.questions) if ":" in name.partition(" ")[0]]
         return [*files, *user_code_names(study), *named]
 
