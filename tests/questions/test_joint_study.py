@@ -149,12 +149,15 @@ def test_limits_together_are_not_wider_than_those_alone() -> None:
 
 
 @pytest.mark.slow
-def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody_drew_before() -> None:
+def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody_drew_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """All corners of what is printed, each in a thousand new encounters in which the original vehicle is safe."""
+    monkeypatch.undo()  # as many encounters as a user's answer has
     names = "tireFric,maxBrakeTorque,dampRateZeroT_CE"
     answer = json_of("tolerance", "sun_joint", "--fits", "0", "--characteristics", names)
     rows = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
-    assert any(row["together_low"] < row["together_high"] for row in rows.values())
+    assert all(row["together_low"] < row["together_high"] for row in rows.values())
     system = assemble(load_study("sun_joint"))
     members, rng = system.characteristics, np.random.default_rng(99)
     settings = members.lower + rng.random((8000, len(members))) * (members.upper - members.lower)
