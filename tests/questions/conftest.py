@@ -4,7 +4,7 @@ known.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -14,10 +14,16 @@ import pytest
 from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.campaign.questions import Batches
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.questions import models, scope
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.tolerance import rows, search
+from safevar_sumo.questions.tolerance.scans import scan
+from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.study import CharacteristicTable, Study, load_study
+from safevar_sumo.study import CharacteristicTable, Limit, Study, load_study
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
 from tests.made_up import made_up_evaluations
@@ -32,6 +38,14 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
         return Batches(100, True, False) if study.name == "made-up" else choose(study, selection)
 
     monkeypatch.setattr(questions, "choose_batches", choose_batches)
+
+
+@pytest.fixture(autouse=True)
+def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No vehicle has their characteristics; their failures are described as of the study smoke."""
+    smoke = assemble(load_study("smoke"))
+    for module in (models, scope, rows, search):
+        monkeypatch.setattr(module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study))
 
 
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
@@ -113,3 +127,19 @@ def two_islands(settings: FloatArray) -> BoolArray:
 def diagonal_band(settings: FloatArray) -> BoolArray:
     """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
     return np.asarray((settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8))
+
+
+def box_of(
+    n: int, region: Region, limits: dict[str, Limit], others: Sequence[Region] = (), budget: int = 2000
+) -> LimitsTogether:
+    """The box of a planted region, and of those of further fits."""
+    study = made_up_study(n)
+    fits = [
+        Model(number, Evaluator(study, Plant(study, each)), Unsafe()) for number, each in enumerate([region, *others])
+    ]
+    evaluator = fits[0].evaluator
+    columns = list(range(n))
+    scans = scan(evaluator, columns, Unsafe())
+    ends = [{one.characteristic.name: end} for one in scans for interval in one.of_state("unsafe") for end in interval]
+    known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
+    return find_limits_together(Models(tuple(fits), ()), columns, limits, scans, known, budget)

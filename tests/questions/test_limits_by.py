@@ -15,12 +15,14 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.attack import Attack, attack, attack_all
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
+from safevar_sumo.questions.tolerance.levels_together import _nested
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import ROOT, files_of, refused, run
+from tests.questions.conftest import box_of, made_up_study, nowhere
 
 SEARCHED = """
 extends = "wear"
@@ -223,3 +225,16 @@ def test_the_page_on_an_occurrence_says_what_explain_says(tmp_path: Path) -> Non
     shares = {row["characteristic"]: row["in_some"] for row in found.to_dict()["tables"]["characteristics"]["rows"]}
     assert [name for name, share in shares.items() if share == 0] == ["sensorRange"]
     assert found.numbers["original_outcome"] == "stopped"
+
+
+def test_limits_together_that_are_cut_have_no_attack_and_no_proof_of_their_own() -> None:
+    """Up to a faster speed the box was found wider in one characteristic than up to the slower one."""
+    found = box_of(2, nowhere, {})
+    assert found.attack is not None
+    assert found.proof is not None
+    region = region_of(made_up_study(2))
+    boxes = [Box(region, np.zeros(2), np.array(upper)) for upper in ([8.0, 9.0], [6.0, 7.0], [7.0, 5.0])]
+    nested = [each for each in _nested([found._replace(box=box) for box in boxes]) if each is not None]
+    assert [each.box and each.box.upper.tolist() for each in nested] == [[8, 9], [6, 7], [6, 5]]
+    assert [each.attack is None for each in nested] == [False, False, True]
+    assert [each.proof is None for each in nested] == [False, False, True]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -17,17 +16,16 @@ from hypothesis import given, settings, strategies as st
 from safevar_sumo import tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions import models, scope
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Box, Judgement, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance import rows, search
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.tolerance import search
 from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
-from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit, load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
@@ -35,15 +33,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import run
 from tests.made_up import case_of
-from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_islands
-
-
-@pytest.fixture(autouse=True)
-def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No vehicle has their characteristics; their failures are described as of the study smoke."""
-    smoke = assemble(load_study("smoke"))
-    for module in (models, scope, rows, search):
-        monkeypatch.setattr(module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study))
+from tests.questions.conftest import Plant, Region, box_of, made_up_study, nowhere, two_islands
 
 
 def degrees(rows: FloatArray) -> FloatArray:
@@ -202,22 +192,6 @@ def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
 
 LINEAR = np.array([1.0, 2.0, 3.0])
 """Weights of a region whose largest box has sides at 10, 7.5 and 5."""
-
-
-def box_of(
-    n: int, region: Region, limits: dict[str, Limit], others: Sequence[Region] = (), budget: int = 2000
-) -> LimitsTogether:
-    """The box of a planted region, and of those of further fits."""
-    study = made_up_study(n)
-    fits = [
-        Model(number, Evaluator(study, Plant(study, each)), Unsafe()) for number, each in enumerate([region, *others])
-    ]
-    evaluator = fits[0].evaluator
-    columns = list(range(n))
-    scans = scan(evaluator, columns, Unsafe())
-    ends = [{one.characteristic.name: end} for one in scans for interval in one.of_state("unsafe") for end in interval]
-    known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
-    return find_limits_together(Models(tuple(fits), ()), columns, limits, scans, known, budget)
 
 
 def relative_volume(found: LimitsTogether) -> float:

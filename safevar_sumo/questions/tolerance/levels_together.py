@@ -60,15 +60,20 @@ def _find(search: LevelSearch, level: Level, models: Models, inner: Box | None) 
 
 
 def _nested(found: Sequence[LimitsTogether | None]) -> list[LimitsTogether | None]:
-    """Limits together, each cut to those up to the value below; without these there are none."""
+    """Limits together, each cut to those up to the value below; without these there are none. The attack and the proof
+    of a box that is cut are of a wider one: what is cut has none.
+    """
     nested = list[LimitsTogether | None]()
     outer: Box | None = None
     for number, each in enumerate(found):
         box = None if each is None else each.box
-        if box is not None and number:
-            box = None if outer is None else _common(box, outer)
+        if each is not None and box is not None and number:
+            common = None if outer is None else _common(box, outer)
+            if common is None or (common.lower != box.lower).any() or (common.upper != box.upper).any():
+                box = common
+                each = each._replace(box=box, attack=None, proof=None)
         outer = box
-        nested.append(None if each is None else each._replace(box=box))
+        nested.append(each)
     return nested
 
 
