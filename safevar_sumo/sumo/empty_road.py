@@ -15,6 +15,8 @@ MIN_PEDAL = 0.03
 """Brake pedal from which on the vehicle brakes [-], as for the robot of Euro NCAP's tests."""
 MIN_SLOWDOWN = 2.0
 """Speed that braking takes off before it counts [m/s]: cruise controls brake to hold a speed, some by full strokes."""
+SLOW_APPROACH = 0.5
+"""Who comes closer by less need not reach anybody within a test [m/s]: he follows."""
 
 
 def why_no_verdict(system: System) -> str:
@@ -49,15 +51,17 @@ def why_no_verdict(system: System) -> str:
 def _problem(runs: SimulationRuns, test_speed: float | None) -> str:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing.
 
-    Who still has its test speed at the end has driven as it should, if nobody was there to be reached.
+    Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
     """
     trace = runs.trace
     end = int(np.count_nonzero(trace.active)) + 1  # the sample after the last active one ended the run
     gap, speed, brake, position = (values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return "brakes without an obstacle"
+    approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
+    is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
-    if gap[-1] <= 0 or keeps_speed or runs.outcome[0] == Outcome.COLLISION:
+    if gap[-1] <= 0 or (keeps_speed and is_alone) or runs.outcome[0] == Outcome.COLLISION:
         return ""
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""

@@ -14,6 +14,7 @@ from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import OpenScenario
 from safevar_sumo.study import Study, data_files, load_study
 from safevar_sumo.study.schema import tables_of
+from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
@@ -117,6 +118,22 @@ def test_a_run_in_which_the_system_acts_while_others_depend_on_ego_is_invalid(tm
     (runs,) = runs_of(study_of(write(tmp_path, car=(teleport(at(-1, 120)), speed(10)))))
     assert runs.outcome[0] != Outcome.INVALID_TEST
     assert np.isnan(runs.acted_early[0])
+
+
+@pytest.mark.parametrize(
+    ("car", "expected"),
+    [
+        ((teleport(at(-1, 90)), speed(10)), ""),  # Ego follows it at its own speed
+        ((teleport(at(-2, 90)), speed(10)), ""),  # nobody is in the lane
+        ((teleport(at(-1, 300)), speed(0)), "never reaches the encounter (it gets "),
+    ],
+)
+def test_who_keeps_its_speed_has_driven_unless_the_file_ends_before_somebody_who_stands(
+    tmp_path: Path, car: tuple[str, ...], expected: str
+) -> None:
+    study = study_of(write(tmp_path, car=car, stop=trigger(AT_ONCE.format(8), "")))
+    reason = why_no_verdict(assemble(study))
+    assert reason == expected or (expected and expected in reason)
 
 
 def test_who_is_deleted_is_not_hit(tmp_path: Path) -> None:
