@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 AnswerFunction = TypeVar("AnswerFunction", bound="Callable[..., Answer]")
 FORMATS = ("text", "json", "csv", "latex", "html")
+SENTENCE_END = re.compile(r"(?<=[^.]{2}\.) (?=[A-Z])")
+"""Between two sentences, each of which a page puts on lines of its own."""
 MAX_ROWS = 200
 """Number of rows up to which readers see a table; JSON and CSV have them all."""
 WIDTH = 80
@@ -192,8 +195,10 @@ class Answer:
             tables = [latex_table(self._label_of(name), frame) for name, frame in shown.items()]
             return "\n".join([LATEX_PREAMBLE, *tables, *([] if remarks is None else [latex_notes(remarks)])])
         if form == "html":
-            sentences = [f"<p>{escape(text)}</p>" for text in (self.verdict, self._other_tables) if text]
-            return "\n".join([sentences[0], *map(html_table, self._short_tables.values()), *sentences[1:]])
+            first, *later = map(escape, SENTENCE_END.split(self.verdict))
+            verdict = " ".join([first, *(f"<span>{sentence}</span>" for sentence in later)])
+            others = [f"<p>{escape(self._other_tables)}</p>"] if self._other_tables else []
+            return "\n".join([f"<p>{verdict}</p>", *map(html_table, self._short_tables.values()), *others])
         console = Console(width=WIDTH, no_color=True, force_terminal=False)
         with console.capture() as capture:
             self.print(console)
