@@ -251,11 +251,19 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
 
     `reach` is the sensors' range in clear weather [m].
     """
+    return depth_in_the_way(seen, corridor, reach) >= 0
+
+
+def depth_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> FloatArray:
+    """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle reaches it [m];
+    below 0 outside, and `-LARGEST_GAP` without an obstacle.
+    """
     is_detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
     lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
     lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
     watched = corridor + seen.obstacle_width / 2
-    return is_detected & ((np.abs(lateral) <= watched) | (np.abs(lateral_at_arrival) <= watched))
+    least = np.minimum(np.abs(lateral), np.abs(lateral_at_arrival))
+    return np.where(is_detected, watched - least, -LARGEST_GAP)
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:

@@ -37,8 +37,6 @@ class _Perceiving(NamedTuple):
         Time since a leader began to brake harder than `leader_braking` [s], negative before.
     first_gap
         Gap at which the driver first saw who is in the way now [m]; infinite for nobody.
-    nearness
-        `critical_ttc` less the time to collision at the last call [s].
     """
 
     reaction: Reaction
@@ -47,7 +45,6 @@ class _Perceiving(NamedTuple):
     stray_time: FloatArray
     braking_time: FloatArray
     first_gap: FloatArray
-    nearness: FloatArray
 
 
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
@@ -98,7 +95,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         reaction = ReferenceDriver.start(self, n, nominal, step)
         never = np.full(n, -1.0)
         nowhere = np.full(n, np.inf)
-        return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere, -nowhere)
+        return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere)
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         is_same = seen.obstacle == memory.reaction.leader
@@ -113,15 +110,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         nearness = self.critical_ttc - time_to_reach(seen)
         danger = is_in_way & (brakes | ((nearness > 0) & ~still_brakes))
         is_followed = is_same & np.isfinite(memory.first_gap)
-        since = np.where(
-            brakes,
-            braking_time - self.perception_time,
-            np.minimum(
-                np.where(is_followed, reaction.step, np.maximum(memory.stray_time - self.perception_time, 0.0)),
-                _time_above_zero(nearness, np.where(is_same, memory.nearness, 0.0), reaction.step),
-            ),
-        )
-        since = np.minimum(np.maximum(since, 0.0), reaction.step)
+        strayed_time = np.where(is_followed, reaction.step, memory.stray_time - self.perception_time)
+        longest = np.where(brakes, braking_time - self.perception_time, strayed_time)
         first_gap = np.where(is_in_way, np.where(is_followed, memory.first_gap, seen.gap), np.inf)
         command, reaction = self.react(
             seen,
@@ -134,12 +124,11 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
             self.lets_go,
             still_brakes,
             _following(seen, is_in_way, first_gap),
-            since,
+            np.where(brakes, np.inf, nearness),
+            longest,
         )
         braking_time = np.where(is_in_way, braking_time, -1.0)
-        return command, memory._replace(
-            reaction=reaction, braking_time=braking_time, first_gap=first_gap, nearness=nearness
-        )
+        return command, memory._replace(reaction=reaction, braking_time=braking_time, first_gap=first_gap)
 
     def _perceive(self, seen: Observation, memory: _Perceiving, is_same: BoolArray) -> tuple[BoolArray, _Perceiving]:
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
@@ -161,11 +150,6 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
         )
-
-
-def _time_above_zero(now: FloatArray, before: FloatArray, step: float) -> FloatArray:
-    """How long of the last step a quantity that changes evenly was above 0 [s]; all of it if it was so before."""
-    return np.where(before < 0, step * now / np.maximum(now - before, LEAST_DIVISOR), step)
 
 
 def _cuts_in(seen: Observation) -> BoolArray:

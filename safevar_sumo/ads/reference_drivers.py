@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import (
     CORRIDOR,
+    LARGEST_GAP,
     Ads,
     Memory,
     NonNegativeParameter,
@@ -20,6 +21,7 @@ from safevar_sumo.ads.base import (
     Trim,
     blocks_the_way,
     cruise_at,
+    depth_in_the_way,
     is_in_the_way,
     pedals_for,
     time_to_reach,
@@ -71,6 +73,8 @@ class Reaction(NamedTuple):
     leader, leader_speed, leader_has_braked
         Number of the obstacle at the last call; its speed if it was in the way [m/s], 0 for nobody; whether it has
         braked there.
+    nearness
+        What is above 0 in a danger, at the last call, in a unit of the driver's own.
     """
 
     nominal: Nominal
@@ -83,6 +87,7 @@ class Reaction(NamedTuple):
     leader: FloatArray
     leader_speed: FloatArray
     leader_has_braked: BoolArray
+    nearness: FloatArray
 
     def acceleration(self, seen: Observation) -> FloatArray:
         """Mean acceleration since the last call [m/s^2]; 0 at the first call."""
@@ -102,7 +107,8 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         zeros = np.zeros(n)
         never = np.zeros(n, dtype=bool)
-        return Reaction(nominal, step, None, zeros, np.full(n, -1.0), zeros, zeros, zeros, zeros, never)
+        far = np.full(n, -LARGEST_GAP)
+        return Reaction(nominal, step, None, zeros, np.full(n, -1.0), zeros, zeros, zeros, zeros, never, far)
 
     def watch_leader(self, seen: Observation, memory: Reaction, is_in_way: BoolArray) -> tuple[FloatArray, Reaction]:
         """The mean deceleration of a leader since the last call [m/s^2], 0 without one; and the memory with the
@@ -114,7 +120,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         deceleration = np.where(is_led, (memory.leader_speed - speed) / memory.step, 0.0)
         brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
         has_braked = is_in_way & (memory.leader_has_braked & is_same | brakes)
-        return deceleration, memory._replace(leader=seen.obstacle, leader_speed=speed, leader_has_braked=has_braked)
+        return deceleration, memory._replace(leader_speed=speed, leader_has_braked=has_braked)
 
     def react(
         self,
@@ -128,11 +134,13 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         lets_go: float = 0.0,
         still_brakes: BoolArray | bool = False,
         following: FloatArray | float = np.inf,
-        since: FloatArray | float = 0.0,
+        nearness: FloatArray | float = np.inf,
+        longest: FloatArray | float = np.inf,
     ) -> tuple[Command, Reaction]:
         """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
 
-        A danger lasts while an obstacle ahead approaches or still brakes, or keeps its distance and blocks the way.
+        A danger lasts while an obstacle ahead approaches or still brakes, or keeps its distance and blocks the way. A
+        driver looks all the time: the danger began within the last step, where `nearness` was 0.
 
         Parameters
         ----------
@@ -151,9 +159,10 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             Whether a leader still brakes, shape (N,).
         following
             Upper limit of the acceleration when following a leader [m/s^2].
-        since
-            Time for which a danger that is new has lasted, less than a step [s], shape (N,): a driver looks all the
-            time.
+        nearness
+            What rises above 0 when a danger begins, shape (N,), in any unit.
+        longest
+            Upper limit of the time for which a danger that is new has lasted [s], shape (N,).
         """
         nominal = memory.nominal
         step = memory.step
@@ -166,6 +175,10 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         danger_lasts = is_ahead & ((seen.closing_speed > 0) | still_brakes | still_blocks)
         is_aware = memory.danger_time >= 0
         is_reacting = np.where(is_aware, danger_lasts, danger)
+        nearness = np.maximum(nearness, np.full_like(seen.gap, -LARGEST_GAP))
+        before = np.where(seen.obstacle == memory.leader, memory.nearness, 0.0)
+        part_of_step = 1 / (1 - np.minimum(before, 0.0) / np.maximum(nearness, LEAST_DIVISOR))
+        since = np.maximum(np.minimum(longest, step * part_of_step), 0.0)
         danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, since), -1.0)
         # How long of the last step, and of the next one, it brakes.
         braked_time, braking_time = (
@@ -195,6 +208,8 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return command, memory._replace(
             cruise=cruise,
             speed=seen.speed,
+            leader=seen.obstacle,
+            nearness=nearness,
             danger_time=danger_time,
             felt_deceleration=felt,
             intended_deceleration=intended,
@@ -248,14 +263,17 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     margin: NonNegativeParameter = 0.1
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        is_in_way = is_in_the_way(seen, self.corridor)
-        _, memory = self.watch_leader(seen, memory, is_in_way)
+        depth = depth_in_the_way(seen, self.corridor)
+        _, memory = self.watch_leader(seen, memory, depth >= 0)
         critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
         # The gap was seen after a step, in which a leader who brakes has shortened it.
         least_gap = seen.speed * (1 + seen.speed * KMH_PER_MS / 100 - memory.step)
-        is_near = np.where(memory.leader_has_braked, seen.gap >= least_gap, time_to_reach(seen) < critical_ttc)
-        danger = is_in_way & is_near
-        return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk=np.inf)
+        when_braking = np.where(seen.gap >= least_gap, np.inf, -np.inf)
+        when_steady = np.minimum(depth, critical_ttc - time_to_reach(seen))
+        nearness = np.where(memory.leader_has_braked, when_braking, when_steady)
+        return self.react(
+            seen, memory, nearness > 0, self.deceleration, self.reaction_time, jerk=np.inf, nearness=nearness
+        )
 
 
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
@@ -287,9 +305,9 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        is_too_near = seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed)
-        danger = is_in_the_way(seen, self.corridor) & is_too_near
-        return self.react(seen, memory, danger, self.braking, self.reaction_time)
+        lacking = self.safe_distance(seen.speed, seen.obstacle_speed) - seen.gap
+        nearness = np.minimum(depth_in_the_way(seen, self.corridor), lacking)
+        return self.react(seen, memory, nearness > 0, self.braking, self.reaction_time, nearness=nearness)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
@@ -326,21 +344,30 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     margin: NonNegativeParameter = 2.0
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, np.inf)
+        depth = depth_in_the_way(seen, self.corridor)
+        gap = np.where(depth >= 0, seen.gap, np.inf)
         pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
         cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, memory.acceleration(seen))
         critical_deceleration = cfs * (self.hardest - self.comfortable) + self.comfortable
         deceleration = np.minimum(np.where(cfs > 0, critical_deceleration, pfs * self.comfortable), HARDEST_BRAKING)
-        return self.react(seen, memory, (pfs > 0) | (cfs > 0), deceleration, self.reaction_time)
+        _, safe_distance = self.proactive_distances(seen.speed, seen.obstacle_speed)
+        nearness = np.minimum(depth, safe_distance + self.margin - seen.gap)
+        danger = (pfs > 0) | (cfs > 0)
+        return self.react(seen, memory, danger, deceleration, self.reaction_time, nearness=nearness)
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
         """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe
         distance.
         """
+        unsafe_distance, safe_distance = self.proactive_distances(v, u)
+        return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
+
+    def proactive_distances(self, v: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The unsafe and the safe distance [m] of PFS."""
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
         unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
-        return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
+        return unsafe_distance, safe_distance
 
     def critical_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
         """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape

@@ -338,3 +338,18 @@ def test_rss_brakes_with_another_number_than_it_plans_with() -> None:
     onset_gap, decelerations = braking(Rss(deceleration=4.0, braking=6.0), 12.0, 60.0)
     assert onset_gap == pytest.approx(12**2 / (2 * 4), abs=2.1 * 12 * STEP), "rt later than 12 * rt + 12^2 / (2 * 4)"
     assert decelerations.max() == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.35, 0.6, 0.85])
+def test_drivers_see_a_danger_within_a_time_step(share: float) -> None:
+    """What they have braked off at contact is that of the moment of the danger, wherever in a step it is."""
+    speed = 12.0
+    gap = 60.0 + share * speed * STEP
+    end = np.ceil(gap / speed / STEP) * STEP
+    _, of_r157 = braking(R157(), speed, gap)
+    braked = end - (gap / speed - (speed / 12 + 0.45) + 0.35)
+    assert of_r157.sum() * STEP == pytest.approx(6.0 * braked, abs=0.03)
+    _, of_rss = braking(Rss(), speed, gap)
+    hardest = 0.774 * 9.81
+    braked = end - (gap - (speed * 0.75 + speed**2 / (2 * hardest))) / speed - 0.75
+    assert of_rss.sum() * STEP == pytest.approx(hardest * (braked - hardest / 12.65 / 2), abs=0.03)
