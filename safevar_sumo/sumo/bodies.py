@@ -57,7 +57,15 @@ class Body(NamedTuple):
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
         """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape (M,)."""
-        return cls._make(np.array(column) for column in zip(*bodies, strict=True))
+        return cls._make(np.array([body[column] for body in bodies]) for column in range(len(cls._fields)))
+
+
+class BodyPairs(NamedTuple):
+    """M pairs of bodies: numbers of the vehicles under test, shape (M,), their bodies and the others, in columns."""
+
+    vehicles: IntArray
+    own: Body
+    other: Body
 
 
 def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
@@ -114,8 +122,8 @@ class World(Protocol):
     def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
         """Simulate a step in which the vehicles whose runs are open reach `speeds` [m/s], shape (N,)."""
 
-    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
-        """The bodies of vehicles that hit somebody in this step, and of those whom they hit, both in columns."""
+    def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
+        """Vehicles that hit somebody in this step, each with the body that it hit."""
 
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
@@ -131,10 +139,8 @@ class SceneWorld(World, ScenariosWorld, Protocol):
     def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory."""
 
-    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        """Each of these vehicles with each other actor of its scene: numbers of the vehicles, shape (M,), their bodies
-        and those of the actors, both in columns.
-        """
+    def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
+        """Each of these vehicles with each other actor of its scene."""
 
 
 TOUCH = 1e-3
@@ -165,8 +171,7 @@ class Contacts:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by vehicle number."""
         new_copies = [copy for copy in hits if not self.first.side[copy]]
         if new_copies:
-            own, other = world.bodies(new_copies)
-            self._locate(new_copies, own, other, scene)
+            self._locate(world.bodies(new_copies), scene)
         side = self.first.side
         return {copy: speed for copy, speed in hits.items() if not self._is_tested[copy] or side[copy] == FRONT}
 
@@ -186,21 +191,23 @@ class Contacts:
         self._was_inside = is_inside
         if not np.count_nonzero(enters):
             return
-        vehicles, own, other = world.bodies_around(np.flatnonzero(enters).tolist())
-        if not len(vehicles):
+        around = world.bodies_around(np.flatnonzero(enters).tolist())
+        if not len(around.vehicles):
             return
-        depth = find_overlaps(own, other)
-        is_missed = (depth > TOUCH_OVERLAP) & (find_touches(own, other)[0] == FRONT)
+        depth = find_overlaps(around.own, around.other)
+        is_missed = (depth > TOUCH_OVERLAP) & (find_touches(around.own, around.other).side == FRONT)
         if is_missed.any():
             inside = f"the front of the vehicle under test is {depth[is_missed].max():.2f} m inside a body"
             raise InputError(NETWORK_KEY, f"at {time:g} s {inside}, and SUMO reports no collision", COLLISION_PLACES)
 
-    def _locate(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
-        side, age, distance_behind_front = find_touches(own, other)
-        lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * age
-        is_at_end = (side == FRONT) | (side == REAR)
-        share = np.where(is_at_end, lateral / own.width + 0.5, distance_behind_front / own.length)
-        self.first.side[copies] = side
+    def _locate(self, pairs: BodyPairs, scene: Scene) -> None:
+        copies, own, other = pairs
+        touches = find_touches(own, other)
+        lateral_speed = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies]
+        lateral = scene.lateral[copies] - lateral_speed * touches.age
+        is_at_end = (touches.side == FRONT) | (touches.side == REAR)
+        share = np.where(is_at_end, lateral / own.width + 0.5, touches.behind_front / own.length)
+        self.first.side[copies] = touches.side
         self.first.speed[copies] = other.speed * np.round((own.along * other.along).sum(axis=1), COSINE_DECIMALS)
         self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
@@ -245,11 +252,18 @@ def _square_outside(x: Quantity, y: Quantity, length: Quantity, width: Quantity)
     return dx * dx + dy * dy
 
 
-def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:
-    """The first touches of M overlapping pairs, a vehicle's own body and another, if their velocities were constant.
+class Touches(NamedTuple):
+    """First touches of M vehicles: the touched side, the time since then [s], and how far the other body's middle was
+    then behind the vehicle's front [m].
+    """
 
-    Returns the touched side of the own body, the time since the touch [s], and how far the other body's middle was then
-    behind the own front [m].
+    side: npt.NDArray[np.str_]
+    age: FloatArray
+    behind_front: FloatArray
+
+
+def find_touches(own: Body, other: Body) -> Touches:
+    """The first touches of M overlapping pairs, a vehicle's own body and another, if their velocities were constant.
 
     Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin
     a|) / 2 along the own body and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
@@ -268,7 +282,7 @@ def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArr
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
     ahead, left = distance > 0
     side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
-    return side, age, own.length / 2 - (distance[0] + age * speed[0])
+    return Touches(side, age, own.length / 2 - (distance[0] + age * speed[0]))
 
 
 def find_overlaps(own: Body, other: Body) -> FloatArray:

@@ -11,7 +11,7 @@ from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Int
 from safevar_sumo.scenarios import Scene, Track, TrackScenario
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import SCREEN
-from safevar_sumo.sumo.bodies import TOUCH, Body, Motion, distance_between, distance_covered, find_overlaps
+from safevar_sumo.sumo.bodies import TOUCH, Body, BodyPairs, Motion, distance_between, distance_covered, find_overlaps
 from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
 from safevar_sumo.vehicles import SumoType
 
@@ -178,13 +178,13 @@ class Stage:
         touched = np.flatnonzero(self._struck >= 0)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
 
-    def bodies(self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray) -> tuple[Body, Body]:
-        """The bodies of vehicles that touch somebody, and of those whom they touch, in lane coordinates."""
+    def bodies(self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray) -> BodyPairs:
+        """Vehicles that touch somebody and those whom they touch, in lane coordinates."""
         numbers = np.asarray(vehicles)
         others = [self._body(k, numbers) for k in range(len(self._bodies))]
         struck = self._struck[numbers]
         columns = (np.stack(column)[struck, np.arange(len(numbers))] for column in zip(*others, strict=True))
-        return self._own(front[numbers], speed[numbers]), Body(*columns)
+        return BodyPairs(numbers, self._own(front[numbers], speed[numbers]), Body(*columns))
 
     def _own(self, front: FloatArray, speed: FloatArray) -> Body:
         return Body.behind(
@@ -294,7 +294,7 @@ class LaneWorld:
         fronts[:, 0] = self._front
         return Motion(fronts, self._speed, hits)
 
-    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
+    def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         return self._stage.bodies(vehicles, self._front, self._speed)
 
     def vehicle_length(self, actor: str) -> float:

@@ -16,7 +16,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
-from safevar_sumo.sumo.bodies import Body, Motion
+from safevar_sumo.sumo.bodies import BodyPairs, Motion
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.moving import Column, row
 from safevar_sumo.sumo.network import Network, copied_network
@@ -108,7 +108,7 @@ class StageWorld(SumoWorld):
         super().step(speeds, is_open)
         return self._checked(self._lane.step(speeds, is_open))
 
-    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
+    def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         return self._lane.bodies(vehicles)
 
     def _hits(self, is_open: BoolArray) -> dict[int, float]:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.records import BoolArray, FloatArray, IntArray
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame, lane_through
-from safevar_sumo.sumo.bodies import Body, Film, Motion
+from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, Motion
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
@@ -172,20 +172,20 @@ class SumoWorld:
                     speeds[copy], self._struck_ids[copy] = speed, other_id
         return speeds
 
-    def bodies(self, vehicles: Sequence[int]) -> tuple[Body, Body]:
-        return (
-            Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in vehicles]),
-            Body.columns([self._body_of(self._struck_ids[copy]) for copy in vehicles]),
-        )
+    def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
+        return self._pairs([(copy, self._struck_ids[copy]) for copy in vehicles])
 
-    def bodies_around(self, vehicles: Sequence[int]) -> tuple[IntArray, Body, Body]:
-        own_ids = self.ids(VUT)
-        wanted = {*vehicles}
+    def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
         ids = [id_ for domain in (self.api.vehicle, self.api.person) for id_ in domain.getIDList()]
-        pairs = [(copy, id_) for id_ in ids if (copy := copy_and_name(id_)[0]) in wanted and id_ != own_ids[copy]]
-        copies = [copy for copy, _ in pairs]
-        own = Body.columns([self._body_of(own_ids[copy]) for copy in copies])
-        return np.array(copies), own, Body.columns([self._body_of(id_) for _, id_ in pairs])
+        pairs = [(copy_and_name(id_)[0], id_) for id_ in ids if id_ not in self._copy_of]
+        return self._pairs([(copy, id_) for copy, id_ in pairs if copy in vehicles])
+
+    def _pairs(self, pairs: Sequence[tuple[int, str]]) -> BodyPairs:
+        """Vehicles under test by their copy, each with an actor by its id."""
+        own = Body.columns([self._body_of(self.ids(VUT)[copy]) for copy, _ in pairs])
+        return BodyPairs(
+            np.array([copy for copy, _ in pairs]), own, Body.columns([self._body_of(id_) for _, id_ in pairs])
+        )
 
     def _body_of(self, id_: str) -> Body:
         domain, (_, length, width) = self._domain_of(id_), self.actor_size(id_)

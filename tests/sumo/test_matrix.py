@@ -171,8 +171,8 @@ def test_bodies_touch_at_the_side_where_the_overlap_began_last(
 ) -> None:
     own = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0)
     other = Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
-    side, age, distance_behind_front = find_touches(Body.columns([own]), Body.columns([other]))
-    assert side == contact[0]
-    assert age == pytest.approx(contact[1])
+    touches = find_touches(Body.columns([own]), Body.columns([other]))
+    assert touches.side == contact[0]
+    assert touches.age == pytest.approx(contact[1])
     if contact[2] is not None:
-        assert distance_behind_front == pytest.approx(contact[2] - 0.2)
+        assert touches.behind_front == pytest.approx(contact[2] - 0.2)
