@@ -117,7 +117,8 @@ def drive_all(
             lane = LaneWorld(stage, _start_speeds(fleet.points, n), stage.step)
             return drive(fleet, np.tile(vehicles, (len(points), 1)), lane, stage, listen)
         (scenario,) = (point.scenario for point in points if isinstance(point.scenario, WorldScenario))
-        (scene,) = (scene for scene in system.scenes.of([scenario]) if isinstance(scene, Recording))
+        scene = system.scenes.of(scenario)
+        assert isinstance(scene, Recording)
         size = n
         if fleet.points[0].scenario is not scenario:  # each encounter has a scene of its own
             size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])

@@ -32,12 +32,12 @@ from safevar_sumo.sumo.network import (
     is_shipped,
     open_network,
     options_of,
-    stage_networks,
+    stage_network,
     sumo_version,
 )
 from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
 
-SCENES_FILE = "scenes.msgpack"
+SCENE_FILE = "scene.msgpack"
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 STRAIGHTNESS = 1e-6
@@ -113,8 +113,8 @@ class Scenes:
         """Time step of a scenario [s]."""
         return self.step or step_of(options_of(open_network(scenario.network).path(OPTIONS_FILE)))
 
-    def of(self, scenarios: Sequence[WorldScenario]) -> list[Recording | str]:
-        """Each scenario's scene, or the reason why SUMO must simulate it.
+    def of(self, scenario: WorldScenario) -> Recording | str:
+        """A scenario's scene, or the reason why SUMO must simulate it.
 
         SUMO plays a scene once; scenes of shipped scenarios are also kept in the user's cache folder.
 
@@ -125,52 +125,35 @@ class Scenes:
         UserCodeError
             If a user's scenario fails.
         """
-        missing = dict.fromkeys(scenario for scenario in scenarios if scenario not in self._recorded)
-        reasons = {scenario: _reason_against_recording(scenario) for scenario in missing}
-        new = [scenario for scenario, reason in reasons.items() if not reason]
-        with user_errors(self._source):
-            networks = stage_networks(new)
-            keys = [(scenario, network, self.step) for scenario, network in zip(new, networks, strict=True)]
-            self._recorded |= reasons | dict(zip(new, _recordings_of(keys) if keys else [], strict=True))
-        return [self._recorded[scenario] for scenario in scenarios]
+        if scenario not in self._recorded:
+            with user_errors(self._source):
+                self._recorded[scenario] = _scene_of(scenario, self.step)
+        return self._recorded[scenario]
 
     def reason_for_sumo(self, points: Sequence[Point]) -> str:
         """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; "" if scenes suffice."""
-        played = [point.scenario for point in points if isinstance(point.scenario, WorldScenario)]
-        return next((scene for scene in self.of(played) if isinstance(scene, str)), "")
+        scenes = (self.of(point.scenario) for point in points if isinstance(point.scenario, WorldScenario))
+        return next((scene for scene in scenes if isinstance(scene, str)), "")
 
 
-def _reason_against_recording(scenario: WorldScenario) -> str:
+def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
+    """A scene, read from the cache or played by SUMO with the study's time step [s]."""
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
     # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
     if not scenario.is_user_code and not is_shipped(scenario.network):
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
-    return ""
-
-
-_Key = tuple[WorldScenario, Network, float | None]
-"""A scenario, its network, and the study's time step [s]."""
-
-
-def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
-    """The scenes, read from the cache or played by SUMO."""
-
-    def play() -> list[Recording | str]:
-        return [_play(*key) for key in keys]
-
-    if any(scenario.is_user_code for scenario, _, _ in keys):
-        return play()
-    inputs = [
-        (type(scenario).__name__, to_builtins(scenario), network.digests, step) for scenario, network, step in keys
-    ]
+    network = stage_network(scenario)
+    if scenario.is_user_code:
+        return _play(scenario, network, step)
+    inputs = (type(scenario).__name__, to_builtins(scenario), network.digests, step)
     digest = sha256(_code_bytes() + repr(inputs).encode())
 
     def build(folder: Path) -> None:
-        (folder / SCENES_FILE).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
+        (folder / SCENE_FILE).write_bytes(msgpack.encode(_play(scenario, network, step), enc_hook=_packed_array))
 
-    file = ensure_cached(f"scenes-{digest.hexdigest()[:16]}", SCENES_FILE, build)
-    return msgpack.decode(file.read_bytes(), type=list[Recording | str], dec_hook=_unpacked_array)
+    file = ensure_cached(f"scene-{digest.hexdigest()[:16]}", SCENE_FILE, build)
+    return msgpack.decode(file.read_bytes(), type=Recording | str, dec_hook=_unpacked_array)
 
 
 @cache

@@ -22,7 +22,7 @@ from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
 from safevar_sumo.sumo.models import create_ads, create_scenario, create_vehicle, matrix_points
-from safevar_sumo.sumo.network import copied_network, stage_networks
+from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
@@ -85,7 +85,21 @@ class System:
     @cached_property
     def contact(self) -> float:
         """The safety degree at which bodies touch [m]: 0, or half of both lengths between middles."""
-        return _contact_of(self.points[0].scenario, self.scenes)
+        scenario = self.points[0].scenario
+        if not scenario.centre_to_centre:
+            return 0.0
+        assert isinstance(scenario, WorldScenario)
+        recording = self.scenes.of(scenario)
+        with ExitStack() as stack:
+            world: SceneWorld
+            if isinstance(recording, str):
+                network = copied_network(stage_network(scenario), 1)
+                world = stack.enter_context(open_world(network, 1, self.scenes.step))
+                world.enter(None)
+            else:
+                world = RecordedWorld(recording, 1)
+            scene, _ = scenario.observe(world, world.step_length, world.begin(scenario))
+            return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
 
     def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
         """The system at the encounters of N settings, shape (N, n): its only point, with arrays as the parameters that
@@ -223,13 +237,10 @@ def _assemble(study: Study) -> System:
         scenario, weather, *_ = encounter(points[0], original)
         matrix = tuple(encounter(point, original) for point in matrix)
     region = region_of(study)
-    scenes = Scenes(study.step_length)
-    if study.scenario.search:
-        measuring = _with_safe_original(study, measuring, scenes, scenario)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
     if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
-    return System(
+    system = System(
         characteristics=region.characteristics,
         vehicle=vehicle,
         ads=ads,
@@ -240,33 +251,14 @@ def _assemble(study: Study) -> System:
         measuring=measuring,
         region=region,
         source=study.source,
-        scenes=scenes,
+        scenes=Scenes(study.step_length),
         matrix=matrix,
         rater=rater,
         time_limit=study.search.time_limit,
         aggregate=aggregate,
     )
-
-
-def _contact_of(scenario: Scenario, scenes: Scenes) -> float:
-    """The safety degree at which bodies touch [m]: 0, or half of both lengths between middles."""
-    if not scenario.centre_to_centre:
-        return 0.0
-    assert isinstance(scenario, WorldScenario)
-    (recording,) = scenes.of([scenario])
-    with ExitStack() as stack:
-        world: SceneWorld
-        if isinstance(recording, str):
-            (network,) = stage_networks([scenario])
-            world = stack.enter_context(open_world(copied_network(network, 1), 1, scenes.step))
-            world.enter(None)
-        else:
-            world = RecordedWorld(recording, 1)
-        scene, _ = scenario.observe(world, world.step_length, world.begin(scenario))
-        return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
-
-
-def _with_safe_original(study: Study, measuring: Measuring, scenes: Scenes, scenario: Scenario) -> Measuring:
-    """The scoring of a study that searches its scenario: which safety degree the original vehicle must have."""
-    limit = study.scenario.margin + _contact_of(scenario, scenes)
-    return measuring._replace(scoring=msgspec.structs.replace(measuring.scoring, safe_original=limit))
+    if not study.scenario.search:
+        return system
+    limit = study.scenario.margin + system.contact
+    scoring = msgspec.structs.replace(measuring.scoring, safe_original=limit)
+    return replace(system, measuring=measuring._replace(scoring=scoring))

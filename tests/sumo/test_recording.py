@@ -85,10 +85,10 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
     scenario = assemble(load_study("sun")).scenario
 
     def scene() -> str:
-        return repr(Scenes().of([scenario]))
+        return repr(Scenes().of(scenario))
 
     played = scene()
-    assert [*tmp_path.glob("networks/scenes-*/scenes.msgpack")]
+    assert [*tmp_path.glob("networks/scene-*/scene.msgpack")]
     monkeypatch.setattr(recording, "_play", None)
     assert scene() == played
 
