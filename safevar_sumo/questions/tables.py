@@ -50,13 +50,15 @@ Columns = dict[str, Column | str]
 
 
 class Wide(NamedTuple):
-    """How readers see a long table: one for each column of `values`, in which a row stands for each combination of
-    `labels` and a column for each value of `by`.
+    """How readers see a long table: one for each column of `values`, or pair of columns that hold the ends of an
+    interval, in which a row stands for each combination of `labels` and a column for each value of `by`,
+    which stands in its `head`.
     """
 
     labels: Sequence[str]
     by: str
     values: Sequence[str]
+    head: str = "{}"
 
 
 def tabulate(
@@ -132,13 +134,16 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
         return
     heads, title, words = frame[wide.by].unique(), frame.attrs["title"], frame.attrs["words"]
     for value in wide.values:
+        ends = ("",) if value in frame else (LOW, HIGH)
+        column = columns[f"{value}{ends[0]}"]
         shown = {label: columns[label] for label in wide.labels}
-        shown |= {words.get(str(head), str(head)): columns[value]._replace(unit="") for head in heads}
+        names = [words.get(str(head), wide.head.format(head)) for head in heads]
+        shown |= {f"{name}{end}": column._replace(unit="") for name in names for end in ends}
         rows = [
-            (*key, *group.set_index(wide.by)[value].reindex(heads))
+            (*key, *group.set_index(wide.by)[[f"{value}{end}" for end in ends]].reindex(heads).to_numpy().ravel())
             for key, group in frame.groupby([*wide.labels], sort=False)
         ]
-        heading = title if len(wide.values) == 1 else f"{title}: {columns[value].meaning}"
+        heading = title if len(wide.values) == 1 else f"{title}: {column.meaning}"
         yield f"{name}-{value}", tabulate(heading, shown, rows, words=words)
 
 
@@ -170,9 +175,10 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         texts = [words.get(text, text) for text in texts]
         if ends[0] in frame:
             pairs = frame[ends].itertuples(index=False)
-            intervals = ["" if low == high else _interval_text(low, high, column.number_format) for low, high in pairs]
-            own = zip(texts, intervals, strict=True)
-            texts = [f"{text} ({interval})" if interval and text != "-" else text for text, interval in own]
+            intervals = [_interval_text(low, high, column.number_format) for low, high in pairs]
+            is_exact = frame[ends[0]] == frame[ends[1]]
+            own = zip(texts, intervals, is_exact, strict=True)
+            texts = [text if exact or text == "-" else f"{text} ({interval})" for text, interval, exact in own]
             texts = texts if base == name else intervals
         unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
         is_number = pd.api.types.is_numeric_dtype(frame[name])
@@ -182,6 +188,8 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
     """An interval, of which an end may be missing, for readers."""
     texts = text_of(low, number_format), text_of(high, number_format)
+    if low == high:
+        return texts[0]
     forms = {(True, True): "-", (True, False): "up to {1}", (False, True): "from {0}"}
     return forms.get((texts[0] == "-", texts[1] == "-"), "{0} to {1}").format(*texts)
 

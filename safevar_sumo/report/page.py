@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -25,10 +25,12 @@ from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.subject import Results, case_at, changes_since
+from safevar_sumo.questions.tolerance.by_parameter import usual_values
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, commands, facts, replays, tested, trust
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
+from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
@@ -113,7 +115,7 @@ def report(
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     subjects = cases_by(at_point, unsafe, jobs, show_no_progress)
     asked = [
-        [with_criterion(text, unsafe) for text in alone or ([] if ask else usual_questions(case, path, point))]
+        [with_criterion(text, unsafe) for text in alone or ([] if ask else usual_questions(case, path, point, unsafe))]
         for case, path in zip(subjects, paths, strict=True)
     ]
     joint = [with_criterion(text, unsafe) for text in joint]
@@ -152,16 +154,19 @@ def report(
     return out
 
 
-def usual_questions(case: Case, directory: Path, point: str | None = None) -> list[str]:
+def usual_questions(case: Case, directory: Path, point: str | None = None, unsafe: Criterion = None) -> list[str]:
     """The questions of a page about results; that of a rated study is about its points, with the variant that loses
-    some by the fewest changes.
+    some by the fewest changes. Where the study has speeds, the second asks the limits up to some of them.
     """
     if is_rated(case.study) and point is None:
         any_unsafe = case.unsafe.rows(case.solutions).any()
         handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]
+    first, *later = USUAL_QUESTIONS
+    speeds = usual_values(case.study, SPEED_DIMENSION) if point is None and unsafe is None else []
+    by_speed = [f"{first} --by {SPEED_DIMENSION}={','.join(f'{value:g}' for value in speeds)}"] if speeds else []
     promises = case.study.repair.promise or case.study.limits
-    return [*USUAL_QUESTIONS, *(["repair"] if promises else [])]
+    return [first, *by_speed, *later, *(["repair"] if promises else [])]
 
 
 def answer_to(
@@ -228,10 +233,12 @@ def make_page(
 
 
 def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonObject:
-    """One study for the template. On its front stand all verdicts and the first table of the first answer."""
+    """One study for the template. On its front stand all verdicts, the first of them with its first table; answers to
+    the same question follow it with theirs.
+    """
     anchor, answers, trusted = f"study-{number}", study.answers, trust(study)
     sections = list(_sections(anchor, [*answers, tested(study), trusted]))
-    front = next(iter(answers), trusted)
+    leading = [*takewhile(lambda answer: answer.question == answers[0].question, answers)] or [trusted]
     return {
         "name": study.case.name,
         "title": study.case.study.title,
@@ -240,23 +247,35 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
         "shortfall": study.case.shortfall,
         "later_changes": study.later_changes,
         "facts": facts(study),
-        "front": Markup(replace(front, tables=dict(list(front.tables.items())[:1])).render("html")),
-        "verdicts": [*sections[1 : len(answers)], sections[-1]],
+        "front": [_on_front(answer) for answer in leading],
+        "verdicts": [*sections[len(leading) : len(answers)], sections[-1]],
         "replays": list(replays(study, progress)),
         "sections": sections,
     }
 
 
+def _on_front(answer: Answer) -> Markup:
+    """An answer with its first table alone."""
+    return Markup(replace(answer, tables=dict([*answer.tables.items()][:1])).render("html"))
+
+
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
-    """Answers for the template: the heading, the verdict, the answer in HTML, and its figure if it has one."""
-    for answer in answers:
+    """Answers for the template: the heading, the verdict, the answer in HTML, and its figure if it has one. The second
+    answer to a question has the title of its first table as heading.
+    """
+    names = set[str]()
+    for number, answer in enumerate(answers, 1):
+        name = answer.question
+        if name in names and answer.tables:
+            name = answer.table().attrs["title"].partition(",")[0]
+        names.add(name)
         try:
             picture = _picture(answer.figure())
         except InputError:  # it has nothing to draw
             picture = None
         yield {
-            "anchor": f"{anchor}-{re.sub('[^a-z]', '-', answer.question)}",
-            "heading": answer.question[:1].upper() + answer.question[1:],
+            "anchor": f"{anchor}-{number}-{re.sub('[^a-z]', '-', name.lower())}",
+            "heading": name[:1].upper() + name[1:],
             "verdict": answer.verdict,
             "html": Markup(answer.render("html")),
             "picture": picture,

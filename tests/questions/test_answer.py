@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 import safevar_sumo as sv
 from safevar_sumo.cli.program import COMMANDS, commands, first_sentence
-from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, Wide, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.words import list_of_changes
 from safevar_sumo.study import load_study
@@ -75,6 +75,17 @@ def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
         assert "Many" not in long.render(form)
     assert len(long.render("csv", "many").splitlines()) == MAX_ROWS + 2
     assert "--table" not in ANSWER.render("text") + ANSWER.render("html")
+
+
+def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
+    """Part a holds up to 20: from 1 to 2; to 30 it has no room. Of part b one end is known, and nothing up to 30."""
+    columns = {"part": "it", "by": "value", "length_low": Column("m", "least"), "length_high": Column("m", "largest")}
+    rows = [("a", 20.0, 1.0, 2.0), ("a", 30.0, 1.5, 1.5), ("b", 20.0, np.nan, 2.0), ("b", 30.0, np.nan, np.nan)]
+    frame = tabulate("Lengths", columns, rows, wide=Wide(["part"], "by", ["length"], "to {:g} km/h"))
+    page = replace(ANSWER, tables={"lengths": frame}).render("html")
+    assert re.findall("<th.*?>([^<]*)</th>", page) == ["part", "to 20 km/h", "to 30 km/h"]
+    assert re.findall("<td.*?>([^<]*)</td>", page) == ["a", "1 to 2", "1.5", "b", "up to 2", "-"]
+    assert len(replace(ANSWER, tables={"lengths": frame}).to_dict()["tables"]["lengths"]["rows"]) == 4
 
 
 def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:

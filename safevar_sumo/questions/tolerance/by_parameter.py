@@ -19,6 +19,8 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 FORM = "NAME=V1,V2,...: a searched parameter or an axis of the matrix, and values of it"
+MAX_VALUES = 4
+"""Largest number of values of a question that states none."""
 
 
 class Parameter(NamedTuple):
@@ -105,6 +107,23 @@ def parameters_of(study: Study) -> list[str]:
     tests = [] if study.matrix is None else study.matrix.tests
     axes = [name for test in tests for name, values in test.over.items() if all(map(_is_number, values))]
     return [*dict.fromkeys([*study.scenario.search, *axes])]
+
+
+def usual_values(study: Study, name: str) -> list[float]:
+    """Up to `MAX_VALUES` values of a searched parameter or an axis, the least first, for a question that states none:
+    of a domain the middle below the original's value, that value and the upper end; of an axis its points. None if the
+    study does not vary it.
+    """
+    if name not in parameters_of(study):
+        return []
+    if name in study.scenario.search:
+        domain = study.scenario.search[name]
+        values = {(domain.lower + domain.original) / 2, domain.original, domain.upper}
+        return sorted(value for value in values if value > domain.lower)
+    points = [points for _, points in _points_by_test(study, name) if points]
+    highest = min(map(max, points))
+    reached = sorted({value for values in points for value in values if value <= highest})
+    return reached[:: len(reached) // -MAX_VALUES][::-1]
 
 
 def study_between(study: Study, by: Parameter, low: float | None, high: float, *, at_end: bool = False) -> Study:

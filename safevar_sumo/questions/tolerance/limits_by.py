@@ -12,7 +12,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tables import Column, Columns, Wide, tabulate
 from safevar_sumo.questions.tolerance.alone import ATTACK_SHARE, AloneLimit
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
 from safevar_sumo.questions.tolerance.levels import Level, LevelSearch, Reach
@@ -42,7 +42,13 @@ def answer_by(search: LevelSearch, known: FloatArray, is_together: bool) -> Answ
         reach = search.reach(levels)
     scopes = [by.scope(study, level.value, between=search.budget > 0) for level in levels]
     is_kept = not limits or all(level.alone is not None and not level.failures for level in levels)
-    frame = tabulate(_title(by), columns_by(by), _rows(search, levels, scopes))
+    values = ["alone", *(["together"] if is_together else []), *(["kept"] if limits else [])]
+    frame = tabulate(
+        _title(by),
+        columns_by(by),
+        _rows(search, levels, scopes),
+        wide=Wide(["characteristic", "unit", "original"], f"by_{by.name}", values, f"to {{:g}}{unit_text(by.unit)}"),
+    )
     sentences = [*_sentences(search, levels, frame, reach), f"Scope: {scopes[-1]}."]
     return Answer(
         question="tolerance",
