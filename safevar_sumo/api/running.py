@@ -14,7 +14,6 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.records import Evaluations
-from safevar_sumo.search import PymooAlgorithm
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.system import System
@@ -108,7 +107,6 @@ def load_for_search(study: StudyLike) -> tuple[Study, System]:
     problem = problem_of(loaded_study, system, Evaluations.none(len(characteristics), METRICS))
     for name in loaded_study.search.labels:
         algorithm = algorithm_of(name, loaded_study)
-        if isinstance(algorithm, PymooAlgorithm):
-            with about(loaded_study.source):
-                algorithm.try_out(problem)
+        with about(loaded_study.source):
+            algorithm.try_out(problem)
     return loaded_study, system

@@ -29,7 +29,7 @@ from safevar_sumo.replay.comparison import compare_setting, list_differences, wh
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
-from safevar_sumo.scenarios import OpenScenario, degree_note, pre_crash_sentence
+from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import at_point, point_record, simulate_all_points, vehicle_remarks
@@ -229,12 +229,12 @@ def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
     """Points at which the driving system acts while others still move by a vehicle that keeps its speed."""
     if any(np.any(point.scenario.depends_until > 0) for point in system.points):
         for result in simulate_all_points(system, setting[np.newaxis]):
-            (acted,), scenario = result.runs.acted_early, result.point.scenario
-            if np.isfinite(acted) and isinstance(scenario, OpenScenario):
+            (acted,) = result.runs.acted_early
+            if np.isfinite(acted):
                 at = f"{result.point.name}: " if result.point.name else ""
                 yield (
-                    f"{at}invalid test: {scenario.dependence} depends on an Ego that keeps its speed, and the driving "
-                    f"system acts at {acted:.1f} s: the file's other simulators would show another encounter."
+                    f"{at}invalid test: {result.point.scenario.dependence}, and the driving system acts at "
+                    f"{acted:.1f} s: other simulators would show another encounter."
                 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
@@ -154,9 +154,9 @@ class Scenario:
         tolerance before the ADS brakes is an invalid test.
     is_hit_in_front
         Whether only contacts at the vehicle's front are collisions.
-    depends_until
-        Time until which the others move as if the vehicle kept its speed [s]: a run in which the ADS acts before is an
-        invalid test.
+    depends_until, dependence
+        Time until which the others move as if the vehicle kept its speed [s], and a sentence on it: a run in which the
+        ADS acts before is an invalid test.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     is_user_code
@@ -182,10 +182,13 @@ class Scenario:
         def test_speed(self) -> float | None: ...
         @property
         def depends_until(self) -> float: ...
+        @property
+        def dependence(self) -> str: ...
     else:
         pre_crash = ""
         test_speed = None
         depends_until = 0.0
+        dependence = "others move as if the vehicle kept its speed"
 
     @property
     def is_hit_in_front(self) -> bool:
@@ -208,6 +211,9 @@ class Scenario:
     def actors(self, roads: Roads) -> XmlChanges:
         """Changes to the network's traffic."""
         return {}
+
+    def read_files(self, folders: Sequence[str]) -> None:
+        """Read the files that parameters name, beside the study; by default there are none."""
 
     def check(self) -> None:
         """Refuse parameters of a study's test, by an `InputError`; those of searched encounters are not checked."""

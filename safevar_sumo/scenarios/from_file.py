@@ -10,6 +10,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import STEP, Moved, Played, play, text_of
+from safevar_sumo.output import file_beside
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.tracks import VUT_LENGTH, VUT_WIDTH, Track, TrackScenario
 from safevar_sumo.study import FreeParameter
@@ -155,9 +156,14 @@ class OpenScenario(TrackScenario):
 
     @property
     def dependence(self) -> str:
-        """What depends on Ego, and until when, in words."""
+        """What depends on Ego, and until when."""
         played = self._scenes[0].played
-        return f"{played.dependence} at {played.depends_until:.1f} s"
+        return f"{played.dependence} at {played.depends_until:.1f} s depends on an Ego that keeps its speed"
+
+    def read_files(self, folders: Sequence[str]) -> None:
+        """The file, which is refused if it has what nobody can play."""
+        self.file = file_beside(self.name, folders) or self.file
+        self.remarks()
 
     def remarks(self) -> list[str]:
         """What of the file has no effect here, or never happens, and that the vehicle has Ego's body."""

@@ -127,3 +127,6 @@ class Algorithm:
         same settings again. Yielded settings are in the domains and filtered. The result consists of valid evaluations
         (`problem.scoring.valid`) that the run received.
         """
+
+    def try_out(self, problem: Problem) -> None:
+        """Refuse, by an `InputError`, parameters with which a search fails; by default none."""

@@ -16,7 +16,7 @@ from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds
 from safevar_sumo.errors import InputError, about, check_name, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of
-from safevar_sumo.scenarios import SCENARIOS, OpenScenario, Point, Scenario, TrackScenario, WorldScenario, weather_of
+from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, TrackScenario, WorldScenario, weather_of
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
 from safevar_sumo.study import MatrixTest, ModelTable, Study, VehicleTable, user_code_names
@@ -144,9 +144,7 @@ def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     if member.code is not None:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
         check_fields(member.code, scenario, **further)
-    if isinstance(scenario, OpenScenario):
-        scenario.file = file_beside(scenario.name, lookup.folders) or scenario.file
-        scenario.remarks()  # refuses what the file has and nobody can play
+    scenario.read_files(lookup.folders)
     return _locate_network(scenario, lookup.folders)
 
 

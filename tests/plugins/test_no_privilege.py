@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, Unsafe, time_to_collision
 from safevar_sumo.protocol.cells import MODELS
@@ -24,7 +26,7 @@ from safevar_sumo.study import Study, free_parameters, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import searched
+from tests.in_process import ROOT, InlinePool, searched
 from tests.made_up import drawn
 
 BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
@@ -81,7 +83,7 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(n
     assert_equal(base, copy)
 
 
-@pytest.mark.parametrize("name", ["crossing", "along", "car_to_car", "pedestrian_crossing", "lead_vehicle_stopped"])
+@pytest.mark.parametrize("name", sorted(SCENARIOS.keys() - {"openscenario", "stop"}))  # which have no such scenes
 def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_tmp: Path) -> None:
     names = []
     for model in (name, copied(SCENARIOS[name], in_tmp)):
@@ -157,6 +159,63 @@ def test_a_rating_of_scenarios_in_a_users_file_is_the_same(in_tmp: Path, monkeyp
         points.append(evaluate(system, drawn(system, 2, 2)).column("rating_points"))
     np.testing.assert_array_equal(*points)
     assert points[0].max() > 0
+
+
+def with_own_models(study: Study, folder: Path) -> Study:
+    """A study with copies of its scenario, vehicle and driving system."""
+    tables = {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}
+    for key, shipped in tables.items():
+        table = getattr(study, key)
+        own = msgspec.structs.replace(table, model=copied(shipped[table.model], folder))
+        study = msgspec.structs.replace(study, **{key: own})
+    return study
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["smoke", "sun_joint", "alks_joint"])
+def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(name: str, in_tmp: Path) -> None:
+    ours = load_study(name, search={"algorithms": ["nsga2"], "runs": 1, "population": 10, "evaluations": 30})
+    for number, study in enumerate((ours, with_own_models(ours, in_tmp))):
+        searched(study, in_tmp / f"results{number}")
+    solutions = [(in_tmp / f"results{number}" / "solutions.csv").read_bytes() for number in range(2)]
+    assert solutions[0] == solutions[1]
+
+
+@pytest.mark.slow
+def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But for the simulations that find out whether a user's system drives many vehicles with different parameters."""
+    monkeypatch.setattr("safevar_sumo.questions.repair.attack.BUDGET", 300)
+    monkeypatch.setattr("safevar_sumo.questions.repair.SOBOL_VEHICLES", 32)
+    scenario = {"model": "crossing", "parameters": {"test": "CPFA", "speed": 40.0}}
+    change = {"response_time": {"lower": 0.0, "upper": 1.5, "unit": "s", "meaning": "it plans with"}}
+    ours = load_study("wear", matrix=None, scenario=scenario, repair=change)
+    answers = []
+    for study in (ours, with_own_models(ours, in_tmp)):
+        slower = msgspec.structs.replace(
+            study, ads=msgspec.structs.replace(study.ads, parameters={"response_time": 0.6})
+        )
+        worn = ["brakeTorque >= 0.5"]
+        repaired = sv.repair(study, promise=worn, change=["response_time"], fits=0, pool=InlinePool())
+        compared = sv.compare(study, slower, samples=16, pool=InlinePool())
+        answers.append([(one.verdict, {**one.numbers, "simulations": 0}) for one in (repaired, compared)])
+    assert answers[0] == answers[1]
+    assert answers[0][0][1]["repairs"] == 1
+    assert answers[0][1][1]["only_a_unsafe"] > 0
+
+
+def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() -> None:
+    shipped = {
+        model.__name__: Path(inspect.getfile(model))
+        for family in (SCENARIOS, VEHICLES, ADS, ALGORITHMS)
+        for model in family.values()
+    }
+    questions = re.compile(rf"is(?:instance|subclass)\([^:]*?, [^:]*?\b({'|'.join(shipped)})\b")
+    files = {file: questions.findall(file.read_text()) for file in (ROOT / "safevar_sumo").rglob("*.py")}
+    asked = [(file, name) for file, names in files.items() for name in names]
+    assert asked != [], "some ask in their own file"
+    assert [(file, name) for file, name in asked if shipped[name] != file] == []
 
 
 @pytest.mark.slow
