@@ -103,17 +103,19 @@ class Parameter(NamedTuple):
 
 def declared(element: Element) -> list[Parameter]:
     """The parameters that an element declares."""
-    return [
-        Parameter(
-            attribute(each, "name"),
-            attribute(each, "value"),
-            tuple(
-                tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
-                for group in each.findall("ConstraintGroup")
-            ),
-        )
-        for each in element.findall("ParameterDeclarations/ParameterDeclaration")
-    ]
+    found = element.find("ParameterDeclarations")
+    return [] if found is None else [_parameter(each) for each in found.findall("ParameterDeclaration")]
+
+
+def _parameter(each: Element) -> Parameter:
+    return Parameter(
+        attribute(each, "name"),
+        attribute(each, "value"),
+        tuple(
+            tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
+            for group in each.findall("ConstraintGroup")
+        ),
+    )
 
 
 def values_of(parameters: Sequence[Parameter], given: Values, outer: Values) -> dict[str, str]:

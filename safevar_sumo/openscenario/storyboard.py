@@ -39,8 +39,8 @@ MAX_TURN = 0.01
 
 
 class Moved(NamedTuple):
-    """How an entity moves: its shape, the places of its middle, directions and speeds at all samples, and the time at
-    which it is deleted [s].
+    """How an entity moves: its shape, the places of its middle, directions and speeds at samples, and the time at which
+    it is deleted [s].
     """
 
     name: str
@@ -395,18 +395,20 @@ class Player:
         return found
 
 
-def play(file: str, values: Mapping[str, str], ego: str = "Ego") -> Played:
+def play(file: str, values: Mapping[str, str], ego: str = "Ego", every: int = 1) -> Played:
     """Play a concrete file with some of its parameters set, or take the scene that was played from the same files.
+
+    What moves has `every` such sample, the first one included.
 
     Raises
     ------
     InputError
         With the element that is not supported.
     """
-    key = file, ego, tuple(sorted(values.items()))
+    key = file, ego, every, tuple(sorted(values.items()))
     played, stamps = _SCENES.pop(key, (None, []))
     if played is None or stamps != _stamps(played.files):
-        played = _play(file, values, ego)
+        played = _play(file, values, ego, every)
         stamps = _stamps(played.files)
     _SCENES[key] = played, stamps  # the last one is the newest
     if len(_SCENES) > KEPT_SCENES:
@@ -414,9 +416,13 @@ def play(file: str, values: Mapping[str, str], ego: str = "Ego") -> Played:
     return played
 
 
+EVERY = 5
+"""Samples of a scene that are kept if those of a study are among them: every fifth."""
 _SCENES: dict[tuple[object, ...], tuple[Played, list[tuple[int, int]]]] = {}
-KEPT_SCENES = 1000
-"""Number of played scenes that a process keeps: one of 20 s with three bodies takes about 250 kB."""
+KEPT_SCENES = 5000
+"""Number of played scenes that a process keeps: one of 20 s with every fifth sample takes 16 kB a body. All fits of a
+model meet the same encounters.
+"""
 
 
 def _stamps(files: Sequence[str]) -> list[tuple[int, int]]:
@@ -425,7 +431,7 @@ def _stamps(files: Sequence[str]) -> list[tuple[int, int]]:
     return [(stat.st_mtime_ns, stat.st_size) for stat in stats]
 
 
-def _play(file: str, values: Mapping[str, str], ego: str) -> Played:
+def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     document = read(file, values)
     if problems := violated(document.parameters, document.values):
         raise unsupported(f"the file's constraints exclude {', '.join(problems)}", "values that they allow")
@@ -438,7 +444,8 @@ def _play(file: str, values: Mapping[str, str], ego: str) -> Played:
         raise unsupported(f"{ego} stands at the start", "a SpeedAction in Init")
     if np.ptp(own.speed[samples]) > 1e-6:
         raise unsupported(f"{ego} does not keep its speed at the start: its driving system drives")
-    others = [_moved(actor, samples) for actor in player.actors.values() if actor is not own]
+    kept = slice(0, player.sample + 1, every)
+    others = [_moved(actor, kept) for actor in player.actors.values() if actor is not own]
     if not others:
         raise unsupported(f"nobody but {ego} is in the file", "another ScenarioObject")
     _remark(player)

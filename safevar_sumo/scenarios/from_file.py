@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.openscenario import STEP, Moved, Played, play, text_of
+from safevar_sumo.openscenario import EVERY, STEP, Moved, Played, play, text_of
 from safevar_sumo.output import file_beside
-from safevar_sumo.records import FloatArray, Quantity
+from safevar_sumo.records import FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios.tracks import VUT_LENGTH, VUT_WIDTH, Track, TrackScenario
 from safevar_sumo.study import FreeParameter
 
@@ -19,6 +20,8 @@ WIDEST = 1e9
 """Largest size of a parameter of a file, which says itself what it allows."""
 AWAY_SPEED = 90.0
 """Speed at which a deleted entity, a point without size, leaves the scene to the left [m/s]."""
+SAME = 1e-6
+"""Difference of two samples' numbers up to which they are one [-]."""
 DIGITS = 9
 """Decimals of the places in tracks [m]: the last bits of a sine differ between machines."""
 
@@ -30,8 +33,8 @@ class _Scene(NamedTuple):
     bodies: dict[str, Moved]
 
 
-def _scene(file: str, ego: str, values: Mapping[str, str]) -> _Scene:
-    played = play(file, values, ego)
+def _scene(file: str, ego: str, values: Mapping[str, str], every: int) -> _Scene:
+    played = play(file, values, ego, every)
     start = played.start
     return _Scene(
         played,
@@ -72,7 +75,10 @@ class OpenScenario(TrackScenario):
 
     @property
     def _key(self) -> tuple[object, ...]:
-        return self.file, self.ego, repr(self.values)
+        values = {
+            name: value.tobytes() if isinstance(value, np.ndarray) else value for name, value in self.values.items()
+        }
+        return self.file, self.ego, repr(values)
 
     def free(self) -> Mapping[str, FreeParameter]:
         """Every number among the file's parameters may be searched; a file states no units."""
@@ -85,39 +91,41 @@ class OpenScenario(TrackScenario):
         """The file at other values of its parameters."""
         return OpenScenario(self.file, self.ego, **{**self.values, **values})
 
-    @property
+    @cached_property
+    def _different(self) -> tuple[list[Mapping[str, Any]], IntArray]:
+        """The values of all different encounters, and the number of those of each of N encounters."""
+        arrays = {name: value for name, value in self.values.items() if np.ndim(value)}
+        if not arrays:
+            return [self.values], np.zeros(1, dtype=int)
+        rows, which = np.unique(np.stack([*arrays.values()], axis=1), axis=0, return_inverse=True)
+        return [{**self.values, **dict(zip(arrays, row, strict=True))} for row in rows], np.reshape(which, -1)
+
+    @cached_property
     def _scenes(self) -> list[_Scene]:
-        """The scenes of all encounters."""
-        found = self.__dict__.get("_found")
-        if found is None:
-            try:
-                found = self.__dict__["_found"] = [*self._played()]
-            except InputError as error:
-                name = os.path.basename(self.file)
-                raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
-            if len({scene.played.ego for scene in found}) > 1:
-                problem = f"the body of {self.ego} depends on a searched parameter"
-                raise InputError("scenario.search", problem, "values of it in the matrix")
+        """The scenes of all different encounters."""
+        return self._played(EVERY)
+
+    def _played(self, every: int) -> list[_Scene]:
+        try:
+            found = [
+                _scene(self.file, self.ego, {name: text_of(value) for name, value in values.items()}, every)
+                for values in self._different[0]
+            ]
+        except InputError as error:
+            name = os.path.basename(self.file)
+            raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
+        if len({scene.played.ego for scene in found}) > 1:
+            problem = f"the body of {self.ego} depends on a searched parameter"
+            raise InputError("scenario.search", problem, "values of it in the matrix")
         return found
 
-    def _played(self) -> Sequence[_Scene]:
-        n = max((np.size(value) for value in self.values.values()), default=1)
-        columns = {
-            name: [value] * n if isinstance(value, str) or np.ndim(value) == 0 else [*value]
-            for name, value in self.values.items()
-        }
-        return [
-            _scene(self.file, self.ego, {name: text_of(column[k]) for name, column in columns.items()})
-            for k in range(n)
-        ]
-
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_found"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_different", "_scenes")}
 
     def _of_scenes(self, values: Sequence[float]) -> Quantity:
         """A number, or an array for N encounters."""
-        is_searched = any(np.ndim(value) for value in self.values.values() if not isinstance(value, str))
-        return np.array(values) if is_searched else values[0]
+        is_searched = any(np.ndim(value) for value in self.values.values())
+        return np.array(values)[self._different[1]] if is_searched else values[0]
 
     @property
     def duration(self) -> Quantity:
@@ -175,37 +183,40 @@ class OpenScenario(TrackScenario):
     def tracks(self, times: FloatArray) -> list[Track]:
         """All entities but Ego; beyond the end of the scene they go on as they move there."""
         samples = times[:, 0] / STEP
+        are_kept = np.abs(samples / EVERY - np.round(samples / EVERY)).max() < SAME
+        every, scenes = (EVERY, self._scenes) if are_kept else (1, self._played(1))
         return [
-            self._track(name, [scene.bodies[name] for scene in self._scenes], samples)
-            for name in self._scenes[0].bodies
+            self._track(name, [scene.bodies[name] for scene in scenes], samples, every) for name in scenes[0].bodies
         ]
 
-    def _track(self, name: str, bodies: Sequence[Moved], samples: FloatArray) -> Track:
+    def _track(self, name: str, bodies: Sequence[Moved], samples: FloatArray, every: int) -> Track:
         if len({(body.shape.length, body.shape.width) for body in bodies}) > 1:
             problem = f"the body of {name} depends on a searched parameter"
             raise InputError("scenario.search", problem, "values of it in the matrix")
         place, facing, speed = (
-            np.stack([_sampled(getattr(body, column), samples) for body in bodies], axis=1)
+            np.stack([_sampled(getattr(body, column), samples / every) for body in bodies], axis=1)
             for column in ("place", "facing", "speed")
         )
-        beyond = np.stack([np.maximum(samples - (len(body.speed) - 1), 0.0) for body in bodies], axis=1)
+        beyond = np.maximum(samples[:, np.newaxis] - [every * (len(body.speed) - 1) for body in bodies], 0.0)
         facing = facing / np.abs(facing)
         place = place + beyond * STEP * speed * facing
+        which = self._different[1]
         shape = bodies[0].shape
         length: Quantity = shape.length
         width: Quantity = shape.width
         deleted = np.array([body.deleted for body in bodies])
         gone = np.maximum(samples[:, np.newaxis] * STEP - deleted, 0.0)
         if gone.any():
-            length, width = (np.where(gone > 0, 0.0, size) for size in (length, width))
+            length, width = (np.where(gone > 0, 0.0, size)[:, which] for size in (length, width))
         y = place.imag + AWAY_SPEED * gone
-        return Track(name, shape.kind, length, width, place.real, y, facing.real, facing.imag, speed)
+        columns = (column[:, which] for column in (place.real, y, facing.real, facing.imag, speed))
+        return Track(name, shape.kind, length, width, *columns)
 
 
 def _sampled(column: Any, samples: FloatArray) -> Any:
-    """A column of samples `STEP` apart at others, linear in between."""
+    """A column at fractions of samples, linear in between."""
     inside = np.minimum(samples, len(column) - 1)
-    below = np.minimum(np.floor(inside + 1e-6).astype(int), len(column) - 1)
+    below = np.minimum(np.floor(inside + SAME).astype(int), len(column) - 1)
     share = np.maximum(inside - below, 0.0)
-    share[share < 1e-6] = 0.0
+    share[share < SAME] = 0.0
     return column[below] + share * (column[np.minimum(below + 1, len(column) - 1)] - column[below])

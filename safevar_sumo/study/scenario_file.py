@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown_name, warn
-from safevar_sumo.openscenario import constraints_of, open_file, play, read, text_of
+from safevar_sumo.openscenario import EVERY, constraints_of, open_file, play, read, text_of
 from safevar_sumo.openscenario.logical import Source, originals
 from safevar_sumo.study.parameters import free_parameters
 from safevar_sumo.study.schema import MatrixTest, Parameters, Weather
@@ -163,7 +163,7 @@ def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameter
     played, problems = [], {}
     for point in points:
         try:
-            play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego)
+            play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego, EVERY)
         except InputError as problem:
             problems[" and ".join(f"{name} = {value}" for name, value in point.items())] = problem
         else:

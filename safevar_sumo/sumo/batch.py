@@ -139,20 +139,22 @@ def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> O
 
 def stage_of(system: System, settings: FloatArray) -> Stage | None:
     """The bodies around N settings, shape (N, n), at every point; None if the scenario observes a world itself."""
-    n = len(settings)
-    size = len(settings)
     scenarios = [point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)]
     if len(scenarios) < len(system.points):
         return None
-    if len(system.characteristics.scenario):
-        size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])
-        scenario = system.at_encounters(settings[::size])[0].scenario
+    group = np.repeat(np.arange(len(scenarios)), len(settings))
+    if len(system.characteristics.scenario):  # an encounter that several vehicles meet is there once
+        encounters = settings[:, ~system.characteristics.of_vehicle]
+        _, first, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
+        if len(first) == len(settings):
+            first = group = np.arange(len(settings))
+        scenario = system.at_encounters(settings[first])[0].scenario
         assert isinstance(scenario, TrackScenario)
         scenarios = [scenario]
     step = system.scenes.step_of(scenarios[0])
     duration = max(float(np.max(scenario.duration)) for scenario in scenarios)
     n_samples = round(duration / step) + 1
-    return Stage(scenarios, n * len(scenarios), size, n_samples=n_samples, step=step)
+    return Stage(scenarios, np.reshape(group, -1), n_samples=n_samples, step=step)
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:

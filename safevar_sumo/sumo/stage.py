@@ -31,21 +31,22 @@ OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
 
 
 class Stage:
-    """The bodies around N vehicles, of which `size` at a time are in the same of K scenarios, or in the same encounter
-    of the only one, whose parameters are arrays.
+    """The bodies around N vehicles. `group`, shape (N,), is the number of each one's scenario among K, or that of its
+    encounter of the only one, whose parameters are arrays.
     """
 
-    def __init__(self, scenarios: Sequence[TrackScenario], n: int, size: int, *, n_samples: int, step: float) -> None:
+    def __init__(self, scenarios: Sequence[TrackScenario], group: IntArray, *, n_samples: int, step: float) -> None:
         first = scenarios[0]
         self.length = first.vut_length
         self.width = first.vut_width
         self.setback = first.sensor_setback
         times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
         own = self._own(np.zeros(1), np.zeros(1))
-        self.cast = cast_of(scenarios, times, n // size if len(scenarios) == 1 else 1, step, own)
-        self.n = n
+        n_groups = int(group.max()) + 1
+        self.cast = cast_of(scenarios, times, n_groups if len(scenarios) == 1 else 1, step, own)
+        self.n = len(group)
         self.step = step
-        self.group: IntArray | None = np.repeat(np.arange(n // size), size) if 1 < size < n else None
+        self.group: IntArray | None = group if 1 < n_groups < self.n else None
         bodies = [Moving.of(track, step, self.width) for track in self.cast]
         level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == level) for body in bodies]

@@ -53,7 +53,7 @@ def driven(
     """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the vehicle keeps its
     speed.
     """
-    system = replace(system, scenario=scenario, ads=ads or Hold())
+    system = replace(system, scenario=scenario, matrix=(), ads=ads or Hold())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 
 

@@ -73,7 +73,7 @@ def by_the_driver(scenario: Any) -> SimulationRuns:
     nominal = calibration_drive(vehicle, WEAR.characteristics)
     system = replace(WEAR, vehicle=vehicle, ads=CompetentDriver(), nominal=nominal, scenario=scenario)
     samples = round(float(np.max(scenario.duration)) / STEP) + 1
-    stage = Stage([scenario], n, 1, n_samples=samples, step=STEP)
+    stage = Stage([scenario], np.arange(n), n_samples=samples, step=STEP)
     settings = np.tile(WEAR.characteristics.original, (n, 1))
     return drive(system, settings, LaneWorld(stage, np.zeros(n) + scenario.start_speed, STEP), stage)
 
