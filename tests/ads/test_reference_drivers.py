@@ -253,7 +253,7 @@ def behind_a_braking_leader(driver: Any, speed: float, headway: float, leader_br
     return float(gaps.min() if gaps[-1] >= 0 else -closing)
 
 
-@pytest.mark.parametrize("headway", [1.0, 1.4, 2.0])
+@pytest.mark.parametrize("headway", [1.0, *(pytest.param(v, marks=pytest.mark.slow) for v in (1.4, 2.0))])
 @pytest.mark.parametrize(
     "speed", [50.0, *(pytest.param(v, marks=pytest.mark.slow) for v in (30.0, 80.0, 100.0, 130.0))]
 )

@@ -181,6 +181,7 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
     assert answer.figure().axes
 
 
+@pytest.mark.slow
 def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
     later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})

@@ -79,7 +79,7 @@ def _few_encounters(joint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    "typed", [pytest.param(typed, marks=pytest.mark.slow if "explain tiny" in typed else ()) for typed in QUESTIONS]
+    "typed", [pytest.param(typed, marks=pytest.mark.slow if typed.startswith("explain") else ()) for typed in QUESTIONS]
 )
 def test_a_question_says_which_encounters_count(typed: str) -> None:
     assert re.search(QUESTIONS[typed], json_of(*typed.split())["verdict"])

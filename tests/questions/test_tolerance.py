@@ -402,6 +402,7 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
         ends(unsafe="below=4.5", margin=5)
 
 
+@pytest.mark.slow
 def test_gaps_are_between_bumpers() -> None:
     said = run("tolerance", "native", "--characteristics", "decel", "--jobs", "1").stdout
     assert "no vehicle that was tried keeps less than 0.3 m between bumpers" in said
