@@ -52,6 +52,7 @@ TYPED = [
     ("simulate sun --as-it-is-now", "a study is simulated as it is now anyway"),
     ("simulate sun --set mass=5000", "[2040, 2700] kg"),
     ("simulate sun --set mass=+8", "or mass=+8% of the original, or any with --beyond"),
+    ("simulate sensing --set sensorAngle=+10%", "'sensorAngle=+10%': the original is 0"),
     ("simulate sun --set weight=1", "weight"),
     ("simulate sun_joint --beyond --set distance=1000", "distance is 959.67 m longer than the lane"),
     ("simulate sun_joint --beyond --set recognition_delay=-1", "a finite number from 0, up to 300 s"),

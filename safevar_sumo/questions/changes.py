@@ -49,7 +49,8 @@ def read_changes(
         if single and len(values_by_name[name]) > 1:
             raise InputError("", f"{change!r} is a sweep", forms)
         for value in values_by_name[name]:
-            hint = f", or {name}={text}% of the original" if SIGNED_NUMBER.fullmatch(text) else ""
+            is_relative = SIGNED_NUMBER.fullmatch(text) and characteristic.original
+            hint = f", or {name}={text}% of the original" if is_relative else ""
             characteristic.check(value, beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
         raise InputError(
@@ -60,6 +61,8 @@ def read_changes(
 
 def _parse_values(change: str, text: str, original: float, forms: str) -> list[float]:
     if percentage := PERCENTAGE.fullmatch(text):
+        if not original:
+            raise InputError("", f"{change!r}: the original is 0", "NAME=VALUE in the characteristic's unit")
         return [original + abs(original) * float(percentage[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
         count = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
