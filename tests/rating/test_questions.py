@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
+import safevar_sumo as sv
 from safevar_sumo.api.study import _verdict
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins.check import check
@@ -25,7 +26,7 @@ from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.results import record
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of, run, searched
+from tests.in_process import InlinePool, json_of, refused, run, searched
 from tests.made_up import case_of
 from tests.sumo.test_recording import still as still
 
@@ -122,6 +123,47 @@ def test_a_rating_has_a_page_and_is_packed_and_made_again(in_tmp: Path) -> None:
     claims = json_of("verify", "it.zip")["tables"]["claims"]["rows"]
     assert {claim["verdict"] for claim in claims} == {"same"}
     assert any(claim["claim"].startswith("answer rating") for claim in claims)
+
+
+@pytest.mark.slow
+def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -> None:
+    """`repair` alone refuses a rated study, whatever the criterion."""
+    criterion = ("--unsafe", "rating_points < 2.2")
+    study = 'extends = "euro_ncap_rating"\nname = "rated"\n[search]\npopulation = 8\nevaluations = 32\n'
+    Path("rated.toml").write_text(study)
+    studied = json_of("study", "rated.toml", "--out", "results", "--quiet", *criterion)
+    solutions = sv.load("results").solutions
+    count = (solutions["rating_points"] < 2.2).sum()
+    assert 0 < count
+    assert studied["verdict"].startswith(f"{count} of {len(solutions)} different solutions are unsafe")
+    found = {}
+    for typed in (
+        ("risk", "rated.toml", "--samples", "64"),
+        ("rules", "rated.toml", "--samples", "64"),
+        ("explain", "results", "--fits", "0", "--top", "1"),
+        ("compare", "rated.toml", "rated.toml", "--samples", "32"),
+        ("tolerance", "rated.toml", "--characteristics", "treadDepth"),
+    ):
+        answer = found[typed[0]] = json_of(*typed, *criterion)
+        assert answer["numbers"]["unsafe"] == "rating_points < 2.2", typed
+    assert 0 < found["risk"]["numbers"]["failures"] == found["rules"]["numbers"]["failures"] < 64
+    assert found["explain"]["numbers"]["failures"] == count
+    (solution, *_), (cause, *_) = (found["explain"]["tables"][name]["rows"] for name in ("solutions", "causes"))
+    assert solution["points"]
+    changes = [cause["changes"], {name: cause["changes"][name] for name in list(cause["changes"])[1:]}]
+    failed, without = sv.evaluate("rated.toml", changes, filtered=False, jobs=1)["rating_points"]
+    assert failed < 2.2 <= without, "each change of a cause is needed"
+    (limit,) = found["tolerance"]["tables"]["limits"]["rows"]
+    cars = [{"treadDepth": value} for value in (limit["alone_low"], limit["alone_high"])]
+    assert (sv.evaluate("rated.toml", cars, filtered=False, jobs=1)["rating_points"] >= 2.2).all()
+    assert found["compare"]["numbers"]["only_a_unsafe"] == found["compare"]["numbers"]["only_b_unsafe"] == 0
+    assert found["compare"]["numbers"]["both"] > 0
+    refused("repair", "rated.toml", "--promise", "treadDepth >= 7", *criterion, message=("'rated' is rated",))
+    run("report", "results", "--out", "page.html", "--ask", "rules --samples 64", *criterion)
+    assert "--unsafe &#39;rating_points &lt; 2.2&#39;" in Path("page.html").read_text()
+    run("evidence", "results", "--out", "pack.zip", "--ask", "rules --samples 64", *criterion)
+    verified = json_of("verify", "pack.zip")
+    assert verified["numbers"]["passed"], verified["tables"]["claims"]
 
 
 @pytest.mark.slow
