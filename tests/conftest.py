@@ -15,6 +15,7 @@ import pytest
 
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, function_of
+from safevar_sumo.plugins import ImportPath
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
@@ -75,12 +76,22 @@ def _answers_have_what_their_questions_declare() -> Iterator[None]:
         if answer.question in COMMANDS:
             declared = contents_of(function_of(answer.question))
             assert declared is not None
-            for key in Contents(answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}).keys:
-                declared.check_key(key)
+            keys = Contents(answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}).keys
+            by = next((key.removeprefix("limits.by_") for key in keys if key.startswith("limits.by_")), "")
+            for key in keys:
+                declared.with_options({"by": f"{by}=20,30"}).check_key(key)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Answer, "__init__", create_and_check)
         yield
+
+
+@pytest.fixture(autouse=True)
+def _own_import_path() -> Iterator[None]:
+    """Folders of one test's user code are on the path of no other, also where the test changes the path itself."""
+    path = ImportPath.here()
+    yield
+    path.inherit()
 
 
 @pytest.fixture

@@ -60,10 +60,11 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     ) -> None:
         conditions = [_parse(text) for text in fail_if]
         if declared:
+            named = declared.with_options(values)
             for key, _, _ in conditions:
-                declared.check_key(key)
+                named.check_key(key)
             if table is not None:
-                declared.check_table(table)
+                named.check_table(table)
         if plot is not None:
             check_writable(plot, "plot", PICTURE_ENDINGS)
         form = "json" if as_json else form

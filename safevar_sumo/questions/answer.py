@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import re
 import zlib
+from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from html import escape
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -54,11 +54,21 @@ WIDTH = 80
 
 class Contents(NamedTuple):
     """The names of an answer's numbers, and of the columns of its tables; `...` among them stands for names that a
-    study gives, such as its metrics, and `*` for any end of a name.
+    study gives, such as its metrics, and `{by}` for the name in a value NAME=... of the option `by`.
     """
 
     numbers: Collection[str | EllipsisType]
     tables: Mapping[str, Collection[str | EllipsisType]]
+
+    def with_options(self, values: Mapping[str, Any]) -> Contents:
+        """The names that an answer has with these values of options; `NAME` for an option that has none."""
+        stated = {name: text.partition("=")[0].strip() for name, text in values.items() if isinstance(text, str)}
+        named = defaultdict(lambda: "NAME", stated)
+        tables = {
+            table: [name if name is ... else name.format_map(named) for name in names]
+            for table, names in self.tables.items()
+        }
+        return self._replace(tables=tables)
 
     def check_table(self, name: str) -> None:
         """Refuse the name of no table; raises an InputError."""
@@ -69,7 +79,7 @@ class Contents(NamedTuple):
         name, _, rest = key.rpartition(".")
         number = name if name and rest.isdecimal() else key
         wanted, names = (rest, self.tables[name]) if name in self.tables else (number, self.numbers)
-        if ... not in names and not any(fnmatchcase(wanted, str(known)) for known in names):
+        if ... not in names and wanted not in names:
             # Of a table its columns are legal; the columns of all tables would fill the screen.
             of_table = [legal for legal in self.keys if legal.startswith(f"{name}.")]
             legal = of_table or [*(name for name in self.numbers if name != ...), *(f"{t}.COLUMN" for t in self.tables)]

@@ -35,16 +35,25 @@ def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder:
     assert throttle(folder / "mine.toml") == 0.1
 
 
-def test_an_error_of_an_installed_driving_system_has_its_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("code", "ads", "where"),
+    [
+        (SCALAR + "    def drive(self, seen):\n        return 1 / 0\n", 'model = "bought:Mine"', "drive"),
+        ("def step(traci, vehicle_id):\n    return 1 / 0\n", 'model = "bought:step"\nkind = "traci"', "step"),
+    ],
+)
+def test_an_error_of_an_installed_driving_system_has_its_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, code: str, ads: str, where: str
+) -> None:
     installed = folder / "site-packages"
     installed.mkdir()
-    (installed / "bought.py").write_text(SCALAR + "    def drive(self, seen):\n        return 1 / 0\n")
-    sys.path.append(str(installed))
+    (installed / "bought.py").write_text(code)
+    monkeypatch.syspath_prepend(str(installed))
     study = folder / "it.toml"
-    study.write_text('extends = "smoke"\nname = "it"\n[ads]\nmodel = "bought:Mine"\n')
-    with pytest.raises(UserCodeError, match=r"raised in drive: ZeroDivisionError.*bought\.py:\d+\)"):
+    study.write_text(f'extends = "smoke"\nname = "it"\n[ads]\n{ads}\n')
+    line = len(code.splitlines())
+    with pytest.raises(UserCodeError, match=rf"raised in {where}: ZeroDivisionError.*bought\.py:{line}\)"):
         throttle(study)
-    sys.path.remove(str(installed))
     del sys.modules["bought"]
 
 

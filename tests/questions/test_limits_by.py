@@ -57,6 +57,8 @@ SPEEDS = (20, 30, 45, 60)
         (("euro_ncap_rating", "--by", "speed=20"), ("study 'euro_ncap_rating' is rated", "not rated")),
         (("wear", "--by", "speed=20", "--point", "CPFA, speed 10, wet"), ("beside a point",)),
         (("wear", "--together"), ("together", "--by")),
+        (("wear", "--by", "speed=20", "--fail-if", "limits.by_x > 3"), ("'limits.by_x'", "limits.by_speed")),
+        (("wear", "--fail-if", "limits.by_speed > 3"), ("'limits.by_speed'", "limits.by_NAME")),
     ],
 )
 def test_by_is_refused_in_words(arguments: tuple[str, ...], message: tuple[str, ...]) -> None:

@@ -86,7 +86,7 @@ NEAREST: Columns = {
 @question
 @contents(
     *("unsafe", "margin", "kept", "scope", "boxes", "up_to", *OF_BOX),
-    limits=(*LIMITS, "by_*", "scope"),
+    limits=(*LIMITS, "by_{by}", "scope"),
     intervals=INTERVALS,
     fits=FITS,
     points=POINTS,

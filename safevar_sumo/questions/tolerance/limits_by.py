@@ -19,6 +19,7 @@ from safevar_sumo.questions.tolerance.levels import Level, LevelSearch, Reach
 from safevar_sumo.questions.tolerance.levels_together import levels_with_together
 from safevar_sumo.questions.tolerance.rows import LIMITS, NOWHERE, Failure, describe
 from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.tolerance.words import failure_in_words
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit, unit_text
@@ -195,9 +196,8 @@ def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame
     members, left_out = levels[-1].models
     tried = len(members) + len(left_out)
     fits = "in one model" if tried == 1 else f"in {len(members)} of {tried} fits"
-    keeps = f"keeps less than {unsafe.keep:.3g} m" if unsafe.keep else f"is unsafe ({unsafe.description})"
-    others = f" with the study's own fit, and none collides with {len(members) - 1} others" if len(members) > 1 else ""
-    yield f"Limits up to {values} hold {fits}: within them no vehicle that was tried {keeps}{others}."
+    failure = failure_in_words(unsafe, len(members))
+    yield f"Limits up to {values} hold {fits}: within them no vehicle that was tried {failure}."
     yield _tried(search)
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:

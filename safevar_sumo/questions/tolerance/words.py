@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS
 from safevar_sumo.questions.evaluator import CONFIDENCE
 from safevar_sumo.questions.models import Models, fit_names
@@ -82,15 +83,21 @@ def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, bu
     decision = "All may go to their limits together"
     if has_limits:
         decision = "The limits together below hold" if together.broken else "Keeps all limits"
-    between = " between bumpers" if unsafe.contact else ""
-    distance = f"keeps less than {unsafe.keep:.3g} m{between}" if unsafe.keep else f"is unsafe ({unsafe.description})"
-    others = f" with the study's own fit, and none collides with {count - 1} others" if count > 1 else ""
-    yield f"{decision} {where}: within them no vehicle that was tried {distance}{others}."
+    yield f"{decision} {where}: within them no vehicle that was tried {failure_in_words(unsafe, count)}."
     searched = len(models.own.evaluator.characteristics.scenario) > 0
     met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
     yield f"Tried: all corners{met}; {_attack_in_words(together, budget)}; {_proof_in_words(together)}."
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
+
+
+def failure_in_words(unsafe: Unsafe, fits: int) -> str:
+    """What no vehicle does within limits that hold in some fits: other fits than the study's own keep no distance."""
+    if not unsafe.keep:
+        return f"is unsafe ({unsafe.description}){f' in any of {fits} fits' if fits > 1 else ''}"
+    between = " between bumpers" if unsafe.contact else ""
+    others = f" with the study's own fit, and none collides with {fits - 1} others" if fits > 1 else ""
+    return f"keeps less than {unsafe.keep:.3g} m{between}{others}"
 
 
 def _attack_in_words(together: LimitsTogether, budget: int) -> str:
