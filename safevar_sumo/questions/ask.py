@@ -342,3 +342,8 @@ def _name(source: StudyLike | Results) -> str:
     if isinstance(source, Results):
         return str(source.directory)
     return source.origin.called or source.name if isinstance(source, Study) else str(source)
+
+
+def has_criterion(text: str, unsafe: str | None) -> bool:
+    """Whether a question as `with_criterion` gives it is asked by a criterion, and not by another one or none."""
+    return parse_question(text)[1].get("unsafe") == (None if unsafe is None else str(unsafe))

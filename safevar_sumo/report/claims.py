@@ -24,6 +24,7 @@ from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.ask import has_criterion
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
@@ -98,10 +99,17 @@ class Packed:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
 
+    @cached_property
+    def shown(self) -> Case:
+        """The results by the criterion of the pack."""
+        (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
+        return case
+
     def answer(self, text: str) -> Answer:
         if text not in self._answers:
             add_import_folders(self._places)
-            self._answers[text] = answer_to(text, [self.case], [self._directory], None, self._jobs, self._progress)
+            case = self.shown if has_criterion(text, self.packed.unsafe) else self.case
+            self._answers[text] = answer_to(text, [case], [self._directory], None, self._jobs, self._progress)
         return self._answers[text]
 
     def _answer_json(self, text: str) -> bytes:
@@ -110,8 +118,7 @@ class Packed:
     def page(self) -> bytes:
         answers = [self.answer(text) for text in self.packed.questions]
         versions = self.manifest["versions"]
-        (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
-        study = ReportedStudy(directory=self._directory, case=case, versions=versions, answers=answers)
+        study = ReportedStudy(directory=self._directory, case=self.shown, versions=versions, answers=answers)
         return make_page([study], progress=self._progress).encode()
 
     def study_file(self) -> bytes:

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import Criterion, Jobs, parse_question, with_criterion
+from safevar_sumo.questions.ask import Criterion, Jobs, has_criterion, parse_question, with_criterion
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.research_questions.answer import answer_questions
@@ -122,9 +122,11 @@ def report(
     numbers = count(1)
     total = sum(map(len, asked)) + len(joint)
 
-    def answered(text: str, about: Sequence[Case], directories: Sequence[Path]) -> Answer:
-        """The answer to the next question, whose stages progress shows with its number."""
+    def answered(text: str, chosen: Sequence[int]) -> Answer:
+        """The answer to the next question about the results with these numbers; progress shows its own number."""
         within = f"question {next(numbers)} of {total}, {text.split()[0]}"
+        by_criterion = subjects if has_criterion(text, unsafe) else at_point
+        about, directories = zip(*((by_criterion[number], paths[number]) for number in chosen), strict=True)
         return give(text, about, directories, point, jobs, partial(show_within, show, within))
 
     with open_progress(progress) as show:
@@ -133,13 +135,15 @@ def report(
                 directory=path,
                 case=case,
                 versions=read_manifest(path)["versions"],
-                answers=[answered(text, [case], [path]) for text in texts],
+                answers=[answered(text, [number]) for text in texts],
                 point=point or "",
                 later_changes=changes,
             )
-            for path, case, changes, texts in zip(paths, subjects, later_changes, asked, strict=True)
+            for number, (path, case, changes, texts) in enumerate(
+                zip(paths, subjects, later_changes, asked, strict=True)
+            )
         ]
-        shared = [answered(text, subjects, paths) for text in joint]
+        shared = [answered(text, range(len(paths))) for text in joint]
         pictures = list[JsonObject]()
         if paper:
             show("tables and figures", 0, 1)

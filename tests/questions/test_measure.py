@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.measure import study_by
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.measure import STAGE, study_by
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import load_study
 from tests.in_process import json_of, refused, run, searched
 
@@ -119,6 +123,33 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
     run("evidence", "results", "--out", "pack.zip", *ask)
     verified = json_of("verify", "pack.zip", "--run-code")
     assert verified["numbers"]["passed"], verified["tables"]["claims"]
+
+
+@pytest.mark.slow
+def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_its_own(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By `drac` another point of the matrix is the worst one than by the safety degree, of which one question asks."""
+    search = {"algorithms": ["rs"], "population": 10, "evaluations": 40, "runs": 1}
+    searched(load_study("wear", search=search), in_tmp / "results")
+    stages = []
+    evaluate = Evaluator.evaluate
+
+    def noted(evaluator: Evaluator, settings: FloatArray, stage: str, **options: bool) -> Evaluations:
+        stages.append(stage)
+        return evaluate(evaluator, settings, stage, **options)
+
+    monkeypatch.setattr(Evaluator, "evaluate", noted)
+    own = "rules --samples 64 --unsafe below=0.9"
+    asked = ("--ask", "rules --samples 64", "--ask", "rules --samples 32", "--ask", own)
+    run("evidence", "results", "--out", "pack.zip", *asked, "--unsafe", "drac > 5")
+    assert stages.count(STAGE) == 2, "to choose questions, and for all answers and the page"
+    with zipfile.ZipFile("pack.zip") as pack:
+        (name,) = (name for name in pack.namelist() if name.endswith("answers.json"))
+        packed = json.loads(pack.read(name))[-1]
+    alone = json_of(*own.replace("rules", "rules results").split())
+    assert packed["numbers"] == alone["numbers"]
+    assert json_of("verify", "pack.zip")["numbers"]["passed"]
 
 
 def test_a_study_refuses_a_criterion_before_it_searches(folder: Path) -> None:
