@@ -175,7 +175,7 @@ class DelayLine(NamedTuple):
         return cls(int(steps), float(fraction))
 
     @staticmethod
-    def parts(delay: float | FloatArray, step: float) -> tuple[Any, Any]:
+    def parts(delay: float | FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
         """Whole steps and the fraction of a step of a delay [s], or of several."""
         steps, fraction = np.divmod(np.round(np.asarray(delay) / step, STEP_DECIMALS), 1)
         return steps, fraction

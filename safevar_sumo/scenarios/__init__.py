@@ -79,17 +79,19 @@ def equals_clear(weather: Weather) -> bool:
     )
 
 
+FROM_CENTRES = " from centre to centre"
+"""How a safety degree is measured where bodies touch at one above 0."""
+
+
 def distance_in_words(safety_degree: float, contact: float) -> str:
-    """A safety degree above 0 as text, with the gap between bumpers where it is from centre to centre: where bodies
-    touch at a safety degree of `contact` above 0 [m].
-    """
-    gap = f" from centre to centre (gap {round(safety_degree - contact, 2) + 0.0:.2f} m)" if contact else ""
+    """A safety degree above 0 as text, with the gap where bodies touch at a safety degree of `contact` above 0 [m]."""
+    gap = f"{FROM_CENTRES} (gap {round(safety_degree - contact, 2) + 0.0:.2f} m)" if contact else ""
     return f"{safety_degree:.2f} m{gap}"
 
 
 def degree_note(contact: float) -> str:
     """A sentence on the safety degrees of a table; bodies touch at a safety degree of `contact` [m]."""
-    from_centres = f" (from centre to centre: bodies touch at {contact:.2f} m)" if contact else ""
+    from_centres = f" ({FROM_CENTRES.strip()}: bodies touch at {contact:.2f} m)" if contact else ""
     return f"SD: least distance in m{from_centres}, or minus the collision's speed in m/s."
 
 

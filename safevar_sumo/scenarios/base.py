@@ -123,7 +123,7 @@ class Layout(NamedTuple):
     backwards: BoolArray | bool = False
 
 
-def as_text(value: Any) -> str:
+def as_text(value: Quantity) -> str:
     """A number as SUMO's files have it."""
     return repr(float(value))
 
@@ -199,7 +199,7 @@ class Scenario:
         """Parameters that a study may search, by name."""
         return free_parameters(type(self))
 
-    def at(self, values: Mapping[str, Any]) -> Scenario:
+    def at(self, values: Mapping[str, Quantity]) -> Scenario:
         """This scenario at other values of parameters, created anew."""
         create: Any = msgspec.structs.replace if isinstance(self, msgspec.Struct) else dataclasses.replace
         return create(self, **values)  # type: ignore[no-any-return]

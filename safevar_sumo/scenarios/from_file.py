@@ -61,7 +61,7 @@ class OpenScenario(TrackScenario):
         Values of the file's parameters by name, numbers or texts, or arrays of N numbers.
     """
 
-    def __init__(self, file: str, ego: str = "Ego", **values: Any) -> None:
+    def __init__(self, file: str, ego: str = "Ego", **values: Quantity | str) -> None:
         self.name = file
         self.file = os.path.abspath(file)
         self.ego = ego
@@ -87,7 +87,7 @@ class OpenScenario(TrackScenario):
             for name in self._scenes[0].played.numbers
         }
 
-    def at(self, values: Mapping[str, Any]) -> OpenScenario:
+    def at(self, values: Mapping[str, Quantity]) -> OpenScenario:
         """The file at other values of its parameters."""
         return OpenScenario(self.file, self.ego, **{**self.values, **values})
 

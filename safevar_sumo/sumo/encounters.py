@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.records import Quantity
 from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, TrackScenario, WorldScenario, searchable_in
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Film
@@ -58,7 +58,7 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
             raise InputError("", f"scenario.search: {error.problem}", error.legal or "narrower domains") from None
 
 
-def encounter(point: Point, values: Mapping[str, Any]) -> Point:
+def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the same object if only
     the weather varies.
     """

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
+from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Observation, Quantity, Trace
 from safevar_sumo.scenarios import Scene, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.study import Weather
@@ -38,13 +38,13 @@ class Perception:
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
         self._visibility = per_vehicle([weather.visibility for weather in weathers], size)
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
-        everybody: Any = slice(None)  # faster than indices
+        self._lines: list[tuple[IntArray | slice, DelayLine]] = []
         if np.ndim(delays) == 0:
-            self._lines = [(everybody, DelayLine.by(delays, step))]
+            self._lines.append((slice(None), DelayLine.by(float(delays), step)))  # faster than indices
             return
         steps, fractions = DelayLine.parts(delays, step)
         groups = [np.flatnonzero(steps == count) for count in np.unique(steps)]
-        self._lines = [(group, DelayLine(int(steps[group[0]]), fractions[group])) for group in groups]
+        self._lines += [(group, DelayLine(int(steps[group[0]]), fractions[group])) for group in groups]
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """The observation at this step; must be called in every step.
@@ -86,7 +86,7 @@ class SceneObserver:
         return self._scenario.encounter(trace)
 
 
-def per_vehicle(values: Sequence[Any], size: int) -> Any:
+def per_vehicle(values: Sequence[Quantity], size: int) -> Quantity:
     """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value, or that of the only
     point, if all are equal.
     """

@@ -120,9 +120,8 @@ def tolerance(
     characteristics
         Only these characteristics, separated by commas; all others keep their values. By default all.
     margin
-        Distance to keep from a collision with the study's own fit [m], between bumpers where the safety degree is from
-        centre to centre; by default the model's error that the study states, else 0.3 m, and 0.1 m in a study that
-        searches its scenario, whose originals keep more.
+        Distance to keep from a collision with the study's own fit [m], between bumpers; by default the model's error
+        that the study states, else 0.3 m, and 0.1 m in a study that searches its scenario, whose originals keep more.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     fits

@@ -14,7 +14,7 @@ from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
-from safevar_sumo.scenarios import Scenario
+from safevar_sumo.scenarios import FROM_CENTRES, Scenario
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import assemble
@@ -188,8 +188,8 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
         impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"
         return f"the car hits {scenario.obstacle()}{impact}{test}"
-    centre = " from centre to centre" if scenario.centre_to_centre and unsafe.below else ""
-    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{centre} from {scenario.obstacle()}{test}"
+    measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
+    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from {scenario.obstacle()}{test}"
 
 
 def _sentence(
