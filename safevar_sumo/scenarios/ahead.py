@@ -25,11 +25,10 @@ from safevar_sumo.scenarios.euro_ncap import (
     Metres,
     ProtocolTest,
     Seconds,
-    Speed,
     SpeedProfile,
     lateral_offset,
 )
-from safevar_sumo.scenarios.tracks import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Track, first_in_strip, travelled
+from safevar_sumo.scenarios.tracks import BODIES, KMH, LaneTest, Speed, Track, first_in_strip, travelled
 from safevar_sumo.study import searched
 
 STEADY_SPEED_LIMIT = 80.0
@@ -97,6 +96,8 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
 class Along(TargetAhead, frozen=True, kw_only=True):
     """A pedestrian or cyclist moves ahead in the vehicle's lane in its direction, and does not react to it.
 
+    For other parameters see `LaneTest`.
+
     Parameters
     ----------
     test
@@ -110,10 +111,6 @@ class Along(TargetAhead, frozen=True, kw_only=True):
         speed [m].
     time_to_impact, time_after
         Time from the start to the impact if nobody brakes, and time from the impact to the end of the run [s].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
@@ -132,7 +129,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
         for place in BESIDE:
             name = f"{self.test}, {self.speed:g} km/h, beside at {place:g} %"
             yield name, replace(self, impact_location=place)
-        yield from next_lane(self.speed, HEADWAYS[::4], self.vut_length, self.vut_width)
+        yield from next_lane(self, HEADWAYS[::4])
 
     def obstacle(self) -> str:
         """The target, which is ahead."""
@@ -161,6 +158,8 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 class CarToCar(TargetAhead, frozen=True, kw_only=True):
     """A car or a motorcyclist ahead in the lane stands, drives more slowly, or brakes.
 
+    For other parameters see `LaneTest`.
+
     Parameters
     ----------
     test
@@ -179,10 +178,6 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         Rotation of a standing target around the middle of its rear, counterclockwise seen from above [degrees].
     time_after
         Time from the impact, if nobody brakes, to the end of the run [s].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
@@ -224,7 +219,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
 
     def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car is in the next lane."""
-        return next_lane(self.speed, HEADWAYS, self.vut_length, self.vut_width)
+        return next_lane(self)
 
     def check(self) -> None:
         """Refuse a leader who is faster than any test's."""
@@ -287,11 +282,10 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[()]
 
 
-def next_lane(
-    speed: float, headways: Sequence[float], vut_length: float = VUT_LENGTH, vut_width: float = VUT_WIDTH
-) -> Iterator[tuple[str, Scenario]]:
-    """Benign scenes in which a car stands in the next lane at these headways [s], each with a description."""
-    place = 100 * (LANE_WIDTH / vut_width + 0.5)
+def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> Iterator[tuple[str, Scenario]]:
+    """Benign scenes of a test in which a car stands in the next lane at these headways [s], each with a description."""
+    width = test.vut_width
+    place = 100 * (LANE_WIDTH / width + 0.5)
+    beside = CarToCar(speed=test.speed, vut_length=test.vut_length, vut_width=width, impact_location=place)
     for headway in headways:
-        car = CarToCar(speed=speed, headway=headway, vut_length=vut_length, vut_width=vut_width, impact_location=place)
-        yield f"{speed:g} km/h, a car in the next lane {headway:g} s ahead", car
+        yield f"{test.speed:g} km/h, a car in the next lane {headway:g} s ahead", replace(beside, headway=headway)

@@ -23,11 +23,10 @@ from safevar_sumo.scenarios.euro_ncap import (
     Metres,
     ProtocolTest,
     Seconds,
-    Speed,
     SpeedProfile,
     lateral_offset,
 )
-from safevar_sumo.scenarios.tracks import BODIES, KMH, PERSONS, SCREEN, BodySize, Track
+from safevar_sumo.scenarios.tracks import BODIES, KMH, PERSONS, SCREEN, BodySize, Speed, Track
 from safevar_sumo.study import searched
 
 PARKED_GAP = 1.0
@@ -119,6 +118,8 @@ class _Start(NamedTuple):
 class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A target crosses the lane ahead of the moving vehicle, and is hit at the impact location if nobody brakes.
 
+    For other parameters see `LaneTest`.
+
     Parameters
     ----------
     test
@@ -151,10 +152,6 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     time_to_impact, time_after
         Time from the start to the impact, by default 6 s or as long as the target needs, and from there to the end of
         the run [s].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
@@ -244,7 +241,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 yield f"{row}, stops {short:g} m short", replace(middle, short=short)
             for lead in LEADS:
                 yield f"{row}, leaves {lead:g} s before", replace(middle, hidden=False, lead=lead)
-        yield from next_lane(self.speed, HEADWAYS[::4], self.vut_length, self.vut_width)
+        yield from next_lane(self, HEADWAYS[::4])
 
     def _parked_cars(self, impact: Quantity) -> list[Track]:
         """The parked cars beside the lane, and the row that hides the target."""

@@ -16,14 +16,12 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Quantity
-from safevar_sumo.scenarios.base import Grade, PreCrash
-from safevar_sumo.scenarios.tracks import KMH, VUT_LENGTH, VUT_WIDTH, BodySize, TrackScenario
+from safevar_sumo.scenarios.base import PreCrash
+from safevar_sumo.scenarios.tracks import BodySize, LaneTest
 from safevar_sumo.shipped import shipped_table
 
 Metres = Annotated[float, Meta(ge=0, le=100)]
 Seconds = Annotated[float, Meta(gt=0, le=60)]
-Speed = Annotated[float, Meta(gt=0, le=250)]
-"""Speed of a vehicle under test [km/h]."""
 ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
 """Point on or beside the vehicle's front [% of its width]."""
 Heading = Annotated[float, Meta(ge=-30, le=30)]
@@ -145,43 +143,27 @@ def lateral_offset(location: Quantity, width: float) -> Quantity:
     return (location / 100 - 0.5) * width
 
 
-class ProtocolTest(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the protocol's scenarios, with the parameters that all of them have.
+class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of the protocol's scenarios, with the parameters that all of them have; for others see `LaneTest`.
 
     Parameters
     ----------
     test
         Row of the protocol, the source of parameters that are not set.
-    speed
-        Speed of the vehicle under test at the start [km/h].
     impact_location
         Point of the vehicle's front that would hit the target [% of the width].
     time_after
         Time from the impact, if nobody brakes, to the end of the run [s].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
     """
 
     test: str
-    speed: Speed = 40.0
     impact_location: ImpactLocation = 50.0
     time_after: Seconds = 4.0
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
-    network: str = "along"
 
     @property
     def pre_crash(self) -> PreCrash:
         """NHTSA's pre-crash type."""
         return TESTS[self.test].pre_crash
-
-    @property
-    def test_speed(self) -> Quantity:
-        """Speed that the vehicle holds until it brakes [m/s]."""
-        return self.speed * KMH
 
     def parameter(self, name: str) -> Any:
         """A parameter as the study sets it, by default as the protocol does."""

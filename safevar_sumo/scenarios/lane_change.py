@@ -10,25 +10,15 @@ from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
-from safevar_sumo.scenarios.ahead import HEADWAYS, LANE_WIDTH, VEHICLE_SPEED, next_lane
-from safevar_sumo.scenarios.base import Grade, PreCrash, Scenario, XmlChanges
+from safevar_sumo.scenarios.ahead import LANE_WIDTH, VEHICLE_SPEED, next_lane
+from safevar_sumo.scenarios.base import PreCrash, Scenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
 from safevar_sumo.scenarios.roads import Roads
-from safevar_sumo.scenarios.tracks import (
-    BODIES,
-    DEPARTURE,
-    KMH,
-    VUT_LENGTH,
-    VUT_WIDTH,
-    BodySize,
-    Track,
-    TrackScenario,
-    travelled,
-)
+from safevar_sumo.scenarios.tracks import BODIES, DEPARTURE, KMH, BodySize, LaneTest, Track, travelled
 from safevar_sumo.study import searched
 
 CAR = BodySize(BODIES["car"].length, 1.9)
@@ -41,22 +31,14 @@ Gap = Annotated[float, Meta(gt=0, le=500), searched(5.0, 120.0, "m", "gap when t
 LateralSpeed = Annotated[float, Meta(gt=0, le=5), searched(0.5, 3.0, "m/s", "speed of the lateral movement")]
 
 
-class LaneChange(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of both scenarios: a car changes the lane, `side` of the vehicle's."""
+class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of both scenarios: a car changes the lane, `side` of the vehicle's; for other parameters see `LaneTest`."""
 
     speed: MotorwaySpeed = 80.0
     gap: Gap = 40.0
     lateral_speed: LateralSpeed = 1.0
     side: Literal["left", "right"] = "left"
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
     network: str = "two_lanes"
-
-    @property
-    def test_speed(self) -> Quantity:
-        """Speed that the vehicle holds until its driving system acts [m/s]."""
-        return self.start_speed
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, with the next lane at the side where it is needed."""
@@ -66,7 +48,7 @@ class LaneChange(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknow
 
     def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car stays in the next lane."""
-        return next_lane(self.speed, HEADWAYS, self.vut_length, self.vut_width)
+        return next_lane(self)
 
     def moved(self, times: FloatArray) -> Quantity:
         """Distance that the car has moved sideways [m]."""
@@ -96,10 +78,6 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Deceleration from the middle of the lane on, down to a stop [m/s^2].
     duration
         Length of a run [s].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
@@ -157,10 +135,6 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         The side to which the leader leaves.
     time_after
         Time from the impact, if nobody brakes, to the end of the run [s].
-    vut_length, vut_width
-        Size of the vehicle under test [m].
-    grade
-        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----

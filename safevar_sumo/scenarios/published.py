@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Encounter, FloatArray, Quantity, Trace
-from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
+from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.base import (
     CROSSING_LANE,
     PEDESTRIAN,
@@ -262,7 +262,7 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car is in the next lane."""
         for speed in CITY_SPEEDS:
-            yield from next_lane(speed, HEADWAYS)
+            yield from CarToCar(speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         frame = Frame.of(roads.lane("road_0"))

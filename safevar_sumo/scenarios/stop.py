@@ -9,9 +9,8 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import STANDSTILL, Encounter, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, Scene, WorldScenario, XmlChanges
-from safevar_sumo.scenarios.euro_ncap import Speed
 from safevar_sumo.scenarios.roads import Frame, Roads, World
-from safevar_sumo.scenarios.tracks import KMH
+from safevar_sumo.scenarios.tracks import KMH, Speed
 
 
 class Stop(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

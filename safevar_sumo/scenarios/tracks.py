@@ -9,20 +9,23 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
-from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Scenario, XmlChanges, as_text
+from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Grade, Scenario, XmlChanges, as_text
 from safevar_sumo.scenarios.roads import Roads
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
 VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 """Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
+Speed = Annotated[float, Meta(gt=0, le=250)]
+"""Speed of a vehicle under test [km/h]."""
 
 
 class BodySize(NamedTuple):
@@ -211,3 +214,28 @@ class TrackScenario(Scenario):
             "vType[@id='vut']": {"length": as_text(self.vut_length), "width": as_text(self.vut_width)},
             DEPARTURE: {"departSpeed": as_text(self.start_speed)},
         }
+
+
+class LaneTest(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of tests on a straight lane, at whose speed a robot holds the vehicle until its driving system acts.
+
+    Parameters
+    ----------
+    speed
+        Speed of the vehicle under test at the start [km/h].
+    vut_length, vut_width
+        Size of the vehicle under test [m].
+    grade
+        Rise of the road over its length, negative downhill [%].
+    """
+
+    speed: Speed = 40.0
+    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
+    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
+    network: str = "along"
+
+    @property
+    def test_speed(self) -> Quantity:
+        """Speed that the vehicle holds until its driving system acts [m/s]."""
+        return self.start_speed
