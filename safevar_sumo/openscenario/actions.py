@@ -55,7 +55,8 @@ SHAPES: dict[str, tuple[float, Callable[[Array], Array]]] = {
 
 def transition_of(dynamics: Element, change: float, speed: float, name: str) -> Transition:
     """Class TransitionDynamics for a change; its distance is driven at a speed [m/s]. A rate is the largest one."""
-    shape, dimension = attribute(dynamics, "dynamicsShape"), attribute(dynamics, "dynamicsDimension")
+    shape = attribute(dynamics, "dynamicsShape")
+    dimension = attribute(dynamics, "dynamicsDimension")
     value = number(dynamics, "value")
     if shape == "step" or not change or (not value and dimension != "rate"):
         return Transition(0.0, np.ones_like)
@@ -79,7 +80,8 @@ def transition_of(dynamics: Element, change: float, speed: float, name: str) -> 
 
 def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """SpeedAction. Over a distance the acceleration of a linear change is constant."""
-    target, start = part(action, "SpeedActionTarget/*"), actor.speed_now
+    target = part(action, "SpeedActionTarget/*")
+    start = actor.speed_now
     value = number(target, "value")
     if target.tag == "RelativeTargetSpeed":
         if target.get("continuous") == "true":
@@ -120,7 +122,8 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
         gap += other.shape.front - actor.shape.rear if leads else actor.shape.front - other.shape.rear
     signed = gap if leads else -gap
     player.depends(other, player.now, f"{actor.name}'s distance to {other.name}")
-    mine, its = actor.here, other.here
+    mine = actor.here
+    its = other.here
     if isinstance(mine.path, Way) and isinstance(its.path, Way) and mine.path.chain == its.path.chain:
         actor.at = mine._replace(distance=its.distance + signed)
     else:
@@ -147,7 +150,9 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
     if not 0 < time < math.inf:
         raise unsupported(f"SynchronizeAction: {master.name} does not move towards its position")
     way = actor.here.way_to(player.place(part(action, "TargetPosition/*")))
-    final, steady_time, steady_way = way / time, 0.0, 0.0
+    final = way / time
+    steady_time = 0.0
+    steady_way = 0.0
     if (target := action.find("FinalSpeed/*")) is not None:
         if target.tag != "AbsoluteSpeed":
             raise unsupported(f"SynchronizeAction with {target.tag} is not supported")
@@ -156,7 +161,8 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
             is_way = steady.tag == "TargetDistanceSteadyState"
             steady_way = number(steady, "distance") if is_way else number(steady, "time") * final
             steady_time = steady_way / final if final else 0.0
-    until, rest = time - steady_time, way - steady_way
+    until = time - steady_time
+    rest = way - steady_way
     if rest < -1e-6 or until < -1e-6:
         where = f"{way:.1f} m and {time:.1f} s before its position"
         raise unsupported(f"SynchronizeAction: {actor.name} is {where}, within its steady state")
@@ -202,13 +208,16 @@ def lane_change_action(player: Player, action: Element, actor: Actor) -> list[Ru
 
 def lane_offset_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """LaneOffsetAction: as fast as maxLateralAcc allows; without one at once."""
-    way, target, left = _way_of(action, actor), part(action, "LaneOffsetTarget/*"), actor.here.left
+    way = _way_of(action, actor)
+    target = part(action, "LaneOffsetTarget/*")
+    left = actor.here.left
     by = _sign(way, actor) * number(target, "value")
     goal = way.lane_left(way.lane_at(actor.here.distance, left), actor.here.distance) + by
     if target.tag == "RelativeTargetLaneOffset":
         goal = player.other(target).here.left + by
     dynamics = part(action, "LaneOffsetActionDynamics")
-    shape, most = attribute(dynamics, "dynamicsShape"), number(dynamics, "maxLateralAcc", 0.0)
+    shape = attribute(dynamics, "dynamicsShape")
+    most = number(dynamics, "maxLateralAcc", 0.0)
     if shape == "step" or not most or goal == left:
         return [_sideways(player, actor, goal, Transition(0.0, np.ones_like))]
     peaks = {"sinusoidal": math.pi**2 / 2, "cubic": 6.0, "linear": 4.0}
@@ -232,7 +241,8 @@ def _sign(way: Way, actor: Actor) -> int:
 
 
 def _sideways(player: Player, actor: Actor, goal: float, transition: Transition) -> Running:
-    start, share = actor.here.left, transition.share
+    start = actor.here.left
+    share = transition.share
     if not transition.duration:
         actor.at = actor.here._replace(left=goal)
     return actor.begin("sideways", transition.duration, player.now, lambda time: start + (goal - start) * share(time))
@@ -251,7 +261,8 @@ def teleport_action(player: Player, action: Element, actor: Actor) -> list[Runni
 
 def assign_route_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """AssignRouteAction: the actor goes on along the roads of a route, beginning with its own."""
-    way, here = way_of(part(action, "Route"), player.network), actor.here
+    way = way_of(part(action, "Route"), player.network)
+    here = actor.here
     if isinstance(here.path, Way) and here.path.chain != way.chain:
         there = here.path.road_at(here.distance, here.left)
         distance = way.distance_to(there.road.id, there.s)
@@ -277,7 +288,8 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
     times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
     if any(b <= a for a, b in pairwise(times)):
         raise unsupported("FollowTrajectoryAction with Timing: the times of the vertices do not grow")
-    now, stations = player.now, np.asarray(line.stations)
+    now = player.now
+    stations = np.asarray(line.stations)
     speeds = np.diff(stations) / np.diff(times)
     # Who changes its speed evenly has the mean of two neighbours at the vertex in between.
     at_vertices = np.array([speeds[0] if times[0] <= now else 0.0, *(speeds[1:] + speeds[:-1]) / 2, speeds[-1]])

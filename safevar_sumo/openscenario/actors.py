@@ -105,7 +105,9 @@ class Actor:
             self.running[domain].is_replaced = True
         self.running[domain] = running
         if domain == "along":
-            self.along, self.follows, self.stations = Motion(time, value), None, None
+            self.along = Motion(time, value)
+            self.follows = None
+            self.stations = None
         else:
             self.sideways = Motion(time, value)
         return running
@@ -126,11 +128,14 @@ class Actor:
         if not sample or abs(pose.place - self.place[sample]) > 1e-9:
             self.place[sample], self.facing[sample] = pose
         self.speed[sample] = self.speed_now
-        self.distance[sample], self.left[sample] = self.here.distance, self.here.left
+        self.distance[sample] = self.here.distance
+        self.left[sample] = self.here.left
 
     def move(self, sample: int, last: int, times: Array) -> None:
         """Move from a sample to the `last`: the speed is that of the body, along its own direction."""
-        path, now, n = self.here.path, self.here, last - sample
+        path = self.here.path
+        now = self.here
+        n = last - sample
         later = slice(sample + 1, last + 1)
         if self.along is None:
             speed: Array = np.full(n, self.speed_now)
@@ -140,13 +145,16 @@ class Actor:
         ahead = (before + speed) / 2 * STEP
         if self.stations is not None:
             ahead = np.diff(self.stations.value(times[later] - self.stations.since), prepend=now.distance)
-        forward, left, turn = ahead, np.full(n, now.left), np.ones(n)
+        forward = ahead
+        left = np.full(n, now.left)
+        turn = np.ones(n)
         if self.sideways is not None:
             left = np.broadcast_to(self.sideways.value(times[later] - self.sideways.since), n)
             aside = np.diff(left, prepend=now.left)
             sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
             cosine = np.sqrt(1 - np.square(sine))
-            forward, turn = ahead * cosine, np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
+            forward = ahead * cosine
+            turn = np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
         distance = now.distance + np.cumsum(forward)
         if isinstance(path, Way) and not path.is_straight:  # on a way that bends, the inner side is shorter
             for _ in range(2):
@@ -155,8 +163,11 @@ class Actor:
         if self.follows is not None:
             speed, distance, path, left = self._behind(later, left)
         pose = path.pose(distance, left)
-        self.place[later], self.facing[later] = pose.place, pose.facing * turn * now.turn
-        self.speed[later], self.distance[later], self.left[later] = speed, distance, left
+        self.place[later] = pose.place
+        self.facing[later] = pose.facing * turn * now.turn
+        self.speed[later] = speed
+        self.distance[later] = distance
+        self.left[later] = left
         self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
         moves = speed > 1e-3
         since = np.maximum.accumulate(np.where(moves, np.arange(1, n + 1), 0))
@@ -191,8 +202,10 @@ def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
             raise unsupported(f"{name} is no Vehicle, Pedestrian or MiscObject")
         if body.find("Trailer") is not None:
             raise unsupported(f"the Trailer of {name} is not supported")
-        middle, size = part(body, "BoundingBox/Center"), part(body, "BoundingBox/Dimensions")
-        length, width = number(size, "length"), number(size, "width")
+        middle = part(body, "BoundingBox/Center")
+        size = part(body, "BoundingBox/Dimensions")
+        length = number(size, "length")
+        width = number(size, "width")
         if not (0 < length <= 100 and 0 < width <= 100):
             raise unsupported(f"{name} is {length:g} m long and {width:g} m wide", "sizes above 0, up to 100 m")
         shape = Shape(_kind(body, length), length, width, number(middle, "x"), number(middle, "y", 0.0))

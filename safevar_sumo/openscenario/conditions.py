@@ -51,7 +51,8 @@ def _condition(player: Player, condition: Element, window: slice) -> Array:
     seen[window] = _value(player, condition, window)
     samples = np.arange(window.start, window.stop) - round(number(condition, "delay", 0.0) / STEP)
     now = (samples >= first) & seen[samples]
-    has_before, before = samples > first, seen[samples - 1]
+    has_before = samples > first
+    before = seen[samples - 1]
     match condition.get("conditionEdge", "none"):
         case "none":
             return now
@@ -101,8 +102,10 @@ def simulation_time_condition(player: Player, condition: Element, window: slice)
 
 def storyboard_element_state_condition(player: Player, condition: Element, window: slice) -> Array:
     """StoryboardElementStateCondition: transitions hold at the moment at which they happen."""
-    kind, name = attribute(condition, "storyboardElementType").lower(), attribute(condition, "storyboardElementRef")
-    times, state = player.times[window], attribute(condition, "state")
+    kind = attribute(condition, "storyboardElementType").lower()
+    name = attribute(condition, "storyboardElementRef")
+    times = player.times[window]
+    state = attribute(condition, "state")
     began, ended = (
         min(
             (time for (of, path), time in states.items() if of == kind and f"::{path}".endswith(f"::{name}")),
@@ -153,7 +156,8 @@ def relative_distance_condition(player: Player, condition: Element, actor: Actor
 
 def time_headway_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """TimeHeadwayCondition: the distance over the triggering entity's speed [s]."""
-    gap, speed = distance(condition, actor, player.other(condition), window), actor.speed[window]
+    gap = distance(condition, actor, player.other(condition), window)
+    speed = actor.speed[window]
     return compared(condition, np.where(speed > 0, gap / np.maximum(speed, 1e-9), np.inf))
 
 
@@ -163,7 +167,8 @@ def time_to_collision_condition(player: Player, condition: Element, actor: Actor
     if target is None:
         raise unsupported("TimeToCollisionCondition with a position is not supported")
     other = player.other(target)
-    gap, closing = distance(condition, actor, other, window), actor.speed[window] - _along(actor, other, window)
+    gap = distance(condition, actor, other, window)
+    closing = actor.speed[window] - _along(actor, other, window)
     return compared(condition, np.where(closing > 0, gap / np.maximum(closing, 1e-9), np.inf))
 
 
@@ -239,7 +244,8 @@ def distance(condition: Element, actor: Actor, other: Actor, window: slice) -> A
         return np.abs(apart.real if kind == "longitudinal" else apart.imag)
     turn = other.facing[window] / facing
     middle = apart + turn * complex(other.shape.ahead, other.shape.left) - complex(actor.shape.ahead, actor.shape.left)
-    cosine, sine = np.abs(turn.real), np.abs(turn.imag)
+    cosine = np.abs(turn.real)
+    sine = np.abs(turn.imag)
     if kind == "longitudinal":
         reach = (cosine * other.shape.length + sine * other.shape.width + actor.shape.length) / 2
         return np.maximum(np.abs(middle.real) - reach, 0.0)
@@ -249,18 +255,21 @@ def distance(condition: Element, actor: Actor, other: Actor, window: slice) -> A
 
 def _is_along_road(condition: Element, kind: str, actor: Actor) -> bool:
     """Whether a distance is one along a road that bends."""
-    system, path = condition.get("coordinateSystem", "entity"), actor.here.path
+    system = condition.get("coordinateSystem", "entity")
+    path = actor.here.path
     return kind == "longitudinal" and system in ("road", "lane") and isinstance(path, Way) and not path.is_straight
 
 
 def _along_road(condition: Element, actor: Actor, other: Actor, window: slice, is_free: bool) -> Array:
-    own, its = actor.here.path, other.here.path
+    own = actor.here.path
+    its = other.here.path
     if not (isinstance(own, Way) and isinstance(its, Way) and own.chain == its.chain):
         raise unsupported(f"{condition.tag} along a road, of entities on different roads")
     gap = other.distance[window] - actor.distance[window]
     if not is_free:
         return np.abs(gap)
-    ahead, behind = gap + other.shape.rear - actor.shape.front, actor.shape.rear - gap - other.shape.front
+    ahead = gap + other.shape.rear - actor.shape.front
+    behind = actor.shape.rear - gap - other.shape.front
     return np.maximum(np.maximum(ahead, behind), 0.0)
 
 

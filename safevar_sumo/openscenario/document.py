@@ -175,7 +175,8 @@ def read(file: str, given: Mapping[str, str]) -> Document:
         raise unsupported(f"{file!r} has no Storyboard", "a scenario, or a file of parameter values")
     parameters = declared(root)
     values = values_of(parameters, given, {})
-    folder, folders = os.path.dirname(file), []
+    folder = os.path.dirname(file)
+    folders = []
     for each in root.findall("CatalogLocations/*/Directory"):
         folders.append(beside(folder, literal(attribute(each, "path"), values)))
     catalogs: list[str] = []

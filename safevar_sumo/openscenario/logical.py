@@ -83,7 +83,9 @@ def open_file(file: str) -> Source:
     InputError
         If it is neither, or its values are no deterministic ones.
     """
-    root, choices, concrete = root_of(file), [], file
+    root = root_of(file)
+    choices = []
+    concrete = file
     distribution = root.find("ParameterValueDistribution")
     if distribution is not None:
         if distribution.find("Deterministic") is None:
@@ -103,8 +105,10 @@ def _choice(each: Element) -> Choice:
         case "DistributionSet":
             return _filled(Choice((_name(each),), tuple((attribute(one, "value"),) for one in content)))
         case "DistributionRange":
-            limits, step = part(content, "Range"), number(content, "stepWidth")
-            lower, upper = number(limits, "lowerLimit"), number(limits, "upperLimit")
+            limits = part(content, "Range")
+            step = number(content, "stepWidth")
+            lower = number(limits, "lowerLimit")
+            upper = number(limits, "upperLimit")
             if not (step > 0 and lower <= upper and (upper - lower) / step < MOST_STEPS):
                 raise unsupported(f"{_name(each)}: a range from {lower:g} to {upper:g} by {step:g}")
             count = math.floor((upper - lower) / step + 1e-9) + 1
@@ -163,14 +167,16 @@ def constraints_of(
     InputError
         If a constraint is not linear in them.
     """
-    declarations, bounds = declared(root_of(file)), []
+    declarations = declared(root_of(file))
+    bounds = []
 
     def difference(name: str, limit: str, at: FloatArray) -> float:
         own = {key: repr(float(value)) for key, value in zip(names, at, strict=True)}
         values = values_of(declarations, {**given, **own}, {})
         return float(values[name]) - float(literal(limit, values))
 
-    middle, half = (low + high) / 2, (high - low) / 2
+    middle = (low + high) / 2
+    half = (high - low) / 2
     for name, _, groups in declarations:
         for rule, limit in (one for group in groups for one in group):
             if rule not in KINDS:

@@ -48,7 +48,8 @@ class Way(Line):
     @classmethod
     def onward(cls, network: Network, name: str, is_forward: bool) -> Way:
         """The way along a road and straight on along those that follow, as far as there is one such road."""
-        way, following = cls.of(network, ((name, is_forward),)), [(name, is_forward)]
+        way = cls.of(network, ((name, is_forward),))
+        following = [(name, is_forward)]
         while len(following) == 1 and way.is_straight and len(way.chain) <= MAX_DETOUR:
             found = way
             ways = [one for one in network.ways(*way.chain[-1]) if not network.road(one[0]).flaw]
@@ -60,9 +61,11 @@ class Way(Line):
     def road_at(self, distance: float, left: float = 0.0) -> Crossing:
         """The road at a distance, and the place on it."""
         assert self.network is not None
-        road, is_forward = self.network.road(self.chain[-1][0]), self.chain[-1][1]
+        road = self.network.road(self.chain[-1][0])
+        is_forward = self.chain[-1][1]
         for name, direction in self.chain:
-            road, is_forward = self.network.road(name), direction
+            road = self.network.road(name)
+            is_forward = direction
             if distance <= road.length + 1e-9:
                 break
             distance -= road.length
@@ -162,7 +165,9 @@ def world_position(position: Element, network: Network, entity: Entity) -> Place
 
 def lane_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class LanePosition: the offset counts along t, of lanes to the left of the reference line, too."""
-    road, lane, s = network.road(attribute(position, "roadId")), whole(position, "laneId"), number(position, "s")
+    road = network.road(attribute(position, "roadId"))
+    lane = whole(position, "laneId")
+    s = number(position, "s")
     return _in_lane(position, road, network, lane, s)
 
 
@@ -175,7 +180,8 @@ def _in_lane(position: Element, road: Road, network: Network, lane: int, s: floa
 def road_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class RoadPosition."""
     road = network.road(attribute(position, "roadId"))
-    s, t = number(position, "s"), number(position, "t")
+    s = number(position, "s")
+    t = number(position, "t")
     return on_road(road, network, s, t, position.find("Orientation"), against=False)
 
 
@@ -190,7 +196,8 @@ def _of_reference(position: Element, entity: Entity) -> Crossing:
 def relative_road_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class RelativeRoadPosition."""
     here = _of_reference(position, entity)
-    s, t = here.s + number(position, "ds"), here.t + number(position, "dt")
+    s = here.s + number(position, "ds")
+    t = here.t + number(position, "dt")
     return on_road(here.road, network, s, t, position.find("Orientation"), against=False)
 
 
@@ -295,7 +302,8 @@ Chain = tuple[tuple[str, bool], ...]
 
 def _extended(network: Network, options: Sequence[Chain], end: str) -> Chain:
     """The first of some chains of roads that leads to the road with the id `end`, extended by the fewest roads."""
-    queue, most = [*options], len(options[0]) + MAX_DETOUR
+    queue = [*options]
+    most = len(options[0]) + MAX_DETOUR
     while queue:
         option = queue.pop(0)
         if option[-1][0] == end:
@@ -314,7 +322,8 @@ def line_of(trajectory: Element, network: Network, entity: Entity, start: Pose |
         case "ClothoidSpline":
             return Line(_clothoids(shape, network, entity, start))
         case "Clothoid":
-            pose, length = place_of(part(shape, "Position/*"), network, entity).pose, number(shape, "length")
+            pose = place_of(part(shape, "Position/*"), network, entity).pose
+            length = number(shape, "length")
             first = number(shape, "curvature")
             slope = number(shape, "curvaturePrime", number(shape, "curvatureDot", 0.0))
             return Line([Piece(pose, length, first, first + slope * length)])
@@ -325,7 +334,8 @@ def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
     """Class Polyline: straight from vertex to vertex; who stands at one place has several there."""
     positions = [(vertex, part(vertex, "Position/*")) for vertex in shape.findall("Vertex")]
     poses = [place_of(position, network, entity).pose for _, position in positions]
-    pieces, stations = [], [0.0]
+    pieces = []
+    stations = [0.0]
     for (a, _), (b, _) in pairwise(poses):
         length = abs(b - a)
         stations.append(stations[-1] + (length if length > LEAST_WAY else 0.0))
@@ -343,7 +353,8 @@ def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
 
 def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | None) -> list[Piece]:
     """Class ClothoidSpline: one segment after another, from where its actor is unless a start is given."""
-    pieces, pose = [], start
+    pieces = []
+    pose = start
     for segment in shape.findall("ClothoidSplineSegment"):
         begin = segment.find("PositionStart")
         if begin is not None:

@@ -64,14 +64,16 @@ class Piece(NamedTuple):
 
     def pose(self, distance: Number) -> Pose:
         """The pose at a distance from the start."""
-        slope, first = self.slope, self.first
+        slope = self.slope
+        first = self.first
         if abs(slope) * self.length**2 < LEAST_TURN:
             if abs(first) * self.length < LEAST_TURN:
                 return self.start.moved(distance)
             turn = np.exp(1j * first * distance)
             return Pose(self.start.place + self.start.facing * (turn - 1) / (1j * first), self.start.facing * turn)
         # Fresnel's integrals count from where the curvature is 0.
-        scale, sign = math.sqrt(abs(slope) / math.pi), math.copysign(1.0, slope)
+        scale = math.sqrt(abs(slope) / math.pi)
+        sign = math.copysign(1.0, slope)
         offset = first / slope
         turn = np.exp(1j * (first * distance + slope * np.square(distance) / 2))
         way = (_fresnel((distance + offset) * scale, sign) - _fresnel(offset * scale, sign)) / scale
@@ -128,7 +130,8 @@ class Line:
             return self.pieces[0].start.moved(distance, left)
         distances = np.atleast_1d(np.asarray(distance, dtype=float))
         inside = np.clip(distances, 0.0, self.length)
-        place, facing = np.empty(len(inside), complex), np.empty(len(inside), complex)
+        place = np.empty(len(inside), complex)
+        facing = np.empty(len(inside), complex)
         pieces = self._piece_at(inside)
         for k in np.unique(pieces):
             here = pieces == k
@@ -270,7 +273,8 @@ def _road(element: Element) -> Road:
         for section in element.findall("lanes/laneSection")
     ]
     offsets = _cubics(part(element, "lanes"), "laneOffset", "s")
-    pieces, flaw = [], ""
+    pieces = []
+    flaw = ""
     try:
         pieces = [_piece(each, name) for each in element.findall("planView/geometry")]
     except InputError as error:

@@ -129,7 +129,9 @@ class Player:
             raise unsupported(
                 f"no ScenarioObject is named {ego!r}; there are: {', '.join(actors)}", f"ego = {one_of(actors)}"
             )
-        self.actors, self.ego, self.sample = actors, actors[ego], 0
+        self.actors = actors
+        self.ego = actors[ego]
+        self.sample = 0
         self.variables = {
             attribute(each, "name"): attribute(each, "value")
             for each in document.root.findall("VariableDeclarations/VariableDeclaration")
@@ -139,7 +141,8 @@ class Player:
         self.dependences: dict[str, float] = {}
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
-        self.has_begun, self._changes = False, 0
+        self.has_begun = False
+        self._changes = 0
         """Whether Init is over; how many events have begun or ended."""
         self.stop = math.inf
         self.seen: dict[int, tuple[int, Array]] = {}
@@ -193,9 +196,11 @@ class Player:
     # The storyboard
 
     def _act(self, element: Element, story: Key) -> Act:
-        act_key, events = _below(story, element), []
+        act_key = _below(story, element)
+        events = []
         for group in element.findall("ManeuverGroup"):
-            actors, group_key = part(group, "Actors"), _below(act_key, group)
+            actors = part(group, "Actors")
+            group_key = _below(act_key, group)
             if actors.get("selectTriggeringEntities") == "true":
                 raise unsupported("Actors with selectTriggeringEntities = true is not supported")
             own = [self.other(each) for each in actors.findall("EntityRef")]
@@ -363,7 +368,8 @@ class Player:
     def play(self) -> None:
         """Play up to the end."""
         self.initialise()
-        stop, final = self._board.find("StopTrigger"), len(self.times) - 1
+        stop = self._board.find("StopTrigger")
+        final = len(self.times) - 1
         while True:
             self.settle()
             is_asked = math.isinf(self.stop) and stop is not None and len(stop) > 0
@@ -461,7 +467,9 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
 
 def _moved(actor: Actor, samples: slice) -> Moved:
     place = actor.place[samples] + actor.facing[samples] * complex(actor.shape.ahead, actor.shape.left)
-    facing, speed = actor.facing[samples].copy(), actor.speed[samples].copy()  # not views that keep all samples
+    # not views that keep all samples
+    facing = actor.facing[samples].copy()
+    speed = actor.speed[samples].copy()
     return Moved(actor.name, actor.shape, place, facing, speed, actor.deleted)
 
 

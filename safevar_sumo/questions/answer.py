@@ -185,7 +185,8 @@ class Answer:
         InputError
             If the answer has no such table.
         """
-        tables, remarks = {name: self.table(name)}, self.tables.get("remarks")
+        tables = {name: self.table(name)}
+        remarks = self.tables.get("remarks")
         if remarks is not None:
             is_about_it = remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
             tables["remarks"] = remarks[is_about_it]

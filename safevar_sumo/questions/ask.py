@@ -132,7 +132,8 @@ class Question:
     def __init__(self, compute: Callable[..., Answer]) -> None:
         update_wrapper(self, compute)
         is_own = compute.__module__.partition(".")[0] == PACKAGE.name
-        self.compute, self.name = compute, f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
+        self.compute = compute
+        self.name = f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
         parameters = list(inspect.signature(compute).parameters.values())
         if sum(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in parameters) < 2:
             takes = f"takes ({', '.join(map(str, parameters))})"
@@ -296,7 +297,9 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
         name, *words = split(text)
     except ValueError:  # nothing, or a quotation mark without its second one
         raise InputError("ask", repr(text), 'a question with its options, such as "risk --samples 4000"') from None
-    asked, values, waiting = find_question(name), dict[str, Any](), iter(words)
+    asked = find_question(name)
+    values = dict[str, Any]()
+    waiting = iter(words)
     options = {option.flag: option for option in asked.options}
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
@@ -318,7 +321,8 @@ def with_criterion(text: str, unsafe: str | None) -> str:
 
 
 def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
-    limits, metavar = None, None
+    limits = None
+    metavar = None
     if get_origin(hint) is Annotated:
         hint, extra = get_args(hint)
         limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))

@@ -86,7 +86,8 @@ def attack_all(
     for number in range(len(boxes)):
         go_on(number, None)
     while waiting:
-        numbers, generations = [*waiting], [*waiting.values()]
+        numbers = [*waiting]
+        generations = [*waiting.values()]
         waiting.clear()
         settings = np.concatenate([each.settings for each in generations])
         met = np.concatenate([each.judges for each in generations])

@@ -54,9 +54,11 @@ class Box:
         In a study that searches its scenario, each corner of the vehicle's characteristics meets equally many
         encounters, drawn anew in each attempt.
         """
-        of_vehicle, is_open = self.region.characteristics.of_vehicle, self.lower < self.upper
+        of_vehicle = self.region.characteristics.of_vehicle
+        is_open = self.lower < self.upper
         worn = np.flatnonzero(of_vehicle & is_open)
-        rng, size = np.random.default_rng(seed), len(worn)
+        rng = np.random.default_rng(seed)
+        size = len(worn)
         numbers = np.arange(2**size) if 2**size <= MAX_CORNERS else rng.integers(2**size, size=MAX_CORNERS)
         points = np.zeros((len(numbers), len(self.lower)))
         points[:, worn] = numbers[:, np.newaxis] >> np.arange(size) & 1

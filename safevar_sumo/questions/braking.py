@@ -25,12 +25,14 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     2. otherwise the first one after that;
     3. otherwise none if the vehicle collides, and its last one if it does not.
     """
-    trace, nearest_sample = runs.trace, runs.nearest(column)
+    trace = runs.trace
+    nearest_sample = runs.nearest(column)
     active = trace.active[: None if nearest_sample is None else nearest_sample + 1, column]
     speed = np.where(active, trace.speed[: len(active), column], 0.0)
     brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
-    braking_samples, last_cruise = np.flatnonzero(is_braking), np.flatnonzero(speed >= CRUISE_SHARE * speed.max())[-1]
+    braking_samples = np.flatnonzero(is_braking)
+    last_cruise = np.flatnonzero(speed >= CRUISE_SHARE * speed.max())[-1]
     later_samples = braking_samples[braking_samples >= last_cruise]
     if not braking_samples.size or (not later_samples.size and np.isfinite(runs.collision_speed[column])):
         return None

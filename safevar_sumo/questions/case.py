@@ -159,7 +159,8 @@ class Case:
     @property
     def shortfall(self) -> str:
         """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
-        done, planned = Counter(algorithm for algorithm, _ in self.finished_runs), self.study.search.runs
+        done = Counter(algorithm for algorithm, _ in self.finished_runs)
+        planned = self.study.search.runs
         labels = self.study.search.labels if self.has_runs else ()
         missing = ", ".join(f"{name} {done[name]} of {planned} runs" for name in labels if done[name] < planned)
         return f"{self.name}: unfinished, {missing}; only solutions of finished runs count." if missing else ""

@@ -61,9 +61,12 @@ class Evaluator:
         with about(study.source):
             self.region = region_of(study)
         self.characteristics = self.region.characteristics
-        self._pool, self.progress, self._verified = pool, progress, verified
+        self._pool = pool
+        self.progress = progress
+        self._verified = verified
         self.simulated = 0
-        self.measure, self.undefined = "", list[tuple[int, int]]()
+        self.measure = ""
+        self.undefined = list[tuple[int, int]]()
 
     def evaluate(self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False) -> Evaluations:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
@@ -75,7 +78,8 @@ class Evaluator:
         is_feasible = self.region.feasible(settings) | ignore_constraints
         if is_feasible.all():
             return self._evaluate_shown(settings, stage, self._verified)
-        infeasible, undefined = settings[~is_feasible], np.full(np.count_nonzero(~is_feasible), np.nan)
+        infeasible = settings[~is_feasible]
+        undefined = np.full(np.count_nonzero(~is_feasible), np.nan)
         not_simulated = Evaluations(
             settings=infeasible,
             outcome=np.full(len(infeasible), Outcome.INFEASIBLE.value, dtype="U16"),
@@ -145,7 +149,8 @@ class Evaluator:
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         compile_vehicle(self.study, self._pool, self.progress)
-        done, total = 0, len(np.unique(settings, axis=0))
+        done = 0
+        total = len(np.unique(settings, axis=0))
         self.progress(stage, done, total)
 
         def show_more_done(increment: int) -> None:
@@ -294,7 +299,8 @@ class Evaluator:
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
         other = Evaluator(study, self._pool, self._show, self._verified if verified is None else verified)
-        other.measure, other.undefined = self.measure, self.undefined
+        other.measure = self.measure
+        other.undefined = self.undefined
         return other
 
     def _show(self, stage: str, done: int, total: int) -> None:
@@ -310,16 +316,19 @@ def side_by_side(
     """
     if len(evaluators) < 2:
         return [measure(one) for one in evaluators]
-    pool, show = evaluators[0]._pool, evaluators[0].progress
+    pool = evaluators[0]._pool
+    show = evaluators[0].progress
     done = 0
 
     def measure_on(evaluator: Evaluator, part: Pool) -> Found:
         nonlocal done
-        evaluator._pool, evaluator.progress = part, show_no_progress
+        evaluator._pool = part
+        evaluator.progress = show_no_progress
         try:
             found = measure(evaluator)
         finally:
-            evaluator._pool, evaluator.progress = pool, show
+            evaluator._pool = pool
+            evaluator.progress = show
         done += 1
         show(stage, done, len(evaluators))
         return found
@@ -362,7 +371,8 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
 
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
     """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
-    lower, upper = characteristics.lower, characteristics.upper
+    lower = characteristics.lower
+    upper = characteristics.upper
     return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
 
 

@@ -100,7 +100,8 @@ def prediction_band(
     side.
     """
     ends = np.full((2, safety_degrees.shape[1]), np.nan)
-    is_defined, shares = np.isfinite(safety_degrees).any(axis=0), [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2]
+    is_defined = np.isfinite(safety_degrees).any(axis=0)
+    shares = [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2]
     ends[:, is_defined] = np.nanquantile(safety_degrees[:, is_defined], shares, axis=0)
     lower, upper = ends
     return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error

@@ -142,7 +142,8 @@ def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_un
     study = evaluator.study
     studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
     in_fits = replace(unsafe, keep=0.0)
-    members, left_out = [Model(0, evaluator, unsafe)], list[int]()
+    members = [Model(0, evaluator, unsafe)]
+    left_out = list[int]()
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         original = model.evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "original with each fit")

@@ -134,7 +134,8 @@ def judge_causes(
     """
     system, vehicle = assemble_both_systems(study)
     second_system = replace(system, vehicle=vehicle)
-    rows, count = causes.to_dict("records"), len(causes) + 1
+    rows = causes.to_dict("records")
+    count = len(causes) + 1
     progress(STAGE, 0, count)
     frame, runs = _drive_both(system, second_system, rows, unsafe)
     judged = list[tuple[Verdict, dict[str, float], dict[str, float], str]]()
@@ -156,7 +157,8 @@ def _drive_both(
     system: System, second_system: System, causes: Sequence[dict[Any, Any]], unsafe: Unsafe
 ) -> tuple[pd.DataFrame, _Runs]:
     """Simulate the original vehicle and the causes with both models: a frame with `SETTING_COLUMNS`, and the runs."""
-    characteristics, contact = system.characteristics, system.contact
+    characteristics = system.characteristics
+    contact = system.contact
     values = [{}, *(cause["changes"] | cause.get("encounter", {}) for cause in causes)]
     settings = np.stack([characteristics.setting(one, beyond=True) for one in values])
     originals = characteristics.with_original_vehicle(settings)
@@ -188,7 +190,9 @@ def _judge(
     """The verdict on a cause, and its reason."""
     if reasons := vehicle.reasons_to_omit(cause["changes"]):
         return "outside", "; ".join(reasons)
-    own, there, fails_there = len(runs.settings) + row, runs.there, unsafe.of(runs.theirs)
+    own = len(runs.settings) + row
+    there = runs.there
+    fails_there = unsafe.of(runs.theirs)
     if unsafe.of(runs.ours)[own]:
         return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
     if fails_there[own] or not runs.theirs.valid[own] or second_system.measuring.scoring.violation(runs.theirs)[row]:

@@ -91,10 +91,13 @@ def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
 
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of `judge_sample`."""
-    rows, share_of = [], avoided_shares(verdicts)
+    rows = []
+    share_of = avoided_shares(verdicts)
     drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]
     for driver in drivers if len(verdicts) else ():
-        later, number, avoided = f"{driver}_later", int(verdicts[driver].count()), int(verdicts[driver].sum())
+        later = f"{driver}_later"
+        number = int(verdicts[driver].count())
+        avoided = int(verdicts[driver].sum())
         low = high = share_of.get(driver)
         if number and len(verdicts) < collisions:
             low, high = clopper_pearson(avoided, number)
@@ -125,9 +128,11 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     drivers = DRIVERS | (OF_LANES if any(point.scenario.border for point in system.points) else {})
     verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(point="")
     for index in np.unique(worst).tolist():
-        rows, point = np.flatnonzero(worst == index), system.points[index]
+        rows = np.flatnonzero(worst == index)
+        point = system.points[index]
         study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
-        settings, there = collisions.settings[rows], system.at(point)
+        settings = collisions.settings[rows]
+        there = system.at(point)
         verdicts.loc[rows, list(drivers)] = _judge_at_point(evaluator.for_study(study), there, settings, drivers)
         verdicts.loc[rows, "point"] = point.name
     return verdicts
@@ -137,7 +142,8 @@ def _judge_at_point(
     evaluator: Evaluator, system: System, settings: FloatArray, drivers: Mapping[str, tuple[str, JsonObject]]
 ) -> FloatArray:
     """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
-    approach, verdicts = approach_parameters(system), dict[str, FloatArray]()
+    approach = approach_parameters(system)
+    verdicts = dict[str, FloatArray]()
     if approach is None:
         return np.full((len(settings), len(drivers)), np.nan)
     with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
@@ -168,7 +174,8 @@ def approach_parameters(system: System) -> JsonObject | None:
     that speed.
     """
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
-    speed, is_braking = trace.speed[:, 0], trace.brake[:, 0] > 0
+    speed = trace.speed[:, 0]
+    is_braking = trace.brake[:, 0] > 0
     if speed[0] > 0 or not speed.any():
         return {}
     if len(system.characteristics.scenario):

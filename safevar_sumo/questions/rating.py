@@ -100,7 +100,8 @@ def rating(
     solution
         The variant is the N-th solution of a run, from 0, of a results directory; `set` changes it further.
     """
-    study, original = evaluator.study, evaluator.characteristics.original
+    study = evaluator.study
+    original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}
     if study.scenario.search:
         raise InputError(
@@ -127,12 +128,14 @@ def _variant(
         If there is no such solution, a value is outside its domain, or the changed variant violates a constraint.
     """
     characteristics = evaluator.characteristics
-    setting, name = characteristics.original, "variant"
+    setting = characteristics.original
+    name = "variant"
     if solution is not None:
         if isinstance(subject, Study):
             raise InputError("solution", f"{subject.name!r} is a study and has no solutions", "a results directory")
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(solution))]
-        setting, name = row[list(characteristics.names)].to_numpy(float), solution
+        setting = row[list(characteristics.names)].to_numpy(float)
+        name = solution
     if changes:
         with about("set"):
             values = dict(zip(characteristics.names, setting.tolist(), strict=True))
@@ -145,12 +148,15 @@ def _variant(
 
 def rate(study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: CellResults) -> Answer:
     """The answer about the original vehicle and its variant, settings by name, that were simulated in all cells."""
-    protocol, scores, names = rater.protocol, rater.points(cells), list(settings)
+    protocol = rater.protocol
+    scores = rater.points(cells)
+    names = list(settings)
     lost = (scores.total[0] - scores.total).round(DECIMALS)
     possible = round(sum(sum(matrix.points) for matrix in protocol.matrices), DECIMALS)
     tests = tabulate("Points by test", TESTS, _rows_of_tests(rater, scores, names))
     changes = [_changes(study, setting) for setting in settings.values()]
-    invalid, remarks = (~cells.valid).sum(axis=1), [*_remarks(rater, scores, cells)]
+    invalid = (~cells.valid).sum(axis=1)
+    remarks = [*_remarks(rater, scores, cells)]
     vehicles = tabulate("Vehicles", VEHICLES, zip(names, scores.total, lost, changes, invalid, remarks, strict=True))
     not_simulated = tabulate(
         "Not simulated, neither passed nor failed", NOT_SIMULATED, protocol.points_not_simulated.items()
@@ -245,9 +251,11 @@ def _remarks(rater: Rater, scores: Points, cells: CellResults) -> Iterator[str |
 
 def _points_of_open_layers(rater: Rater) -> float:
     """Points of the robustness layers of simulated tests that are neither simulated nor claimed."""
-    protocol, points = rater.protocol, 0.0
+    protocol = rater.protocol
+    points = 0.0
     for matrix in protocol.matrices:
-        layers, claimed = protocol.layers_of(matrix.test_name), rater.claims.get(matrix.test_name, ())
+        layers = protocol.layers_of(matrix.test_name)
+        claimed = rater.claims.get(matrix.test_name, ())
         is_open = [not layer.simulated_conditions and layer.name not in claimed for layer in layers]
         points += matrix.points[2] * sum(is_open) / len(layers)
     return points
@@ -257,7 +265,8 @@ def _verdict(
     study: Study, settings: Mapping[str, FloatArray], scores: Points, possible: float, tests: pd.DataFrame
 ) -> str:
     """How many points the variant loses and in which tests; without a variant, the original's points."""
-    weather, road = weather_of(study.weather), ""
+    weather = weather_of(study.weather)
+    road = ""
     if weather.water or weather.road_friction != 1:
         road = (
             f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
@@ -272,7 +281,8 @@ def _verdict(
         f"{items[name].short_name} {float(items[name].text(value)):g}{items[name].suffix}"
         for name, value in _changes(study, settings[variant]).items()
     ]
-    lost, where = round(scores.total[0] - scores.total[-1], DECIMALS), ""
+    lost = round(scores.total[0] - scores.total[-1], DECIMALS)
+    where = ""
     result = f"earns {-lost:.2f} points more, {scores.total[-1]:.2f} instead" if lost < 0 else f"loses {lost:.2f}"
     losses = tests[tests["variant"] == variant]
     largest = losses[losses["lost"] == losses["lost"].max()]

@@ -71,9 +71,11 @@ def risk(
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
-    study, model = evaluator.study, VariationModel(evaluator.study)
+    study = evaluator.study
+    model = VariationModel(evaluator.study)
     criterion = evaluator.choose_criterion(unsafe, subject)
-    rng, batches = np.random.default_rng(study.search.seed), []
+    rng = np.random.default_rng(study.search.seed)
+    batches = []
     evaluator.plan(SAMPLING, SENSITIVITY)
     with evaluator.stage(SAMPLING, samples):
         for start in range(0, samples, VEHICLES_PER_CALL):
@@ -81,7 +83,8 @@ def risk(
             batches.append(evaluator.evaluate(vehicles, SAMPLING))
     drawn = Evaluations.concatenate(batches)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
-    failures, total = int(criterion.of(simulated).sum()), len(simulated)
+    failures = int(criterion.of(simulated).sum())
+    total = len(simulated)
     if not total:
         raise SimulationError(f"study {study.name!r}: none of {samples} vehicles could be simulated")
     low, high = clopper_pearson(failures, total, confidence)
@@ -150,7 +153,8 @@ def sobol_indices(evaluator: Evaluator, model: VariationModel, criterion: Unsafe
     from SALib.analyze import sobol as analysis
     from SALib.sample import sobol as design
 
-    names, seed = list(evaluator.characteristics.names), evaluator.study.search.seed % 2**32
+    names = list(evaluator.characteristics.names)
+    seed = evaluator.study.search.seed % 2**32
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
     evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)

@@ -63,17 +63,21 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
-    study, characteristics = evaluator.study, evaluator.characteristics
+    study = evaluator.study
+    characteristics = evaluator.characteristics
     criterion = evaluator.choose_criterion(unsafe, subject)
     vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
     evaluations = evaluator.evaluate(vehicles, "settings over the whole domain")
     rows = np.arange(len(evaluations))
     training, testing = (evaluations.take(half[evaluations.valid[half]]) for half in np.split(rows, [len(rows) // 2]))
-    is_unsafe, is_unsafe_in_test = criterion.of(training), criterion.of(testing)
-    total, failures = len(training) + len(testing), int(is_unsafe.sum() + is_unsafe_in_test.sum())
+    is_unsafe = criterion.of(training)
+    is_unsafe_in_test = criterion.of(testing)
+    total = len(training) + len(testing)
+    failures = int(is_unsafe.sum() + is_unsafe_in_test.sum())
     if not total:
         raise SimulationError(f"study {study.name!r}: none of {len(rows)} vehicles could be simulated")
-    boxes, remark = [], ""
+    boxes = []
+    remark = ""
     if is_unsafe.all() and len(training):
         boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]
     elif min(is_unsafe.sum(), (~is_unsafe).sum()) < MIN_SETTINGS:
@@ -119,7 +123,8 @@ def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
 def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[float]:
     """The unsafe share within a box, and the share of the unsafe settings within it, each with its interval."""
     is_inside = is_within(box, settings)
-    count, values = int(np.count_nonzero(is_inside & is_unsafe)), []
+    count = int(np.count_nonzero(is_inside & is_unsafe))
+    values = []
     for total in (int(is_inside.sum()), int(is_unsafe.sum())):
         values += [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
     return values
@@ -129,7 +134,8 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
     """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to those before it is
     dropped.
     """
-    lower, width = characteristics.lower, characteristics.upper - characteristics.lower
+    lower = characteristics.lower
+    width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
     leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
     dense_boxes = [box for box, density in leaves if density > 0.5]
@@ -139,7 +145,8 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
     digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
     rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
-    chosen, is_uncovered = list[FloatArray](), is_unsafe.copy()
+    chosen = list[FloatArray]()
+    is_uncovered = is_unsafe.copy()
     for box in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
         is_inside = is_within(box, settings)
         if not chosen or np.count_nonzero(is_uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):

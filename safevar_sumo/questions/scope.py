@@ -16,7 +16,8 @@ from safevar_sumo.sumo.system import assemble
 def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixTest, list[Point]]]:
     """The tests of a study's matrix, each with its points."""
     assert study.matrix is not None
-    rest, tests = iter(points), []
+    rest = iter(points)
+    tests = []
     for test in study.matrix.tests:
         count = max(len(test.weathers), 1)
         for values in test.over.values():

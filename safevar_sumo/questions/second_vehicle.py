@@ -193,7 +193,9 @@ class SecondVehicle(Vehicle):
     """
 
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
-        self._vehicle, self.UNITS, self.spinning = vehicle, vehicle.UNITS, set[bytes]()
+        self._vehicle = vehicle
+        self.UNITS = vehicle.UNITS
+        self.spinning = set[bytes]()
         if vehicle.second_model not in MAPPINGS:
             problem = f"vehicle.model = {study.vehicle.model!r} is no vehicle that the second model can represent"
             raise InputError(study.source, problem, f"one of {', '.join(MAPPINGS)}, or a class derived from one")
@@ -203,7 +205,8 @@ class SecondVehicle(Vehicle):
         rows = study.vehicle.characteristics.items()
         matching = {name: row.original for name, row in rows if cls.UNITS.get(name) == row.unit}
         originals = {name: row.original for name, row in load_study(shipped).vehicle.characteristics.items()}
-        self._original, self._matching = originals | matching, matching.keys()
+        self._original = originals | matching
+        self._matching = matching.keys()
 
     def reasons_to_omit(self, changes: Mapping[str, float]) -> list[str]:
         """The reason for each changed characteristic that cannot be represented; empty if all can."""
@@ -220,7 +223,8 @@ class SecondVehicle(Vehicle):
         slope: Slope = LEVEL,
         water: float | FloatArray = 0.0,
     ) -> Prepared:
-        road, settings = Road(road_friction, slope, water), np.stack([*characteristics.values()], axis=1)
+        road = Road(road_friction, slope, water)
+        settings = np.stack([*characteristics.values()], axis=1)
         original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
         plant, original_plant = (
@@ -247,7 +251,8 @@ class SecondVehicle(Vehicle):
         """The state in which the pedals hold the original vehicle's speed, which may be 0."""
         original = self._engine.at_start(prepared.original, speed)
         commands = DelayedSignal.of(original.brake, prepared.plant.brake_delay, prepared.step)
-        vehicle, body = self._vehicle.at_start(prepared.vehicle, speed), balanced_state(prepared.plant, speed)
+        vehicle = self._vehicle.at_start(prepared.vehicle, speed)
+        body = balanced_state(prepared.plant, speed)
         return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, body, commands)
 
     def sensors(self, prepared: Prepared) -> Sensors | None:
@@ -261,7 +266,9 @@ class SecondVehicle(Vehicle):
         return state._replace(original=self._engine.hold_gear(prepared.original, state.original, holds))
 
     def advance(self, prepared: Prepared, state: SecondState, command: Command) -> SecondState:
-        plant, body, brake = prepared.plant, state.body, state.brake
+        plant = prepared.plant
+        body = state.body
+        brake = state.brake
         friction = self._engine.friction(prepared.vehicle, state.speed)
         if friction is not None:
             plant = plant._replace(friction=friction)
@@ -281,7 +288,10 @@ class SecondVehicle(Vehicle):
 
     def _advance_engine(self, prepared: Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
         """The original vehicle one step later, and the torque of its engine and all drags on all wheels [N m]."""
-        plant, radius, speed, original = prepared.plant, prepared.plant.radius, state.speed, state.original
+        plant = prepared.plant
+        radius = prepared.plant.radius
+        speed = state.speed
+        original = state.original
         # The speed at which the original's wheels turn as fast as the second model's.
         original_speed = speed * prepared.engine_radius / radius
         if hasattr(original, "wheel_speed"):

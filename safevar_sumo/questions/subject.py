@@ -120,7 +120,8 @@ def study_or_case(
     if isinstance(source, str | Path):
         # `os.path` accepts any text, unlike paths.
         names = study_names()
-        is_directory, is_study = os.path.isdir(source), str(source) in names
+        is_directory = os.path.isdir(source)
+        is_study = str(source) in names
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
             raise InputError(
                 source, "is a study and has no solutions", "a directory that the command `study` has written"
@@ -194,7 +195,8 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     from safevar_sumo.campaign.identity import identity_of
     from safevar_sumo.sumo.system import assemble
 
-    manifest, study = read_manifest(directory), case.study
+    manifest = read_manifest(directory)
+    study = case.study
     if "imported" in manifest:
         return []
     present = manifest_of(study, identity_of(study, assemble(study), manifest.get("files", {})))

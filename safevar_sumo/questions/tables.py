@@ -128,11 +128,14 @@ def csv_cell(value: Any) -> Any:
 
 def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """The tables that readers see in place of a frame, by name: itself, or those that `Wide` describes."""
-    wide, columns = frame.attrs.get("wide"), columns_of(frame)
+    wide = frame.attrs.get("wide")
+    columns = columns_of(frame)
     if wide is None or frame.empty:
         yield name, frame
         return
-    heads, title, words = frame[wide.by].unique(), frame.attrs["title"], frame.attrs["words"]
+    heads = frame[wide.by].unique()
+    title = frame.attrs["title"]
+    words = frame.attrs["words"]
     for value in wide.values:
         ends = ("",) if value in frame else (LOW, HIGH)
         column = columns[f"{value}{ends[0]}"]
@@ -163,10 +166,12 @@ class _ReaderColumn(NamedTuple):
 
 def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
     """The columns of a table for readers: an interval stands behind its value unless that is exact, or alone."""
-    columns, words = columns_of(frame), frame.attrs.get("words", {})
+    columns = columns_of(frame)
+    words = frame.attrs.get("words", {})
     for name in map(str, frame):
         base = re.sub(f"({LOW}|{HIGH})$", "", name)
-        column, ends = columns.get(name, Column("", "")), [f"{base}{LOW}", f"{base}{HIGH}"]
+        column = columns.get(name, Column("", ""))
+        ends = [f"{base}{LOW}", f"{base}{HIGH}"]
         if not column.is_shown or (base != name and (base in frame or name == ends[1])):
             continue
         if len(frame) and frame[[name] if base == name else ends].isna().all(axis=None):  # undefined in every row
@@ -207,7 +212,8 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
             yield ": ".join(filter(None, (first, " ".join(filter(None, others)))))
         return
     if 1 + sum(max(_least_width(column), LEAST_TEXT * column.is_long) for column in every) <= width:
-        columns, long = every, []
+        columns = every
+        long = []
     labels = list(takewhile(lambda column: not column.is_number, columns))
     if 1 + sum(map(_least_width, labels)) > width:
         labels = labels[:1]

@@ -39,7 +39,8 @@ class VariationModel:
         distributions = [study.variation.get(name, Uniform()) for name in self.characteristics.names]
         self._study = study.source
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
-        self.is_correlated, correlations = bool(study.correlations), np.eye(len(distributions))
+        self.is_correlated = bool(study.correlations)
+        correlations = np.eye(len(distributions))
         for correlation in study.correlations:
             first, second = map(self.characteristics.names.index, correlation.between)
             correlations[first, second] = correlations[second, first] = correlation.value
@@ -75,13 +76,16 @@ def _quantile_function(
     characteristic: Characteristic, distribution: Distribution
 ) -> Callable[[FloatArray], FloatArray]:
     """The function that turns cumulative probabilities into values in the characteristic's unit."""
-    low, high, original = characteristic.lower, characteristic.upper, characteristic.original
+    low = characteristic.lower
+    high = characteristic.upper
+    original = characteristic.original
     stated = stated_values(distribution)
     match distribution:
         case Fixed():
             return lambda p: np.full_like(p, stated.get("value", original))
         case Uniform() | Triangular():
-            lower, upper = stated.get("lower", low), stated.get("upper", high)
+            lower = stated.get("lower", low)
+            upper = stated.get("upper", high)
             if isinstance(distribution, Uniform):
                 return lambda p: lower + p * (upper - lower)
             triangle = scipy.stats.triang(
@@ -89,11 +93,13 @@ def _quantile_function(
             )
             return lambda p: triangle.ppf(p)
         case Normal():
-            mean, deviation = stated.get("mean", original), stated["deviation"]
+            mean = stated.get("mean", original)
+            deviation = stated["deviation"]
             normal = scipy.stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, mean, deviation)
             return lambda p: normal.ppf(p)
         case Lognormal():
-            mean, deviation = np.log(stated.get("median", original)), stated["sigma"]
+            mean = np.log(stated.get("median", original))
+            deviation = stated["sigma"]
             ends = (np.log(low) - mean) / deviation, (np.log(high) - mean) / deviation
             logarithm = scipy.stats.truncnorm(*ends, mean, deviation)
             return lambda p: np.exp(logarithm.ppf(p))

@@ -43,7 +43,8 @@ def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]
     """
     texts = []
     for item in characteristics:
-        original, value = item.original, values.get(item.name, item.original)
+        original = item.original
+        value = values.get(item.name, item.original)
         if value != original:
             share = f" ({100 * (value - original) / abs(original):+.1f} %)" if original else ""
             texts.append(f"{item.name} {original:g} -> {item.text(value)}{item.suffix}{share}")
@@ -108,7 +109,8 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     """
     if not study.scenario.search:
         return []
-    names, those = join_phrases(study.scenario.search), "those" if left_out is None else f"{left_out:,}"
+    names = join_phrases(study.scenario.search)
+    those = "those" if left_out is None else f"{left_out:,}"
     left_out_in_words = f"left out: {those} in which the original is not safe"
     return [
         f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}.",

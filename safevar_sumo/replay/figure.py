@@ -80,7 +80,8 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row:
     """Mark where a vehicle begins to brake, is nearest, and collides. The original's marks are larger, to show behind
     the changed vehicle's.
     """
-    trace, (start, nearest, end) = comparison.runs.trace, comparison.moments[row]
+    trace = comparison.runs.trace
+    start, nearest, end = comparison.moments[row]
     impact_speed = float(comparison.runs.collision_speed[row])
     has_impact = not np.isnan(impact_speed)
 

@@ -166,7 +166,8 @@ def _show_sample(api: Api, scene: FlatScene, sample: int) -> None:
         y = body.y[sample]
         angle = 90 - np.rad2deg(body.heading[sample])
         if not np.isnan(x):
-            name, (right, up) = f"{body.row}.{body.name}", _road_origin(scene, body.row)
+            name = f"{body.row}.{body.name}"
+            right, up = _road_origin(scene, body.row)
             api.vehicle.moveToXY(name, "", 0, x + right, y + up, angle, keepRoute=ANY_POSITION)
             api.vehicle.setSignals(name, BRAKE_LIGHT if scene.brakes(body, sample) else 0)
     for row in comparison.rows:

@@ -70,25 +70,32 @@ class Packed:
     def __init__(
         self, packed: PackedStudy, files: dict[str, bytes], places: Sequence[str], jobs: int | None, progress: Progress
     ) -> None:
-        self.packed, self.files, self._places, self._jobs, self._progress = packed, files, places, jobs, progress
+        self.packed = packed
+        self.files = files
+        self._places = places
+        self._jobs = jobs
+        self._progress = progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
         with about(MANIFEST):
             study = convert_table(self.manifest["study"], Study, "study")
         study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
         self._check_claims(study)
         scoring = msgspec.convert(self.manifest["scoring"], Scoring) if "scoring" in self.manifest else None
-        solutions, outcomes = read_table(files[SOLUTIONS]), packed.outcomes
+        solutions = read_table(files[SOLUTIONS])
+        outcomes = packed.outcomes
         self._solution_rows = rows_of(files[SOLUTIONS])
         codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
         evaluations = pd.DataFrame({"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))})
-        original, scoring = self.manifest["original"], scoring or PUBLISHED_SCORING
+        original = self.manifest["original"]
+        scoring = scoring or PUBLISHED_SCORING
         self.case = build_case(study, original, solutions, evaluations, packed.runs, scoring=scoring)
         self._directory = Path("results", study.name)
         self._answers: dict[str, Answer] = {}
 
     def _check_claims(self, study: Study) -> None:
         """Refuse what no pack claims, before anything is computed."""
-        outcomes, runs = self.packed.outcomes, self.packed.runs
+        outcomes = self.packed.outcomes
+        runs = self.packed.runs
         if unknown := outcomes.keys() - set(Outcome):
             raise ValueError(f"there is no outcome {min(unknown)!r}")
         if not set(runs) <= set(all_runs(study)) or len(runs) > len({*runs}):
@@ -131,7 +138,8 @@ class Packed:
     @cached_property
     def simulated(self) -> tuple[bytes, bytes]:
         """The original vehicle's evaluation, and the table of solutions, all simulated again."""
-        characteristics, solutions = self.case.characteristics, self.case.solutions
+        characteristics = self.case.characteristics
+        solutions = self.case.solutions
         settings = self.case.settings
         evaluations = evaluate_settings(self.case.study, settings, jobs=self._jobs, progress=self._progress)
         frame = evaluations_frame(characteristics.names, [(("", 0), evaluations.take(range(1, len(settings))))])
@@ -142,7 +150,8 @@ class Packed:
     def searched(self) -> tuple[bytes, bytes]:
         """The outcomes of all evaluations, and the table of solutions, of the same runs again."""
         with tempfile.TemporaryDirectory() as folder:
-            study, runs = self.case.study, self.packed.runs
+            study = self.case.study
+            runs = self.packed.runs
             results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs)
             return json_bytes(count_outcomes(results.case)), rows_of(csv_of(results.solutions))
 
@@ -166,7 +175,8 @@ class Packed:
 
         Networks count, since SUMO's options beside them may name files to write; scenes of OpenSCENARIO do not.
         """
-        study, prefix = self.case.study, f"{CODE}/"
+        study = self.case.study
+        prefix = f"{CODE}/"
         names = [name for name in self.files if not name.endswith((".xosc", ".xodr"))]
         files = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
         named = [name for name in (*study.search.algorithms, *self.packed.questions) if ":" in name.partition(" ")[0]]

@@ -87,7 +87,8 @@ def evidence(
     """
     out = Path(out)
     check_writable(out, "out", (".zip",))
-    studies, files = [], dict[str, bytes]()
+    studies = []
+    files = dict[str, bytes]()
     with open_progress(progress) as show:
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
             described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
@@ -105,7 +106,8 @@ def _pack_study(
     assert isinstance(case, Case)
     if not case.has_runs:
         raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
-    study, manifest = case.study, read_manifest(directory)
+    study = case.study
+    manifest = read_manifest(directory)
     manifest.pop("folders", None)  # of this machine
     (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown, directory)]

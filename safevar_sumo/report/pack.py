@@ -59,7 +59,8 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
             entry = zipfile.ZipInfo(name)  # with the same date on every day, in 1980
-            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << UNIX_MODE_SHIFT
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << UNIX_MODE_SHIFT
             archive.writestr(entry, texts[name])
 
 

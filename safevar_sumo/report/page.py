@@ -240,7 +240,9 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
     """One study for the template. On its front stand all verdicts, the first of them with its first table; answers to
     the same question follow it with theirs.
     """
-    anchor, answers, trusted = f"study-{number}", study.answers, trust(study)
+    anchor = f"study-{number}"
+    answers = study.answers
+    trusted = trust(study)
     sections = list(_sections(anchor, [*answers, tested(study), trusted]))
     leading = [*takewhile(lambda answer: answer.question == answers[0].question, answers)] or [trusted]
     return {
@@ -290,7 +292,8 @@ def _picture(figure: Figure) -> JsonObject:
     """A figure for the page: Matplotlib's SVG in a link that holds it; equal figures give equal bytes."""
     import matplotlib
 
-    axis, buffer = figure.axes[0], BytesIO()
+    axis = figure.axes[0]
+    buffer = BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     svg = LONG_DECIMALS.sub(r"\1", buffer.getvalue().decode())

@@ -126,7 +126,8 @@ class ReportedStudy:
     @cached_property
     def choices(self) -> dict[str, str]:
         """The handles of the solutions that `FIRST_CHOICES` select, and why; if none is unsafe, of the most severe."""
-        solutions, chosen = self.case.solutions, dict[str, list[str]]()
+        solutions = self.case.solutions
+        chosen = dict[str, list[str]]()
         names = [] if solutions.empty else list(FIRST_CHOICES)
         for name in names if self.case.unsafe.rows(solutions).any() else names[-1:]:
             handle = choose_handle(solutions, self.case.unsafe, name)
@@ -210,7 +211,8 @@ def _conditions(study: ReportedStudy) -> str:
 
 
 def _search(study: ReportedStudy) -> str:
-    case, search = study.case, study.case.study.search
+    case = study.case
+    search = study.case.study.search
     versions = ", ".join(f"{name} {value}" for name, value in study.versions.items())
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
@@ -229,7 +231,8 @@ def name_and_sentence(models: Mapping[str, type], name: str) -> str:
 
 def trust(study: ReportedStudy) -> Answer:
     """How far the results agree with published data and with other fitted vehicle models, and what they leave out."""
-    case, tables = study.case, dict[str, pd.DataFrame]()
+    case = study.case
+    tables = dict[str, pd.DataFrame]()
     fitted = "Published data were used to fit the vehicle; the " if case.study.spread else "The "
     verdict = (
         f"{fitted}simulations of this study were not compared with published ones: whether another simulator or a real "
@@ -238,7 +241,8 @@ def trust(study: ReportedStudy) -> Answer:
     agreement = shipped_agreement(case.study)
     if len(agreement):
         tables["agreement"] = tabulate("Agreement with published data: safety degrees", AGREEMENT, agreement)
-        lowest, highest = agreement["spearman"].min(), agreement["spearman"].max()
+        lowest = agreement["spearman"].min()
+        highest = agreement["spearman"].max()
         verdict = (
             f"Compared with {number_of(len(agreement), 'file')} of published simulations: the safety degrees have a "
             f"rank correlation of {lowest:.2f}{'' if lowest == highest else f' to {highest:.2f}'} with them. Nothing "
@@ -273,7 +277,8 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for each set of changed
     characteristics.
     """
-    characteristics, settings = study.case.characteristics, dict[str, FloatArray]()
+    characteristics = study.case.characteristics
+    settings = dict[str, FloatArray]()
     for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
         settings[handle] = setting
     changes: dict[tuple[str, ...], tuple[Mapping[str, float], Mapping[str, float]]] = {}
@@ -310,7 +315,8 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
 
 def commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
     """The commands that give the numbers of the page, each after what it gives."""
-    directory, flag = str(study.directory), " --as-it-is-now" if study.later_changes else ""
+    directory = str(study.directory)
+    flag = " --as-it-is-now" if study.later_changes else ""
     if study.case.has_runs:
         out = json.dumps(f"{directory}-again")
         script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out}, progress=True)"

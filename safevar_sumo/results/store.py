@@ -99,7 +99,8 @@ class ResultsDirectory:
         remarks = []
         if not earlier_manifest:
             return []
-        (_, _, before), (_, _, now) = search_extent_of(earlier_manifest), search_extent_of(self.manifest)
+        _, _, before = search_extent_of(earlier_manifest)
+        _, _, now = search_extent_of(self.manifest)
         if before != now:
             remarks.append(
                 f"{self.path}: each run had {before} evaluations before and has {now} now: an id such as nsga2:0:0 may "

@@ -175,7 +175,8 @@ class OpenScenario(TrackScenario):
 
     def remarks(self) -> list[str]:
         """What of the file has no effect here, or never happens, and that the vehicle has Ego's body."""
-        played, car = self._scenes[0].played, f"{VUT_LENGTH:.2f} m x {VUT_WIDTH:.2f} m"
+        played = self._scenes[0].played
+        car = f"{VUT_LENGTH:.2f} m x {VUT_WIDTH:.2f} m"
         body = f"{played.ego.length:.2f} m x {played.ego.width:.2f} m"
         differs = [] if body == car else [f"the vehicle has {self.ego}'s body, {body}, not that of other tests, {car}"]
         return [*played.remarks, *differs]

@@ -29,7 +29,8 @@ class Lane(NamedTuple):
 
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     """The lane `name`, whose centre line goes through these points [m]."""
-    (x, y), (to_x, to_y) = points[0], points[-1]
+    x, y = points[0]
+    to_x, to_y = points[-1]
     length = math.hypot(to_x - x, to_y - y)
     # The largest distance of a point from the line through the first and the last point:
     bend = max(
@@ -57,7 +58,8 @@ class Frame(NamedTuple):
         """
         if lane.flaw:
             raise InputError(NETWORK_KEY, lane.flaw, "a straight lane")
-        (x, y), (to_x, to_y) = lane.start, lane.end
+        x, y = lane.start
+        to_x, to_y = lane.end
         length = math.sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y))
         return cls(lane.start, ((to_x - x) / length, (to_y - y) / length))
 
@@ -70,12 +72,14 @@ class Frame(NamedTuple):
 
     def along(self, positions: FloatArray) -> FloatArray:
         """Distances of positions, shape (N, 2), along the lane [m]; shape (N,)."""
-        (x, y), (dir_x, dir_y) = self.origin, self.direction
+        x, y = self.origin
+        dir_x, dir_y = self.direction
         return (positions[:, 0] - x) * dir_x + (positions[:, 1] - y) * dir_y
 
     def left(self, positions: FloatArray) -> FloatArray:
         """Distances of positions, shape (N, 2), to the left of the lane's middle [m]; shape (N,)."""
-        (x, y), (dir_x, dir_y) = self.origin, self.direction
+        x, y = self.origin
+        dir_x, dir_y = self.direction
         return (positions[:, 1] - y) * dir_x - (positions[:, 0] - x) * dir_y
 
     def lane_coordinates(self, point: Coordinates) -> tuple[float, float]:
@@ -100,7 +104,8 @@ class Frame(NamedTuple):
 
     def point(self, along: Quantity, left: Quantity) -> Coordinates:
         """The point, or the points, at these distances along the lane and to its left [m]."""
-        (x, y), (dir_x, dir_y) = self.origin, self.direction
+        x, y = self.origin
+        dir_x, dir_y = self.direction
         return x + along * dir_x - left * dir_y, y + along * dir_y + left * dir_x
 
 

@@ -160,7 +160,8 @@ def _points(rest: Source, given: Parameters) -> list[Parameters]:
 
 def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameters]) -> list[Parameters]:
     """The points that can be played; a warning says how many cannot, and why."""
-    played, problems = [], {}
+    played = []
+    problems = {}
     for point in points:
         try:
             play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego, EVERY)

@@ -105,7 +105,9 @@ def drive_all(
     InputError
         If a user's ADS fails, or takes longer than the time limit.
     """
-    points, n, (fleet, vehicles) = system.points, len(settings), system.at_encounters(settings)
+    points = system.points
+    n = len(settings)
+    fleet, vehicles = system.at_encounters(settings)
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
         stage = stage_of(system, settings)
@@ -171,7 +173,9 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
 
 def open_points_world(system: System, settings: FloatArray, stage: Stage | None) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
-    (point,), step, n = system.points, system.scenes.step, len(settings)
+    (point,) = system.points
+    step = system.scenes.step
+    n = len(settings)
     encounters = system.characteristics.scenario
     scenarios = [point.scenario]
     if len(encounters):
@@ -376,7 +380,8 @@ class _Outcomes:
         for copy, collision_speed in collisions.items():
             if self.is_open[copy]:
                 self.collision_speed[copy] = collision_speed
-                active[copy], self.is_open[copy] = True, False
+                active[copy] = True
+                self.is_open[copy] = False
         is_standing = speed <= STANDSTILL
         self._has_stopped |= self.is_open & self._has_moved & is_standing
         self._has_moved |= self.is_open & ~is_standing

@@ -107,7 +107,8 @@ class System:
         """
         if not len(self.characteristics.scenario):
             return self, settings
-        (point,), of_vehicle = self.points, self.characteristics.of_vehicle
+        (point,) = self.points
+        of_vehicle = self.characteristics.of_vehicle
         columns = np.ascontiguousarray(settings[:, ~of_vehicle].T)
         values = dict(zip(self.characteristics.scenario.names, columns, strict=True))
         system = replace(self.at(encounter(point, values)), characteristics=self.characteristics.vehicle)

@@ -185,7 +185,9 @@ class TraciView:
 
     def _speed_of_sumo(self, speed: float, accel: float, decel: float) -> float:
         """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the leader [m/s]."""
-        vehicle, vut, (_, actors, leader) = self._api.vehicle, self._vut, self._traffic.seen[self._copy]
+        vehicle = self._api.vehicle
+        vut = self._vut
+        _, actors, leader = self._traffic.seen[self._copy]
         ignores_limit = self._commands.mode & CommandedSpeed.BEYOND_LIMIT
         limit = vehicle.getMaxSpeed(vut) if ignores_limit else vehicle.getAllowedSpeed(vut)
         sumo_speed = min(speed + accel * self._step, max(limit, speed - decel * self._step))

@@ -169,7 +169,8 @@ class SumoWorld:
                 pairs.append((collision.victim, collision.victimSpeed, collision.collider))
             for id_, speed, other_id in pairs:
                 if (copy := self._copy_of.get(id_)) is not None and is_open[copy]:
-                    speeds[copy], self._struck_ids[copy] = speed, other_id
+                    speeds[copy] = speed
+                    self._struck_ids[copy] = other_id
         return speeds
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
@@ -188,7 +189,8 @@ class SumoWorld:
         )
 
     def _body_of(self, id_: str) -> Body:
-        domain, (_, length, width) = self._domain_of(id_), self.actor_size(id_)
+        domain = self._domain_of(id_)
+        _, length, width = self.actor_size(id_)
         front = np.array(domain.getPosition(id_))
         along = direction_of(domain.getAngle(id_))
         return Body.behind(front, along, length, width, domain.getSpeed(id_))

@@ -96,7 +96,8 @@ def compare(
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
-    study, second = evaluator.study, evaluator.for_study(in_order_of(evaluator.study, study_in(other)))
+    study = evaluator.study
+    second = evaluator.for_study(in_order_of(evaluator.study, study_in(other)))
     evaluators = evaluator, second
     with about("limits"):
         within = limits_of(limits, study.domains)
@@ -192,7 +193,8 @@ def _criteria(
 
 def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
     """The settings with their values in A, B's values where they differ, and `SETTING_COLUMNS`."""
-    names, (frame, settings, runs) = common.evaluators[0].characteristics.names, pairs
+    names = common.evaluators[0].characteristics.names
+    frame, settings, runs = pairs
     is_unsafe = [unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)]
     of_pairs = table_of_pairs(frame["solution"], *runs, *is_unsafe)
     values = {name: settings[0][:, column] for column, name in enumerate(names)}
@@ -221,11 +223,13 @@ def _test(frame: pd.DataFrame) -> tuple[float, float, str]:
     """
     frame = frame.dropna(subset=[*SIDES])
     sample = frame[frame["source"] == SAMPLE]
-    pairs, unit = sample.groupby(LINE)[[*SIDES]].mean(), "line"
+    pairs = sample.groupby(LINE)[[*SIDES]].mean()
+    unit = "line"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
-            pairs, unit = means, "run"
+            pairs = means
+            unit = "run"
     p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
     return p, a12, number_of(len(pairs), unit)
 

@@ -94,7 +94,8 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
     """What becomes of A's interval in B."""
     if a is None or b is None:
         return SAME if a is b else (GROWN if a is None else SHRUNK)
-    grows, shrinks = b[0] < a[0] or b[1] > a[1], b[0] > a[0] or b[1] < a[1]
+    grows = b[0] < a[0] or b[1] > a[1]
+    shrinks = b[0] > a[0] or b[1] < a[1]
     return {(True, True): BOTH, (True, False): GROWN, (False, True): SHRUNK}.get((grows, shrinks), SAME)
 
 
@@ -125,7 +126,8 @@ def compare_originals(
     """How both original vehicles end, how often they brake needlessly, and how much earlier B's brakes: the numbers,
     and what they say.
     """
-    numbers, both_rated = _ends_of_originals(evaluators, originals), all(is_rated(one.study) for one in evaluators)
+    numbers = _ends_of_originals(evaluators, originals)
+    both_rated = all(is_rated(one.study) for one in evaluators)
     difference = Difference([], [], [])
     in_a, in_b = (bool(unsafe.of(one)[0]) for unsafe, one in zip(criteria, originals, strict=True))
     if in_a != in_b:
@@ -142,7 +144,8 @@ def compare_originals(
             f"{side}_points": float(original.column(RATING_POINTS.name)[0])
             for side, original in zip(SIDES, originals, strict=True)
         }
-        points_a, points_b = numbers["a_points"], numbers["b_points"]
+        points_a = numbers["a_points"]
+        points_b = numbers["b_points"]
         if points_a != points_b:
             kind = difference.better if points_b > points_a else difference.worse
             kind.append(f"earns {points_b:.4g} points ({points_a:.4g} in {a})")

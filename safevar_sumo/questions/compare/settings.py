@@ -89,7 +89,8 @@ class CommonDomain(NamedTuple):
             If B's original vehicle does not keep a limit, or the domains of a searched parameter have nothing in
             common.
         """
-        members, rows = [one.characteristics for one in evaluators], [one.study.domains for one in evaluators]
+        members = [one.characteristics for one in evaluators]
+        rows = [one.study.domains for one in evaluators]
         with about(evaluators[1].study.source):
             check_limits(rows[1], limits, "limits: ")
         shift = np.where(members[0].of_vehicle, members[1].original - members[0].original, 0.0)
@@ -172,7 +173,8 @@ def pairs_of(
     are not in both domains.
     """
     names = list(common.evaluators[0].characteristics.names)
-    groups, outside = [], 0
+    groups = []
+    outside = 0
     for side, case in zip("ab", subjects, strict=True):
         if not isinstance(case, Case):
             continue
@@ -200,7 +202,8 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
     members = common.evaluators[0].characteristics
     ends = _common_sample(common, math.ceil(samples / ROUNDS))
     starts = np.where(members.of_vehicle, members.original, ends)
-    shares, step = np.full(len(ends), 0.5), 0.5
+    shares = np.full(len(ends), 0.5)
+    step = 0.5
     rounds = list[Pairs]()
     while (drawn := sum(len(one.frame) for one in rounds)) < samples and len(rounds) < ROUNDS and len(ends):
         lines = np.arange(min(len(ends), samples - drawn))

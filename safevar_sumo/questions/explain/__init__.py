@@ -159,7 +159,8 @@ def explain(
         is drawn again; 0 leaves this out.
     """
     evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES, BORDERS)
-    study, population = evaluator.study, find_failures(subject, evaluator, solution, unsafe)
+    study = evaluator.study
+    population = find_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)
     changed = evaluator.characteristics.changed(runs.settings[sample])
@@ -167,7 +168,8 @@ def explain(
     # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
     verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
     of_chosen = [causes[row] for row in reasons]
-    holding, ranges = list[BoolArray](), Ranges()
+    holding = list[BoolArray]()
+    ranges = Ranges()
     if fits and study.spread and len(runs):
         shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
         holding, ranges = conclusions_across_fits(evaluator, fits, runs, population.unsafe, of_chosen, *shares)
@@ -199,7 +201,9 @@ def _counts(population: Population, subject: Study | Case) -> JsonObject:
     """The numbers of settings, how the original vehicle ends, and the number of collisions that the search simulated
     but its objectives leave out of the solutions.
     """
-    runs, original, left_out = population.evaluations, population.original, 0
+    runs = population.evaluations
+    original = population.original
+    left_out = 0
     if isinstance(subject, Case) and not subject.study.origin.point and not runs.collided.any():
         left_out = int(are_collisions(subject.evaluations).sum())
     return {
@@ -224,12 +228,16 @@ def _solutions_frame(population: Population, evaluator: Evaluator, reasons: Reas
     """A row of `SOLUTION_COLUMNS` for each chosen failure."""
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
-    study, failures = evaluator.study, population.evaluations.take(list(reasons))
-    settings, unsafe = failures.settings, population.unsafe
+    study = evaluator.study
+    failures = population.evaluations.take(list(reasons))
+    settings = failures.settings
+    unsafe = population.unsafe
     if is_rated(study):  # each neighbour is simulated in all cells
-        factors, comparisons = STEP_FACTORS[:1], compare_at_cells(evaluator, settings)
+        factors = STEP_FACTORS[:1]
+        comparisons = compare_at_cells(evaluator, settings)
     else:
-        factors, comparisons = STEP_FACTORS, compare_at_points(assemble(study), settings, unsafe)
+        factors = STEP_FACTORS
+        comparisons = compare_at_points(assemble(study), settings, unsafe)
     is_judged = failures.collided & (not is_rated(study))
     judged = iter(judge_collisions(evaluator, failures.take(is_judged)).to_dict("records"))
     columns = {
@@ -255,13 +263,15 @@ def _causes_table(
     causes_of: Sequence[Sequence[Cause]],
 ) -> pd.DataFrame:
     """A row of `CAUSE_COLUMNS` for each cause of each chosen failure; of a failure the most robust one first."""
-    study, unsafe = evaluator.study, population.unsafe
+    study = evaluator.study
+    unsafe = population.unsafe
     causes = [cause for group in causes_of for cause in group]
     robust = np.full(len(causes), np.nan)
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, assemble(study).step, unsafe).mean(axis=1)
-    shrunk, fits_holding = find_limits(evaluator, causes, unsafe), np.sum(holding, axis=0)
+    shrunk = find_limits(evaluator, causes, unsafe)
+    fits_holding = np.sum(holding, axis=0)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:
         at_original = [cause._replace(encounter={}) for cause in causes]
@@ -269,7 +279,8 @@ def _causes_table(
             settings_of(evaluator.characteristics, at_original), "causes in the original encounter"
         )
         elsewhere = unsafe.of(there)
-    numbers, rows = np.repeat(range(len(solutions)), list(map(len, causes_of))), []
+    numbers = np.repeat(range(len(solutions)), list(map(len, causes_of)))
+    rows = []
     for index in np.lexsort([-robust, numbers]).tolist():
         rows.append(
             {
@@ -323,7 +334,9 @@ def _distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> 
 
 def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int, causes: pd.DataFrame) -> str:
     """How little is enough, how sure that is, and how many settings are unsafe."""
-    unsafe, contact, runs = population.unsafe, assemble(evaluator.study).contact, population.evaluations
+    unsafe = population.unsafe
+    contact = assemble(evaluator.study).contact
+    runs = population.evaluations
     counts = f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe ({unsafe.description})."
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])

@@ -41,7 +41,8 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
     """
     if not causes:
         return np.zeros(0, dtype=bool)
-    characteristics, groups = evaluator.characteristics, []
+    characteristics = evaluator.characteristics
+    groups = []
     for setting in settings_of(characteristics, causes):
         is_changed = (setting != characteristics.original) & characteristics.of_vehicle
         is_left_out = np.diag(is_changed)[is_changed]

@@ -71,7 +71,8 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
                 for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
                     row, columns = chunk[index]
                     changes = {characteristics.names[column]: float(settings[row, column]) for column in columns}
-                    outcome, degree = str(evaluations.outcome[index]), float(evaluations.f_safe[index])
+                    outcome = str(evaluations.outcome[index])
+                    degree = float(evaluations.f_safe[index])
                     encounter = {
                         item.name: float(settings[row, characteristics.names.index(item.name)])
                         for item in characteristics.scenario
@@ -121,7 +122,9 @@ def count_needed(
         sample is drawn without replacement from finitely many failures), the share itself if all failures were
         analysed. Ordered by needed, in_some, changed; no rows if there is no failure.
     """
-    names, number, changed = characteristics.vehicle.names, max(len(changed), 1), changed[:, characteristics.of_vehicle]
+    names = characteristics.vehicle.names
+    number = max(len(changed), 1)
+    changed = changed[:, characteristics.of_vehicle]
     in_causes = [np.array([[name in cause.changes for name in names] for cause in group]) for group in causes if group]
     needed, in_some = (
         sum((combine(rows, axis=0) for rows in in_causes), np.zeros(len(names))) for combine in (np.all, np.any)
@@ -170,7 +173,8 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     pandas.DataFrame
         Columns algorithm, run, failures (different unsafe solutions), examined, causes.
     """
-    names, keys = list(evaluator.characteristics.names), ["algorithm", "run"]
+    names = list(evaluator.characteristics.names)
+    keys = ["algorithm", "run"]
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
     failures = failures.sort_values([F_NUM_DIFF.name, F_DIFF.name], kind="stable")
     examined = failures.groupby(keys).head(limit)
@@ -236,7 +240,8 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
     # A cause has a line on which all its changes are scaled, then a line for each change by itself.
     groups = [np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]]) for flags in is_changed]
     line_counts = list(map(len, groups))
-    is_scaled, ends = np.concatenate(groups), np.repeat(settings, line_counts, axis=0)
+    is_scaled = np.concatenate(groups)
+    ends = np.repeat(settings, line_counts, axis=0)
     original = np.repeat(original, line_counts, axis=0)
     starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
@@ -244,7 +249,8 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
     )
     with evaluator.stage(BOUNDARIES, len(starts) * (LINE_SETTINGS - 1 + ROUNDS * (PARTS_PER_ROUND - 1))):
         shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1))
-    limits, first_lines = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0], np.cumsum([0, *line_counts])
+    limits = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0]
+    first_lines = np.cumsum([0, *line_counts])
     return [
         Limits(
             boundary=dict(zip(cause.changes, limits[first, flags].tolist(), strict=True)),
@@ -267,7 +273,9 @@ def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> 
 
 def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
     """Settings at K `shares`, shape (M, K), of M lines from `starts` to `ends`, shape (M, n); shape (M, K, n)."""
-    factors, start, end = shares[..., np.newaxis], starts[:, np.newaxis], ends[:, np.newaxis]
+    factors = shares[..., np.newaxis]
+    start = starts[:, np.newaxis]
+    end = ends[:, np.newaxis]
     return np.where(factors >= 1, end, start + factors * (end - start))
 
 
@@ -281,7 +289,9 @@ def find_boundary_shares(
     """
     number = len(starts)
     rows = np.arange(number)
-    low, high, low_is_valid = lowest, np.ones(number), np.ones(number, dtype=bool)
+    low = lowest
+    high = np.ones(number)
+    low_is_valid = np.ones(number, dtype=bool)
     for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high  # without a rounding error; known to be unsafe
@@ -294,7 +304,8 @@ def find_boundary_shares(
         first_unsafe = np.argmax(is_unsafe, axis=1)
         below = rows, np.maximum(first_unsafe - 1, 0)
         low_is_valid = np.where(first_unsafe > 0, is_valid[below], low_is_valid)
-        low, high = np.where(first_unsafe > 0, shares[below], low), shares[rows, first_unsafe]
+        low = np.where(first_unsafe > 0, shares[below], low)
+        high = shares[rows, first_unsafe]
     states = np.where(low_is_valid, BoundaryState.SAFE, BoundaryState.NOT_SIMULATED)
     states = np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)
     return high, [BoundaryState(state) for state in states]

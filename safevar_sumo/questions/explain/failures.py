@@ -96,20 +96,26 @@ def find_failures(
         number = RATED_SAMPLED_SETTINGS if is_rated(subject) else SAMPLED_SETTINGS
         drawn = evaluator.feasible_settings(number, subject.search.seed, feasible_after_filter=True)
         settings = evaluator.characteristics.filter(drawn)
-        names, recorded = [f"drawn:{row}" for row in range(len(settings))], np.full(len(settings), UNKNOWN)
+        names = [f"drawn:{row}" for row in range(len(settings))]
+        recorded = np.full(len(settings), UNKNOWN)
     else:
-        table, characteristics = subject.solutions, list(evaluator.characteristics.names)
+        table = subject.solutions
+        characteristics = list(evaluator.characteristics.names)
         named_rows = [row_of_handle(table, handle) for handle in named]
         distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
         chosen = list(dict.fromkeys([*named_rows, *distinct]))  # the named ones first
-        settings, handles = table[characteristics].to_numpy(dtype=float)[chosen], handles_of(table)
-        names, recorded = [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen]
+        settings = table[characteristics].to_numpy(dtype=float)[chosen]
+        handles = handles_of(table)
+        names = [str(handles[row]) for row in chosen]
+        recorded = table["outcome"].to_numpy(dtype=str)[chosen]
     evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
     unsafe = unsafe or Unsafe.default_among(evaluations, original)
     if isinstance(subject, Study):
         counts = np.flatnonzero(~evaluations.infeasible)
         left_out = settings[evaluations.infeasible]
-        evaluations, names, recorded = evaluations.take(counts), [names[row] for row in counts], recorded[counts]
+        evaluations = evaluations.take(counts)
+        names = [names[row] for row in counts]
+        recorded = recorded[counts]
     else:
         left_out = _left_out_of_search(subject, unsafe)
     rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
@@ -136,7 +142,8 @@ def choose_failures(
     The sample are all failures, if that takes at most about `limit` simulations. What matters: the smallest robust
     failure, a failure for each of `REASONS`, and the simplest failure with each minimal cause that these do not have.
     """
-    rows, settings = population.rows, population.evaluations.settings
+    rows = population.rows
+    settings = population.evaluations.settings
     if population.is_named:
         found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
         return dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True))
@@ -146,7 +153,8 @@ def choose_failures(
     analysed = sorted({*sample, *reasons})
     found = find_minimal_causes(evaluator, settings[analysed], population.unsafe)
     causes = dict(zip(analysed, found, strict=True))
-    reasons, runs = dict(list(reasons.items())[:top]), population.evaluations
+    reasons = dict(list(reasons.items())[:top])
+    runs = population.evaluations
     keys = {row: {directions(evaluator.characteristics, cause.changes) for cause in causes[row]} for row in causes}
     for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])["cause"]:
         if len(reasons) < top and not any(key in keys[row] for row in reasons):
@@ -158,7 +166,8 @@ def choose_failures(
 
 def _failures_that_matter(population: Population, evaluator: Evaluator, limit: int) -> Reasons:
     """The smallest robust failure, and a failure for each of `REASONS`."""
-    reasons, failures = Reasons(), population.evaluations.take(population.rows)
+    reasons = Reasons()
+    failures = population.evaluations.take(population.rows)
     if not population.rows:
         return reasons
     if not is_rated(evaluator.study) and not population.unsafe.of(population.original)[0]:
@@ -182,7 +191,8 @@ original's), in the study's order.
 
 def _endings_in_words(system: System, point: str, both: Evaluations) -> str:
     """How the runs of the original vehicle and of another vehicle end at a point."""
-    contact, pairs = system.contact, zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
+    contact = system.contact
+    pairs = zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
     original, changed = (ending_in_words(outcome, degree, contact) for outcome, degree in pairs)
     return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 
@@ -192,7 +202,8 @@ def compare_at_points(system: System, settings: FloatArray, unsafe: Unsafe) -> l
     originals = system.characteristics.with_original_vehicle(settings)
     results = simulate_all_points(system, np.concatenate([originals, settings]))
     at_points = [result.evaluations for result in results]
-    is_unsafe, worst = np.stack([unsafe.of(evaluations) for evaluations in at_points]), worst_points(system, at_points)
+    is_unsafe = np.stack([unsafe.of(evaluations) for evaluations in at_points])
+    worst = worst_points(system, at_points)
     comparisons = []
     for original, vehicle in enumerate(range(len(settings), len(worst))):
         names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
@@ -208,7 +219,8 @@ def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointCo
 
     An unknown colour is neither better nor worse.
     """
-    system, original = assemble(evaluator.study), evaluator.characteristics.original
+    system = assemble(evaluator.study)
+    original = evaluator.characteristics.original
     assert system.rater is not None
     cells = evaluator.at_each_point(np.vstack([original, settings]), "cells whose colour is worse")
     colours = system.rater.points(cells).colours.astype(int)

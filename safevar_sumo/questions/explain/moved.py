@@ -39,8 +39,10 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
 
     The driver reacts to any braking of a leader.
     """
-    system, original = assemble(evaluator.study), evaluator.characteristics.original
-    names, furthest = list(evaluator.characteristics.names), original.copy()
+    system = assemble(evaluator.study)
+    original = evaluator.characteristics.original
+    names = list(evaluator.characteristics.names)
+    furthest = original.copy()
     for name, value in (pair for cause in causes for pair in cause.changes.items()):
         k = names.index(name)
         if abs(value - original[k]) > abs(furthest[k] - original[k]):
@@ -70,7 +72,8 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
 def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Study:
     """The study at one of its points, with a competent driver, and this parameter of the scenario alone searched."""
     parameters = {**study.scenario.parameters, **{name: one.original for name, one in study.scenario.search.items()}}
-    model, over = study.scenario.model, dict(point.parameters)
+    model = study.scenario.model
+    over = dict(point.parameters)
     if study.matrix is not None and study.matrix.tests:
         test = next(test for test in study.matrix.tests if test.name == over["test"])
         shared = parameters if test.model in ("", model) else {}
@@ -88,7 +91,8 @@ def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArr
 
     It is the domain's lower end if a car is safe from there on, and infinite if no value from the study's own on is.
     """
-    rows, size = np.arange(len(cars)), STEPS + 1
+    rows = np.arange(len(cars))
+    size = STEPS + 1
     values = np.tile(np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original]), (len(cars), 1))
     own = int(np.searchsorted(values[0], domain.original))
     is_never_safe = np.zeros(len(cars), dtype=bool)
@@ -104,5 +108,6 @@ def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArr
         ever_fails = fails.any(axis=1)
         low = np.where(ever_fails, values[rows, last], domain.lower)
         high = np.where(ever_fails, values[rows, np.minimum(last + 1, size - 1)], domain.lower)
-        values, own = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.linspace(0.0, 1.0, size), size - 1
+        values = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.linspace(0.0, 1.0, size)
+        own = size - 1
     return np.where(is_never_safe, np.inf, high)

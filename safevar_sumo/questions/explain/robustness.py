@@ -41,7 +41,8 @@ def robust_shares(
 
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
-    neighbours, shares = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed), []
+    neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed)
+    shares = []
     with evaluator.stage(NEIGHBOURS, len(neighbours) * len(factors)):
         for factor in factors:
             step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)

@@ -166,7 +166,8 @@ class Survivors(NamedTuple):
 
 def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray:
     """The new vehicle, corners and Sobol points of the promise, and failures of results in it; shape (L, n)."""
-    promise, seed = problem.promise, problem.study.search.seed
+    promise = problem.promise
+    seed = problem.study.search.seed
     points = sobol_points(SOBOL_VEHICLES, len(promise.lower), seed)
     settings = [promise.region.characteristics.original[np.newaxis], promise.at(np.round(points)), promise.at(points)]
     if not isinstance(subject, Study):
@@ -194,8 +195,10 @@ def _find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> 
 
 def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
     """Search, attack and prove in turns until the smallest changes survive everything; none if no change does."""
-    search, proofs = Search(problems, vehicles), dict[bytes, Proof]()
-    attacks, failed_proofs = 0, 0
+    search = Search(problems, vehicles)
+    proofs = dict[bytes, Proof]()
+    attacks = 0
+    failed_proofs = 0
     for _ in range(MAX_ROUNDS):
         with problems[0].evaluator.stage(SEARCH_STAGE):
             changes = search.smallest_changes()
@@ -367,7 +370,8 @@ def write_repair(path: Path, answer: Answer) -> None:
     InputError
         If the file cannot be written.
     """
-    study, values = answer.study, answer.table("repairs")["parameters"][0]
+    study = answer.study
+    values = answer.table("repairs")["parameters"][0]
     comment = answer.verdict + (f" Only {study.origin.point} was simulated." if study.origin.point else "")
     if not study.origin.called and study.name not in study_names():
         write_study(path, with_parameters(study, values), comment)

@@ -47,7 +47,8 @@ def prove_change(
     As many settings again each meet one of the other fits, at random. `number` counts the attacks, for the random
     numbers, and `attempt` the proofs that failed before.
     """
-    own, seed = problems[0], problems[0].study.search.seed
+    own = problems[0]
+    seed = problems[0].study.search.seed
 
     def judge(settings: FloatArray) -> Judgement:
         left = own.left(change, settings, PROOF_STAGE)

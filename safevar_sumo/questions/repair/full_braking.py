@@ -38,7 +38,8 @@ class FullBraking:
             return lefts_of(self.evaluator.evaluate(settings, STAGE), self._unsafe) >= 0
         is_safe = self.evaluator.region.feasible(settings)
         for points in np.split(np.argsort(-self._failures, kind="stable"), HARDEST):
-            rows, selection = np.flatnonzero(is_safe), Selection(points=tuple(points.tolist()))
+            rows = np.flatnonzero(is_safe)
+            selection = Selection(points=tuple(points.tolist()))
             evaluations = self.evaluator.evaluate_selection(settings[rows], selection, STAGE)
             is_safe[rows] = lefts_of(evaluations, self._unsafe) >= 0
             if evaluations.worst_points is not None:

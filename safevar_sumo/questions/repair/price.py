@@ -27,7 +27,8 @@ def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) 
     """The price of other values of parameters against today's, by the names of the answer's columns; None where the new
     vehicle brakes nowhere. `encounters` are new vehicles in K encounters, shape (K, n).
     """
-    today, changed = assemble(study), assemble(with_parameters(study, values))
+    today = assemble(study)
+    changed = assemble(with_parameters(study, values))
     onsets_today, _ = drive_new_cars(today, encounters)
     onsets, deceleration = drive_new_cars(changed, encounters)
     benign = benign_scenes(study, today)
@@ -51,9 +52,11 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
     """Where and when the new vehicle begins to brake at each of N points in each of K encounters, shape (2, N K), NaN
     if it does not [m, s]; its largest deceleration [m/s^2].
     """
-    onsets, deceleration = list[tuple[float, float]](), 0.0
+    onsets = list[tuple[float, float]]()
+    deceleration = 0.0
     for result, row in product(simulate_all_points(system, encounters), range(len(encounters))):
-        trace, step = result.runs.trace, brake_onset(result.runs, row)
+        trace = result.runs.trace
+        step = brake_onset(result.runs, row)
         onsets.append((np.nan, np.nan) if step is None else (trace.position[step, row], trace.time[step]))
         speed = trace.speed[trace.active[:, row], row]
         deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))

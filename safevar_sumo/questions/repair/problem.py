@@ -55,7 +55,8 @@ class Parameter(NamedTuple):
 
     def values(self, shares: FloatArray) -> FloatArray:
         """The rounded values at shares of the range, shape (M,)."""
-        lower, upper = self.range.lower, self.range.upper
+        lower = self.range.lower
+        upper = self.range.upper
         digits = DIGITS + max(0, int(np.log10(max(abs(lower), abs(upper)) / (upper - lower))))
         exact = lower * (upper / lower) ** shares if self.range.log else lower + shares * (upper - lower)
         distinct, row_of = np.unique(exact, return_inverse=True)
@@ -75,7 +76,9 @@ class Promise(Box):
         InputError
             If a promise cannot be read, names no characteristic, lies outside its domain, or lets nothing wear.
         """
-        rows, stated, everything = study.domains, study.repair.promise, region.characteristics
+        rows = study.domains
+        stated = study.repair.promise
+        everything = region.characteristics
         if list(texts) == [ALL] or (not texts and stated == ALL):
             return cls(region, everything.lower, everything.upper)
         of_study = stated if stated and isinstance(stated, dict) else study.limits
@@ -97,13 +100,15 @@ class Promise(Box):
 
     def to_dict(self) -> dict[str, list[float]]:
         """The ends of every characteristic that may wear, and of every parameter of the scenario that varies."""
-        names, ends = self.region.characteristics.names, np.transpose([self.lower, self.upper]).tolist()
+        names = self.region.characteristics.names
+        ends = np.transpose([self.lower, self.upper]).tolist()
         return {name: pair for name, pair in zip(names, ends, strict=True) if pair[0] < pair[1]}
 
     @property
     def in_words(self) -> str:
         """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, and the encounters."""
-        ends, characteristics = self.to_dict(), self.region.characteristics
+        ends = self.to_dict()
+        characteristics = self.region.characteristics
         whole_domain = all(ends.get(member.name) == [member.lower, member.upper] for member in characteristics.vehicle)
         worn = ", ".join(
             f"{member.name} {sign} {end:.5g}{member.suffix}"
@@ -130,7 +135,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     InputError
         If there is none, one is unknown, or its bounds exclude the value of today.
     """
-    source, shipped = study.source, CHANGEABLE.get(study.ads.model, {})
+    source = study.source
+    shipped = CHANGEABLE.get(study.ads.model, {})
     table = study.repair.parameters or shipped
     if not table:
         problem = f"ads.model = {study.ads.model!r}: no parameter may change"
@@ -138,9 +144,11 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     for name in names:
         if name not in table:
             raise unknown_name("change", f"{study.ads.model} has no parameter {name!r} that may change", name, table)
-    ads, parameters = assemble(study).ads, []
+    ads = assemble(study).ads
+    parameters = []
     for name in (name for name in table if name in (names or table)):
-        row, today = table[name], study.ads.parameters.get(name, getattr(ads, name, None))
+        row = table[name]
+        today = study.ads.parameters.get(name, getattr(ads, name, None))
         number = float(today) if isinstance(today, int | float) else math.nan
         if table is shipped:
             row = replace_in(row, lower=min(row.lower, number), upper=max(row.upper, number))
@@ -247,7 +255,8 @@ class RepairProblem:
         """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps a new vehicle safe;
         without a search of the scenario, all promised ones count.
         """
-        is_promised, characteristics = self.promise.holds(settings), self.promise.region.characteristics
+        is_promised = self.promise.holds(settings)
+        characteristics = self.promise.region.characteristics
         if len(characteristics.scenario) and is_promised.any():
             originals = characteristics.with_original_vehicle(settings[is_promised])
             is_promised[is_promised] = self.lefts_with(self.today, originals, "new vehicles") >= 0
@@ -268,7 +277,8 @@ class RepairProblem:
         """The new vehicle in the original encounter, and in those promised ones in which it is least safe of many drawn
         ones, shape (K, n).
         """
-        original, settings = self.promise.region.characteristics.original, self.evaluator.critical_encounters
+        original = self.promise.region.characteristics.original
+        settings = self.evaluator.critical_encounters
         return np.concatenate([original[np.newaxis], settings[self.promise.holds(settings)]])
 
     @cached_property

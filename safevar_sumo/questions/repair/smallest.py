@@ -56,10 +56,12 @@ class Search:
 
     def __init__(self, problems: Sequence[RepairProblem], settings: FloatArray) -> None:
         self.problems = problems
-        self.problem, self.settings_of = problems[0], {0: settings}
+        self.problem = problems[0]
+        self.settings_of = {0: settings}
         self._thinning = 1 if self.problem.arrays else THINNING
         self._failures = list[Failure]()
-        self._best, self._least = dict[int, FloatArray](), dict[int, float]()
+        self._best = dict[int, FloatArray]()
+        self._least = dict[int, float]()
 
     @property
     def settings(self) -> FloatArray:
@@ -78,7 +80,8 @@ class Search:
         today = self.problem.today
         if self._failure_of(today) is None:
             return [today]
-        changes, limit = [], 1.0
+        changes = []
+        limit = 1.0
         for number in range(1, min(MOST_CHANGED, len(today)) + 1):
             change = self._smallest_change(number, limit)
             if change is not None:
@@ -90,7 +93,9 @@ class Search:
         """The smallest change of a number of parameters, up to a limit."""
         best = self._best.pop(number, None)
         if best is None or self._failure_of(best) is not None:
-            best, low, high = None, self._least.get(number, 0.0), limit
+            best = None
+            low = self._least.get(number, 0.0)
+            high = limit
             for _ in range(2 if low < high else 0):
                 count = RINGS // self._thinning
                 sizes = low + (high - low) * np.arange(1, count + 1) / count
@@ -100,7 +105,8 @@ class Search:
                     break
                 best = changes[row]
                 ring = int(np.argmax(sizes >= np.max(np.abs(best - self.problem.today)) - 1e-12))
-                low, high = float(sizes[ring - 1]) if ring else low, float(sizes[ring])
+                low = float(sizes[ring - 1]) if ring else low
+                high = float(sizes[ring])
             self._least[number] = low if best is not None else max(low, high)
         if best is not None:
             self._best[number] = best
@@ -124,7 +130,8 @@ class Search:
     def _failure_of(self, change: FloatArray) -> Failure | None:
         """The worst failure among the first settings with which a change fails; None if it survives all."""
         for number, settings in self.settings_of.items():
-            start, size = 0, FIRST_SETTINGS
+            start = 0
+            size = FIRST_SETTINGS
             while start < len(settings):
                 rows = settings[start : start + size]
                 problem = self.problems[number]
@@ -132,7 +139,8 @@ class Search:
                 worst = int(np.argmin(left))
                 if left[worst] < 0:
                     return Failure(rows[worst], number, () if points is None else (int(points[worst]),))
-                start, size = start + size, 4 * size
+                start = start + size
+                size = 4 * size
         return None
 
     def _first_survivor(self, changes: FloatArray) -> int | None:
@@ -153,7 +161,8 @@ class Search:
         alive = np.arange(len(changes))
         for number, points in dict.fromkeys((failure.problem, failure.points) for failure in failures):
             same = [each.setting for each in failures if (each.problem, each.points) == (number, points)]
-            settings, problem = np.array(same), self.problems[number]
+            settings = np.array(same)
+            problem = self.problems[number]
             while len(settings) and len(alive):
                 count = max(1, BATCH // len(alive))
                 left, _ = problem.lefts(changes[alive], settings[:count], "changes with one vehicle", points)

@@ -114,7 +114,8 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
     """
     words = titles_of(cases)
     frames = {}
-    remarks, errors = [], []
+    remarks = []
+    errors = []
     for name in names:
         title, compute, columns, wide = TABLES[name]
         if name == CAUSES and not choices.causes:
@@ -172,7 +173,8 @@ def _equal_solutions(case: Case) -> str:
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
     """What a case's frame leaves out."""
-    prefix, rq = f"{case.name}: ", table.split("-")[0].upper()
+    prefix = f"{case.name}: "
+    rq = table.split("-")[0].upper()
     if table in ("rq1", "rq2"):
         few = frame.loc[~frame["enough_runs"], "algorithm" if table == "rq1" else "baseline"].unique()
         if names := ", ".join(map(case.title_of, few)):

@@ -82,7 +82,8 @@ def _means_by_change_count(
 
 def rq31(case: Case) -> pd.DataFrame:
     """Number of critical solutions of each run with exactly j characteristics changed; columns run, j, count."""
-    solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
+    solutions = critical_solutions(case)
+    runs = case.runs_of(NSGA2)
     counts = solutions.groupby([solutions["run"], count_changes(case)]).size()
     index = pd.MultiIndex.from_product([runs, change_numbers(case)], names=["run", "j"])
     return counts.reindex(index, fill_value=0).reset_index(name="count")
@@ -140,7 +141,8 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
     safety_degree, tet, tit, deceleration = solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
-    degrees, original = case.original_degrees(solutions), case.original
+    degrees = case.original_degrees(solutions)
+    original = case.original
     if case.study.scenario.search:
         original = {**dict.fromkeys(original, np.nan), SAFETY_DEGREE: degrees.mean()}
     values = {

@@ -233,9 +233,11 @@ def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
 def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
     """A row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
-    rows, fewest = [], fewest_runs("RQ1", choices.alpha)
+    rows = []
+    fewest = fewest_runs("RQ1", choices.alpha)
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
-        values, originals = _values(case, algorithm, metric, over_runs), _originals(case, algorithm, metric, over_runs)
+        values = _values(case, algorithm, metric, over_runs)
+        originals = _originals(case, algorithm, metric, over_runs)
         original = originals.mean() if case.study.scenario.search else case.original[metric.name]
         test = signed_rank_test(values - originals) if over_runs else compare_samples(values, originals.dropna())
         if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
@@ -249,11 +251,13 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
 
 def _test_opponents(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
     """A row for each baseline and metric."""
-    (first, others), samples = opponents_of(case, choices.algorithm), _samples(case, choices, over_runs)
+    first, others = opponents_of(case, choices.algorithm)
+    samples = _samples(case, choices, over_runs)
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more causes.
     directions = MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
     directions |= {CAUSES: True} if (first, CAUSES) in samples else {}
-    rows, fewest = [], fewest_runs("RQ2", choices.alpha)
+    rows = []
+    fewest = fewest_runs("RQ2", choices.alpha)
     for baseline, (metric, more_is_better) in product(others, directions.items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
         if not more_is_better:  # so that above 0.5 the first algorithm is better

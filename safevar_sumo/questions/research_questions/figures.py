@@ -144,7 +144,8 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     UnanswerableError
         If no case has an answer.
     """
-    counts_by_case, errors = {}, []
+    counts_by_case = {}
+    errors = []
     for case in cases:
         try:
             counts_by_case[case.name] = rq31(case)
@@ -203,8 +204,10 @@ def draw_change_sizes(case: Case) -> Figure:
     vehicle = case.characteristics.vehicle
     figure, axes = new_panels(title, len(vehicle), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
     for axis, characteristic, changes in zip(axes, vehicle, changes_of_solutions.T, strict=True):
-        low, high = characteristic.lower - characteristic.original, characteristic.upper - characteristic.original
-        increases, decreases = changes[changes > 0], changes[changes < 0]
+        low = characteristic.lower - characteristic.original
+        high = characteristic.upper - characteristic.original
+        increases = changes[changes > 0]
+        decreases = changes[changes < 0]
         axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
@@ -257,7 +260,8 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     UnanswerableError
         If no figure can be drawn.
     """
-    figures, errors = {}, []
+    figures = {}
+    errors = []
     drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
         drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)

@@ -40,7 +40,8 @@ def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
 
     Where the best value is also the worst, an objective keeps its unit.
     """
-    ideal, nadir = reference.min(axis=0), reference.max(axis=0)
+    ideal = reference.min(axis=0)
+    nadir = reference.max(axis=0)
     return np.asarray((points - ideal) / np.where(nadir > ideal, nadir - ideal, 1.0))
 
 
@@ -83,7 +84,8 @@ def compute_indicators(case: Case) -> pd.DataFrame:
         If there are no runs or no solutions.
     """
     reference = reference_front(case)
-    scaled_reference, rows = normalised(reference, reference), {}
+    scaled_reference = normalised(reference, reference)
+    rows = {}
     for run, group in _frames_of_runs(case, case.solutions):
         if len(points := points_of(case, group)):
             scaled = normalised(points, reference)
@@ -112,7 +114,8 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs.
     """
-    search, rows = case.study.search, []
+    search = case.study.search
+    rows = []
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
         last = int(group["evaluation"].max()) + 1
         requested = search.evaluations if last > search.evaluations - search.population else last
@@ -148,7 +151,8 @@ def few_evaluations(case: Case) -> str:
     is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts["algorithm"].isin([*case.stop_by_themselves])
     if not is_few.any():
         return ""
-    share, texts = f"{USUAL_SHARE:.0%}", describe_evaluations(case, counts[is_few])
+    share = f"{USUAL_SHARE:.0%}"
+    texts = describe_evaluations(case, counts[is_few])
     return f"{case.name}: less than {share} of a run's evaluations are simulated: {texts}. Are the options as meant?"
 
 
@@ -164,7 +168,9 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no runs or no solutions.
     """
-    reference, search, frames = reference_front(case), case.study.search, []
+    reference = reference_front(case)
+    search = case.study.search
+    frames = []
     counts = np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
     ends = count_evaluations(case).groupby("algorithm")["requested"].max()
     names = list(case.characteristics.names)
@@ -176,7 +182,8 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         is_defined = np.isfinite(points).all(axis=1) & is_solution & case.scoring.feasible_rows(group)
         numbers = group["evaluation"].to_numpy()
         counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
-        front, volumes = points[:0], []
+        front = points[:0]
+        volumes = []
         for start, end in pairwise([0, *counts_of_run]):
             new_points = points[is_defined & (start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))

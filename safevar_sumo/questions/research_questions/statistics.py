@@ -65,7 +65,8 @@ class TwoSampleTest(NamedTuple):
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     """Compare two samples without undefined values by U test and effect size."""
-    first, second = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    first = np.asarray(x, dtype=float)
+    second = np.asarray(y, dtype=float)
     if not first.size or not second.size:
         return TwoSampleTest(np.nan, np.nan, None, first.size, second.size, None)
     is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and has_distinct_values([*first, *second])

@@ -31,7 +31,8 @@ class PaperTable(NamedTuple):
     @classmethod
     def of(cls, name: str, compute: Compute) -> PaperTable:
         """A table as the file has it."""
-        table, columns = DATA["tables"][name], dict[str, Column]()
+        table = DATA["tables"][name]
+        columns = dict[str, Column]()
         known = DATA["columns"] | table.get("own", {})
         for key in table["columns"]:
             facts = {"meaning": known[key]} if isinstance(known[key], str) else dict(known[key])

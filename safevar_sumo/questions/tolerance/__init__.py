@@ -217,7 +217,8 @@ def _numbers(
 
 def _check_drawable(evaluator: Evaluator) -> None:
     """Refuse a study of which hardly any setting is feasible, before the long scans."""
-    members, region = evaluator.characteristics, evaluator.region
+    members = evaluator.characteristics
+    region = evaluator.region
     if not len(Box(region, members.lower, members.upper).draw(1, np.random.default_rng(evaluator.study.search.seed))):
         problem = f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no box to test: "
         legal = "characteristics that the constraints do not tie to each other"
@@ -228,7 +229,8 @@ def _denser(models: Models, attack: int) -> list[Any]:
     """The models with further points between those of the study's matrix, if there is an attack."""
     if not attack:
         return [*models.members]
-    own, seed = models.own, models.own.evaluator.study.search.seed
+    own = models.own
+    seed = models.own.evaluator.study.search.seed
     return [with_points_between(model, own.unsafe, np.random.default_rng((seed, 5, 0)))[0] for model in models.members]
 
 
@@ -267,7 +269,8 @@ def _unsafe_solutions(subject: Study | Case, columns: Sequence[int], unsafe: Uns
     """The distinct unsafe solutions of results that change no other characteristics than `columns`, shape (K, n)."""
     if isinstance(subject, Study):
         return np.zeros((0, len(CharacteristicSet.of(subject))))
-    names, original = list(subject.characteristics.names), subject.characteristics.original
+    names = list(subject.characteristics.names)
+    original = subject.characteristics.original
     settings = subject.solutions[unsafe.rows(subject.solutions)][names].to_numpy(dtype=float)
     other_columns = np.setdiff1d(np.arange(len(names)), columns)
     return np.unique(settings[(settings == original)[:, other_columns].all(axis=1)], axis=0)
@@ -327,7 +330,8 @@ def _draw(answer: Answer, scans: Sequence[OneAtATimeScan]) -> Figure:
 def _draw_profile(axis: Axes, one: OneAtATimeScan, row: Mapping[Any, Any], column: str) -> None:
     from safevar_sumo.questions.figures import BLUE, FONT_SIZE, SKY_BLUE, VERMILION, as_formula, escape_dollars
 
-    item, profile = one.characteristic, one.profile.set_index("value")[column]
+    item = one.characteristic
+    profile = one.profile.set_index("value")[column]
     axis.plot(profile, color=BLUE, linewidth=1.2)
     for low, high in one.of_state("unsafe"):
         axis.axvspan(low, high, facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)

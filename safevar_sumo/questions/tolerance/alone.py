@@ -66,8 +66,11 @@ class _Ends:
     def __init__(self, scan: OneAtATimeScan, column: int, own: Model) -> None:
         item = scan.characteristic
         assert scan.safe is not None
-        self.item, self.column, self.scan = item, column, scan
-        self.ends, members = [*scan.safe], own.evaluator.characteristics
+        self.item = item
+        self.column = column
+        self.scan = scan
+        self.ends = [*scan.safe]
+        members = own.evaluator.characteristics
         self.failures = list[FloatArray]()
         self.beyond: list[Beyond] = [None, None]
         for side, last in enumerate((item.lower, item.upper)):
@@ -78,7 +81,8 @@ class _Ends:
                 self.beyond[side] = members.setting({item.name: nearest}), own
 
     def limit(self) -> AloneLimit:
-        item, (low, high) = self.item, self.ends
+        item = self.item
+        low, high = self.ends
         safe = (
             low if low <= item.lower else item.rounded(low, upwards=True),
             high if high >= item.upper else item.rounded(high, upwards=False),
@@ -97,7 +101,8 @@ class Move:
     """
 
     def __init__(self, column: int, start: float, failures: FloatArray) -> None:
-        self.column, self.safe = column, start
+        self.column = column
+        self.safe = start
         order = np.argsort(np.abs(failures[:, column] - start), kind="stable")
         self.encounters = failures[order[:MOVED_BEFORE]]
         self.failure = self.encounters[0]
@@ -116,7 +121,8 @@ class Move:
 
     def narrow(self, are_unsafe: BoolArray) -> None:
         """Take what a round gave."""
-        is_unsafe, values = are_unsafe.reshape(len(self.encounters), PARTS - 1), self._values
+        is_unsafe = are_unsafe.reshape(len(self.encounters), PARTS - 1)
+        values = self._values
         first = int(np.argmax(np.append(is_unsafe.any(axis=0), True)))
         self.safe = self.safe if first == 0 else float(values[first - 1])
         if first < len(values):
@@ -142,7 +148,9 @@ class AloneSearch:
     def __init__(
         self, scans: Sequence[OneAtATimeScan], columns: Sequence[int], models: Sequence[Model], values: int = VALUES
     ) -> None:
-        self.scans, self.models, self.values = scans, models, values
+        self.scans = scans
+        self.models = models
+        self.values = values
         is_safe = all(scan.safe is not None for scan in scans)
         self.ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True) if is_safe]
 
@@ -219,7 +227,8 @@ def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -
 
 def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The failures within the ends, below and above the original."""
-    values, original = failures[:, ends.column], ends.item.original
+    values = failures[:, ends.column]
+    original = ends.item.original
     below = failures[(values >= ends.ends[0]) & (values < original)]
     above = failures[(values > original) & (values <= ends.ends[1])]
     return below, above
@@ -227,11 +236,14 @@ def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -> None:
     """Attack the limits in encounters that no scan met, until nothing is found."""
-    members, seed = models[0].evaluator.characteristics, models[0].evaluator.study.search.seed
+    members = models[0].evaluator.characteristics
+    seed = models[0].evaluator.study.search.seed
     judges = [partial(model.left, stage="attack on limits alone") for model in models]
-    waiting, size = [*ends], max(budget // GENERATIONS, 1)
+    waiting = [*ends]
+    size = max(budget // GENERATIONS, 1)
     for number in range(ATTACKS):
-        boxes, known = list[Box](), list[list[FloatArray]]()
+        boxes = list[Box]()
+        known = list[list[FloatArray]]()
         rngs = [np.random.default_rng((seed, 6, each.column, number)) for each in waiting]
         for each, rng in zip(waiting, rngs, strict=True):
             lower = np.where(members.of_vehicle, members.original, members.lower)

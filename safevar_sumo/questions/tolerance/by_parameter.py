@@ -74,7 +74,8 @@ class Parameter(NamedTuple):
         tests = [(test, points) for test, points in _points_by_test(study, name) if points]
         searchable = searchable_in(assemble(study).points[0].scenario)
         unit = searchable[name].unit if name in searchable else ""
-        lowest, highest = min(min(points) for _, points in tests), min(max(points) for _, points in tests)
+        lowest = min(min(points) for _, points in tests)
+        highest = min(max(points) for _, points in tests)
         suffix = unit_text(unit)
         if values[-1] > highest:
             ending = join_phrases(test.name for test, points in tests if max(points) == highest)

@@ -86,8 +86,13 @@ class LevelSearch:
         fits: int | None,
         budget: int,
     ) -> None:
-        self.evaluator, self.by, self.unsafe, self.columns = evaluator, by, unsafe, columns
-        self.limits, self.fits, self.budget = limits, fits, budget
+        self.evaluator = evaluator
+        self.by = by
+        self.unsafe = unsafe
+        self.columns = columns
+        self.limits = limits
+        self.fits = fits
+        self.budget = budget
         self.is_searched = by.name in evaluator.study.scenario.search
         self.whole = models_of(evaluator, unsafe, fits) if evaluator.study.scenario.search else None
 
@@ -137,7 +142,8 @@ class LevelSearch:
             return None
         if self.whole is None:
             return models_of(self.evaluator.for_study(study, verified=0), self.unsafe, self.fits)
-        region, members = self.evaluator.region, list[Model]()
+        region = self.evaluator.region
+        members = list[Model]()
         for model in self.whole.members:
             of_fit = study_between(model.evaluator.study, self.by, low, high, at_end=False)
             of_fit = with_feasible_encounter(of_fit, region) if self.is_searched else of_fit
@@ -163,7 +169,8 @@ class LevelSearch:
 
     def _promise(self, own: Model) -> Box:
         """The specified limits in all encounters of a model, all other characteristics as in the original."""
-        members, region = own.evaluator.characteristics, own.evaluator.region
+        members = own.evaluator.characteristics
+        region = own.evaluator.region
         everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
         columns = [*self.columns, *np.flatnonzero(~members.of_vehicle).tolist()]
         geometry = BoxGeometry(region, columns, {**self.limits, **everywhere})
@@ -199,11 +206,15 @@ class LevelSearch:
         last = Reach(kept[-1].value, kept[-1].attack) if kept else Reach()
         if len(kept) == len(levels) or not self.is_searched or levels[len(kept)].alone is None:
             return last
-        level, low = levels[len(kept)], self.by.lowest if last.value is None else last.value
-        own, judges = level.models.own, level.models.members
+        level = levels[len(kept)]
+        low = self.by.lowest if last.value is None else last.value
+        own = level.models.own
+        judges = level.models.members
         column = own.evaluator.characteristics.names.index(self.by.name)
         item = self.evaluator.characteristics.members[column]
-        promise, failures, high = self._promise(own), level.failures, level.value
+        promise = self._promise(own)
+        failures = level.failures
+        high = level.value
         for number in range(1, REACHES + 1):
             for model, rows in failures or ():
                 inside = rows[rows[:, column] <= high]

@@ -40,7 +40,8 @@ def levels_with_together(search: LevelSearch, known: FloatArray) -> list[Level]:
 
 def _find(search: LevelSearch, level: Level, models: Models, inner: Box | None) -> LimitsTogether:
     """The limits together up to a value, around those up to the value above."""
-    members, region = models.own.evaluator.characteristics, models.own.evaluator.region
+    members = models.own.evaluator.characteristics
+    region = models.own.evaluator.region
     if inner is not None:
         lower = np.where(members.of_vehicle, inner.lower, members.lower)
         upper = np.where(members.of_vehicle, inner.upper, members.upper)

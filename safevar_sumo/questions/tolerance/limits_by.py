@@ -37,7 +37,10 @@ def answer_by(search: LevelSearch, known: FloatArray, is_together: bool) -> Answ
     """Limits that hold up to each value of a parameter, alone, and if they are wanted, together; `known` are failures
     of one characteristic that results hold, shape (K, n).
     """
-    by, unsafe, limits, study = search.by, search.unsafe, search.limits, search.evaluator.study
+    by = search.by
+    unsafe = search.unsafe
+    limits = search.limits
+    study = search.evaluator.study
     levels = levels_with_together(search, known) if is_together else search.levels(known)
     with search.evaluator.stage("specified limits between two values"):
         reach = search.reach(levels)
@@ -73,7 +76,8 @@ def _numbers(levels: Sequence[Level], reach: Reach, unsafe: Unsafe) -> JsonObjec
     """Numbers about the limits up to the greatest value, and about the attack on the specified limits up to the value
     that they reach; `boxes` counts the values that have limits together.
     """
-    last, found = levels[-1], reach.attack
+    last = levels[-1]
+    found = reach.attack
     least = None if found is None or not len(found.left) else unsafe.value(float(found.left[0]))
     attacked = {"attacked": None if found is None else found.simulated, "least_attacked": least}
     members, left_out = last.models
@@ -89,7 +93,8 @@ def columns_by(by: Parameter) -> Columns:
     own = {f"by_{by.name}": Column(by.unit, "value up to which the limits hold", ".6g")}
     names = [*LIMITS]
     place = names.index("original") + 1
-    first, rest = names[:place], names[place:]
+    first = names[:place]
+    rest = names[place:]
     texts = {
         "sentence": Column("", "for a maintenance manual", is_shown=False),
         "scope": Column("", "what the limits up to this value cover", is_shown=False),
@@ -107,7 +112,8 @@ def _text(by: Parameter, value: float | None) -> str:
 
 def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -> list[tuple[Any, ...]]:
     """A row for each characteristic and value."""
-    failures, members = _failures(levels), search.evaluator.characteristics
+    failures = _failures(levels)
+    members = search.evaluator.characteristics
     rows = list[tuple[Any, ...]]()
     for number, column in enumerate(search.columns):
         item = members.members[column]
@@ -151,7 +157,8 @@ def _keep(item: Characteristic, alone: AloneLimit | None, together: LimitsTogeth
     others = "with all others as in the original"
     ends = None if alone is None else alone.safe
     if together is not None:
-        others, box = "with all others within theirs", together.box
+        others = "with all others within theirs"
+        box = together.box
         ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
     if ends is None:
         return "no limit holds"
@@ -184,7 +191,9 @@ def _failures(levels: Sequence[Level]) -> dict[tuple[float, int], Failure]:
 
 def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame, reach: Reach) -> Iterator[str]:
     """The sentences of the verdict, the allowed value first."""
-    by, unsafe, study = search.by, search.unsafe, search.evaluator.study
+    by = search.by
+    unsafe = search.unsafe
+    study = search.evaluator.study
     names = dict.fromkeys(point.weather.name.replace("_", " ") for point in assemble(study).points)
     where = f"On a {' or '.join(names)} road"
     if search.limits:
@@ -245,7 +254,8 @@ def _draw(answer: Answer, search: LevelSearch) -> Figure:
     """The limits across, the parameter upward, a panel for each characteristic."""
     from safevar_sumo.questions.figures import FONT_SIZE, as_formula, new_panels
 
-    frame, by = answer.tables["limits"], search.by
+    frame = answer.tables["limits"]
+    by = search.by
     title = f"{answer.study.name}: limits alone up to each {by.name.replace('_', ' ')}"
     figure, axes = new_panels(title, len(search.columns), 4, (2.3, 1.75), min_width=4.6, title_height=1.1)
     for axis, column in zip(axes, search.columns, strict=True):

@@ -38,7 +38,8 @@ def _nearest(
     models: Models, limits: Mapping[str, Limit], item: Characteristic, side: int, value: float
 ) -> float | None:
     """The value of one limit, from the original's on, up to which the others hold as specified."""
-    safe, unsafe = item.original, value
+    safe = item.original
+    unsafe = value
     if not _first_unsafe(models, [_box(models, limits, item, side, safe)]):
         return None
     for _ in range(ROUNDS):
@@ -47,7 +48,8 @@ def _nearest(
         if safe_count == PARTS:
             safe = values[-1]
             break
-        safe, unsafe = ([safe, *values][safe_count], values[safe_count])
+        safe = [safe, *values][safe_count]
+        unsafe = values[safe_count]
     return _attacked(models, limits, item, side, safe)
 
 
@@ -76,7 +78,8 @@ def _first_unsafe(models: Models, boxes: Sequence[Box]) -> int:
         np.concatenate([box.corners(seed, 0)[: MAX_CORNERS // len(boxes)], box.spread_and_corners(POINTS, seed)])
         for box in boxes
     ]
-    ends, is_safe = np.cumsum([*map(len, settings)])[:-1], np.ones(len(boxes), dtype=bool)
+    ends = np.cumsum([*map(len, settings)])[:-1]
+    is_safe = np.ones(len(boxes), dtype=bool)
     for model in models.members:
         lefts = np.split(model.left(np.concatenate(settings), STAGE), ends)
         is_safe &= [left.min() >= 0 for left in lefts]

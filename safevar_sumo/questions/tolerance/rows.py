@@ -66,10 +66,12 @@ def limit_rows(
     """
     beyond_alone = _failures_alone(alone)
     beyond = {} if together is None else _failures_beyond(together, models)
-    rows, broken = [], []
+    rows = []
+    broken = []
     for each in alone:
         item = each.characteristic
-        name, limit = item.name, limits.get(item.name)
+        name = item.name
+        limit = limits.get(item.name)
         specified = NOWHERE if limit is None else (limit.at_least, limit.at_most)
         box = None if together is None else together.box
         column = models[0].evaluator.characteristics.names.index(name)
@@ -162,7 +164,8 @@ def describe(model: Model, settings: Mapping[str, FloatArray]) -> dict[str, Fail
     """How unsafe settings of a model fail at their worst points, by the same names."""
     if not settings:
         return {}
-    points, members = assemble(model.evaluator.study).points, model.evaluator.characteristics
+    points = assemble(model.evaluator.study).points
+    members = model.evaluator.characteristics
     points = tuple(points[number] for number in model.points) or points
     runs = model.evaluate(np.array(list(settings.values())), "what fails first")
     worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
@@ -203,7 +206,8 @@ def _sentence(
         return f"{name}: no limits together were found."
     column = members.names.index(item.name)
     ends: Interval = float(box.lower[column]), float(box.upper[column])
-    own, domain = (item.original, *specified), (item.lower, item.upper)
+    own = (item.original, *specified)
+    domain = (item.lower, item.upper)
     if ends[0] == ends[1]:
         return f"{name}: keep {ends[0]:g}{item.suffix}, as in the original: no room was found for it."
     keep = " and ".join(

@@ -46,8 +46,10 @@ class OneAtATimeScan(NamedTuple):
     @property
     def intervals(self) -> pd.DataFrame:
         """The runs of neighbouring values of one state: `state`, the first value `low` and the last one `high`."""
-        states, values = self.profile["state"], self.profile["value"]
-        is_first, is_last = states != states.shift(), states != states.shift(-1)
+        states = self.profile["state"]
+        values = self.profile["value"]
+        is_first = states != states.shift()
+        is_last = states != states.shift(-1)
         ends = {"low": values[is_first].to_numpy(), "high": values[is_last].to_numpy()}
         return pd.DataFrame({"state": states[is_first].to_numpy(), **ends})
 
@@ -68,7 +70,8 @@ class OneAtATimeScan(NamedTuple):
 
     def first_loss(self, loss: float = 0.0) -> float:
         """The value nearest to the original that loses more than `loss` rating points; NaN if no value does."""
-        points, original = self.profile.set_index("value")[RATING_POINTS.name], self.characteristic.original
+        points = self.profile.set_index("value")[RATING_POINTS.name]
+        original = self.characteristic.original
         values = points.index[points < points[original] - loss - POINT_ROUNDING]
         return min(values, key=lambda value: abs(value - original), default=math.nan)
 
@@ -102,7 +105,8 @@ def scan(
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:
     """New values that divide the intervals between neighbouring values of different states."""
-    values, states = profile["value"].to_numpy(), profile["state"].to_numpy()
+    values = profile["value"].to_numpy()
+    states = profile["state"].to_numpy()
     rows = np.flatnonzero(states[1:] != states[:-1])[:, np.newaxis]
     inner = values[rows] + (values[rows + 1] - values[rows]) * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
     return np.setdiff1d(inner, values)

@@ -67,8 +67,10 @@ class BoxGeometry:
 
     def __init__(self, region: FeasibleRegion, columns: Sequence[int], limits: Mapping[str, Limit]) -> None:
         members = region.characteristics
-        self.region, self.columns = region, columns
-        self.original, is_varied = members.original, np.isin(range(len(members)), columns)
+        self.region = region
+        self.columns = columns
+        self.original = members.original
+        is_varied = np.isin(range(len(members)), columns)
         self.domain = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
         self.width = self.domain.sum(axis=0)
         self.limits = np.full_like(self.domain, np.nan)
@@ -91,7 +93,8 @@ class BoxGeometry:
 
     def printed(self, sides: FloatArray) -> Box:
         """A box as it is printed: limits and ends of domains exactly, all others rounded inwards."""
-        box, members = self.box(sides), self.characteristics
+        box = self.box(sides)
+        members = self.characteristics
         ends = np.array(
             [
                 [item.rounded(end, upwards=upwards) for item, end in zip(members, ends, strict=True)]
@@ -143,9 +146,11 @@ class BoxSearch(BoxGeometry):
         self, model: Model, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
     ) -> None:
         super().__init__(model.evaluator.region, columns, limits)
-        self.models, self.unsafe_settings = [model], unsafe_settings
+        self.models = [model]
+        self.unsafe_settings = unsafe_settings
         self.corners = list[FloatArray]()
-        self.gap, self.search_count = 0.0, 0
+        self.gap = 0.0
+        self.search_count = 0
         self.seed = model.evaluator.study.search.seed
         self.batch = max(BATCH // len(model.points or assemble(model.evaluator.study).points), LEAST_BATCH)
 
@@ -201,7 +206,9 @@ class BoxSearch(BoxGeometry):
 
     def corner_settings(self, boxes: FloatArray) -> FloatArray:
         """Settings at the C known corners of B boxes, shape (B, C, n)."""
-        corners, below, above = np.array(self.corners), boxes[:, :1], boxes[:, 1:]
+        corners = np.array(self.corners)
+        below = boxes[:, :1]
+        above = boxes[:, 1:]
         return self.original + corners * np.where(corners > 0, above, below)  # a corner of 0 is the original
 
     def points(self, sides: FloatArray, number: int) -> FloatArray:
@@ -227,7 +234,8 @@ class BoxSearch(BoxGeometry):
         """
         number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
         causes = self._causes(settings[:: len(settings) // number][:number])
-        changes, is_vehicle = causes - self.original, self.characteristics.of_vehicle
+        changes = causes - self.original
+        is_vehicle = self.characteristics.of_vehicle
         sides = np.where(changes > 0, self.domain[1], self.domain[0])
         shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
         corners = np.where(is_vehicle, np.sign(changes), shares)  # of the vehicle, in the encounter of the cause
@@ -247,7 +255,8 @@ class BoxSearch(BoxGeometry):
 
     def _causes(self, settings: FloatArray) -> FloatArray:
         """Unsafe settings with as few changes as possible, from K unsafe ones, shape (K, n)."""
-        causes, columns = settings.copy(), np.flatnonzero(self.is_free.any(axis=0))
+        causes = settings.copy()
+        columns = np.flatnonzero(self.is_free.any(axis=0))
         for start in range(0, len(columns), UNDONE_AT_ONCE):
             group = columns[start : start + UNDONE_AT_ONCE]
             bits = 1 << np.arange(len(group))
@@ -267,14 +276,16 @@ class BoxSearch(BoxGeometry):
 
     def shrunk(self, sides: FloatArray, start: FloatArray) -> FloatArray:
         """A box whose free sides are the largest share of `sides` with which it is safe."""
-        low, high = 0.0, 1.0
+        low = 0.0
+        high = 1.0
         for _ in range(ROUNDS):
             shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
             boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * sides, start)
             needs = self.needs(self.unsafe_settings)
             is_safe = self.are_safe(boxes) & [not (needs <= box).all(axis=(1, 2)).any() for box in boxes]
             safe_count = int(np.argmin([*is_safe, False]))  # the smallest ones, before the first unsafe
-            low, high = shares[safe_count], shares[min(safe_count + 1, PARTS)]
+            low = shares[safe_count]
+            high = shares[min(safe_count + 1, PARTS)]
         return np.where(self.is_free, low * sides, start)
 
     def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:

@@ -70,7 +70,8 @@ class Settlement:
         return Box(box.region, *ends)
 
     def _is_blocked(self, box: Box, wider: Box, step: Step) -> bool:
-        search, (side, column) = self.search, step
+        search = self.search
+        side, column = step
         sides = search.sides_of(wider)
         if len(search.unsafe_inside(sides)):
             return True
@@ -98,7 +99,8 @@ class Settlement:
         search = self.search
         while len(inside := search.unsafe_inside(search.sides_of(box))):
             sides = search.sides_of(box)
-            extents, choices = search.extents(inside[:1])[0], list[FloatArray]()
+            extents = search.extents(inside[:1])[0]
+            choices = list[FloatArray]()
             for side, column in np.argwhere(search.is_free & (extents > 0)).tolist():
                 shorter = sides.copy()
                 shorter[side, column] = max(extents[side, column] - CLEARANCE * LEAST_MOVE * search.width[column], 0.0)

@@ -75,7 +75,8 @@ class LimitsTogether(NamedTuple):
     @property
     def numbers(self) -> JsonObject:
         """What an answer says of them in numbers."""
-        proof, found = self.proof, self.attack
+        proof = self.proof
+        found = self.attack
         return {
             "box": self.box is not None,
             "samples": None if proof is None else proof.samples,
@@ -157,7 +158,8 @@ def find_limits_together(
             sides = search.best(start) if inner is None or number > 1 else search.sides_of(inner)
         if sides is None:
             return _without_box(nothing, search, number)
-        box, settlement = search.printed(sides), Settlement(search)
+        box = search.printed(sides)
+        settlement = Settlement(search)
         if not _learn(search, trials, trials.first(box, number)):
             passed = _grown(settlement, trials, box, number)
             if passed is not None:
@@ -186,7 +188,8 @@ def _grown(settlement: Settlement, trials: Trials, box: Box, number: int) -> Tri
 
     Where a box fails, a limit of it moves in, or of the box from which it grew, whichever stays larger.
     """
-    search, passed = settlement.search, None
+    search = settlement.search
+    passed = None
 
     def volume(one: Box) -> float:
         return float(search.log_volume(search.sides_of(one)))
@@ -201,7 +204,8 @@ def _grown(settlement: Settlement, trials: Trials, box: Box, number: int) -> Tri
             box = rest
             wider = max(settlement.cut(wider), box, key=volume)
         else:
-            passed, box = trial, wider
+            passed = trial
+            box = wider
             with trials.evaluator.stage(SEARCH_STAGE):
                 wider = settlement.of(box)
         if passed is not None and volume(wider) <= volume(box):
@@ -213,7 +217,8 @@ def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATime
     """The box of what is safe alone; its corner where every characteristic has gone towards its smaller margin becomes
     the first that the search knows.
     """
-    start, corner = search.longest.copy(), np.zeros(len(search.original))
+    start = search.longest.copy()
+    corner = np.zeros(len(search.original))
     for column, scan in zip(columns, scans, strict=False):  # parameters of the scenario, which come last, have no scan
         original = search.original[column]
         low, high = scan.safe or (original, original)
@@ -227,7 +232,8 @@ def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATime
 
 def _result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int) -> LimitsTogether:
     """The limits together from a box that passed its trial; a box that leaves no characteristic any room is none."""
-    search, box = settlement.search, trial.box
+    search = settlement.search
+    box = trial.box
     of_vehicle = search.characteristics.of_vehicle
     is_open = search.is_free & of_vehicle
     has_room = not is_open.any() or bool((search.sides_of(box)[is_open] > 0).any())

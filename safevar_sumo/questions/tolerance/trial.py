@@ -58,14 +58,18 @@ class Trials:
     """
 
     def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
-        self.models, self.budget, self.evaluator = models, budget, evaluator
+        self.models = models
+        self.budget = budget
+        self.evaluator = evaluator
         self.seed = models[0].evaluator.study.search.seed
-        self._proofs, self._failing = 0, {0}
+        self._proofs = 0
+        self._failing = {0}
         """Number of proofs so far; numbers of the models in which corners of earlier boxes failed, which come first."""
 
     def first(self, box: Box, attempt: int) -> Trial:
         """Try the corners in the models in which earlier boxes failed, and a short attack."""
-        corners, budget = box.corners(self.seed, attempt)[:MAX_CORNERS], round(FIRST_SHARE * self.budget)
+        corners = box.corners(self.seed, attempt)[:MAX_CORNERS]
+        budget = round(FIRST_SHARE * self.budget)
         with self.evaluator.stage(TRIAL_STAGE, len(self._failing) * len(corners) + budget):
             lefts = self._left(corners, self._failing)
             return self._failed(box, corners, lefts) or self._attack(box, corners, lefts, budget, attempt)
@@ -74,8 +78,10 @@ class Trials:
         """Try all corners in all models, the whole attack, and settings drawn at random; the first part that finds
         failures is the last.
         """
-        all_corners, others = box.corners(self.seed, attempt), {*range(len(self.models))} - self._failing
-        corners, own = all_corners[:MAX_CORNERS], self.models[0]
+        all_corners = box.corners(self.seed, attempt)
+        others = {*range(len(self.models))} - self._failing
+        corners = all_corners[:MAX_CORNERS]
+        own = self.models[0]
         of_fits = len(all_corners) + (len(self.models) - 1) * len(corners)
         total = of_fits + self.budget + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)
         with self.evaluator.stage(TRIAL_STAGE, total):
@@ -115,7 +121,9 @@ class Trials:
         """Attack a box, beginning at its worst corners in each model, or in the first."""
         if not budget:
             return Trial(box, judges=self.models)
-        own, judges, left_out = self.models[0], list[Model](), list[int]()
+        own = self.models[0]
+        judges = list[Model]()
+        left_out = list[int]()
         for model in self.models:
             denser, number = with_points_between(model, own.unsafe, np.random.default_rng((self.seed, 5, attempt)))
             judges.append(denser)

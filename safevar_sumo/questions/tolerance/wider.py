@@ -44,7 +44,8 @@ def wider_study(study: Study) -> Study:
         wider = load_study(str(paths[0]) if paths else study.wider)
     except InputError as error:
         raise InputError(study.source, f"wider = {study.wider!r}: {error.problem}", error.legal) from None
-    own, others = study.vehicle.characteristics, wider.vehicle.characteristics
+    own = study.vehicle.characteristics
+    others = wider.vehicle.characteristics
     if {name: row.unit for name, row in own.items()} != {name: row.unit for name, row in others.items()}:
         problem = f"wider = {study.wider!r} varies {', '.join(others)}"
         raise InputError(study.source, problem, f"a study of the same characteristics: {', '.join(own)}")
@@ -87,11 +88,15 @@ def wider_rows(
 
 def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
     """A box of the vehicle's characteristics in all encounters of the wider study."""
-    members, own = models.own.evaluator.characteristics, evaluator.characteristics
-    lower, upper = members.lower.copy(), members.upper.copy()
+    members = models.own.evaluator.characteristics
+    own = evaluator.characteristics
+    lower = members.lower.copy()
+    upper = members.upper.copy()
     for item in members.vehicle:
-        column, column_here = members.names.index(item.name), own.names.index(item.name)
-        lower[column], upper[column] = box.lower[column_here], box.upper[column_here]
+        column = members.names.index(item.name)
+        column_here = own.names.index(item.name)
+        lower[column] = box.lower[column_here]
+        upper[column] = box.upper[column_here]
     return Box(models.own.evaluator.region, lower, upper)
 
 

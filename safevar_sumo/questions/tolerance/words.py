@@ -27,7 +27,8 @@ def verdict_sentences(
     wider: Sequence[tuple[Any, ...]],
 ) -> Iterator[str]:
     """The sentences of the verdict, the decision first."""
-    unsafe, study = models.own.unsafe, models.own.evaluator.study
+    unsafe = models.own.unsafe
+    study = models.own.evaluator.study
     if any(each.safe is None for each in alone):
         yield f"The original vehicle itself is unsafe ({unsafe.description})."
         return
@@ -69,7 +70,8 @@ def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
 
 def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, budget: int) -> Iterator[str]:
     """The limits together, and what they were tested with."""
-    unsafe, count = models.own.unsafe, len(together.members)
+    unsafe = models.own.unsafe
+    count = len(together.members)
     where = "in one model" if len(models.members) == 1 else f"in {count} of {len(models.members)} fits"
     if together.box is None:
         if together.boxes:
@@ -104,10 +106,12 @@ def _attack_in_words(together: LimitsTogether, budget: int) -> str:
     """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67 m)`."""
     if together.attack is None or not budget:
         return "not attacked"
-    (least, own), unsafe = together.least, together.members[0].unsafe
+    least, own = together.least
+    unsafe = together.members[0].unsafe
     if not abs(least) < float("inf"):
         return f"{together.attack.simulated:,} aimed at them meet nobody"
-    words, of_own = unsafe.value_in_words(least), ""
+    words = unsafe.value_in_words(least)
+    of_own = ""
     if own == own and unsafe.value_in_words(own) != words:
         of_own = f" (with the study's own fit {unsafe.value_in_words(own).partition(' ')[2]})"
     between = ""
