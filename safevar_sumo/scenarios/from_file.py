@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,28 +24,6 @@ SAME = 1e-6
 """Difference of two samples' numbers up to which they are one [-]."""
 DIGITS = 9
 """Decimals of the places in tracks [m]: the last bits of a sine differ between machines."""
-
-
-class _Scene(NamedTuple):
-    """A played scene, and its bodies in coordinates of Ego's lane."""
-
-    played: Played
-    bodies: dict[str, Moved]
-
-
-def _scene(file: str, ego: str, values: Mapping[str, str], every: int) -> _Scene:
-    played = play(file, values, ego, every)
-    start = played.start
-    return _Scene(
-        played,
-        {
-            one.name: one._replace(
-                place=np.round((one.place - start.place) / start.facing, DIGITS),
-                facing=np.round(one.facing / start.facing, DIGITS + 3),
-            )
-            for one in played.others
-        },
-    )
 
 
 class OpenScenario(TrackScenario):
@@ -83,8 +61,7 @@ class OpenScenario(TrackScenario):
     def free(self) -> Mapping[str, FreeParameter]:
         """Every number among the file's parameters may be searched; a file states no units."""
         return {
-            name: FreeParameter(lower=-WIDEST, upper=WIDEST, unit="", meaning=name)
-            for name in self._scenes[0].played.numbers
+            name: FreeParameter(lower=-WIDEST, upper=WIDEST, unit="", meaning=name) for name in self._scenes[0].numbers
         }
 
     def at(self, values: Mapping[str, Quantity]) -> OpenScenario:
@@ -101,20 +78,20 @@ class OpenScenario(TrackScenario):
         return [{**self.values, **dict(zip(arrays, row, strict=True))} for row in rows], np.reshape(which, -1)
 
     @cached_property
-    def _scenes(self) -> list[_Scene]:
+    def _scenes(self) -> list[Played]:
         """The scenes of all different encounters."""
         return self._played(EVERY)
 
-    def _played(self, every: int) -> list[_Scene]:
+    def _played(self, every: int) -> list[Played]:
         try:
             found = [
-                _scene(self.file, self.ego, {name: text_of(value) for name, value in values.items()}, every)
+                play(self.file, {name: text_of(value) for name, value in values.items()}, self.ego, every)
                 for values in self._different[0]
             ]
         except InputError as error:
             name = os.path.basename(self.file)
             raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
-        if len({scene.played.ego for scene in found}) > 1:
+        if len({scene.ego for scene in found}) > 1:
             problem = f"the body of {self.ego} depends on a searched parameter"
             raise InputError("scenario.search", problem, "values of it in the matrix")
         return found
@@ -130,12 +107,12 @@ class OpenScenario(TrackScenario):
     @property
     def duration(self) -> Quantity:
         """Length of a run [s]."""
-        return self._of_scenes([scene.played.duration for scene in self._scenes])
+        return self._of_scenes([scene.duration for scene in self._scenes])
 
     @property
     def test_speed(self) -> Quantity:
         """The speed that Ego holds, and the vehicle under test until its driving system acts [m/s]."""
-        return self._of_scenes([scene.played.speed for scene in self._scenes])
+        return self._of_scenes([scene.speed for scene in self._scenes])
 
     @property
     def start_speed(self) -> Quantity:
@@ -145,17 +122,17 @@ class OpenScenario(TrackScenario):
     @property
     def depends_until(self) -> Quantity:
         """The time until which motions depend on an Ego that holds its speed [s]."""
-        return self._of_scenes([scene.played.depends_until for scene in self._scenes])
+        return self._of_scenes([scene.depends_until for scene in self._scenes])
 
     @property
     def vut_length(self) -> float:
         """Length of Ego [m]."""
-        return self._scenes[0].played.ego.length
+        return self._scenes[0].ego.length
 
     @property
     def vut_width(self) -> float:
         """Width of Ego [m]."""
-        return self._scenes[0].played.ego.width
+        return self._scenes[0].ego.width
 
     @property
     def is_hit_in_front(self) -> bool:
@@ -165,7 +142,7 @@ class OpenScenario(TrackScenario):
     @property
     def dependence(self) -> str:
         """What depends on Ego, and until when."""
-        played = self._scenes[0].played
+        played = self._scenes[0]
         return f"{played.dependence} at {played.depends_until:.1f} s depends on an Ego that keeps its speed"
 
     def read_files(self, folders: Sequence[str]) -> None:
@@ -175,7 +152,7 @@ class OpenScenario(TrackScenario):
 
     def remarks(self) -> list[str]:
         """What of the file has no effect here, or never happens, and that the vehicle has Ego's body."""
-        played = self._scenes[0].played
+        played = self._scenes[0]
         car = f"{VUT_LENGTH:.2f} m x {VUT_WIDTH:.2f} m"
         body = f"{played.ego.length:.2f} m x {played.ego.width:.2f} m"
         differs = [] if body == car else [f"the vehicle has {self.ego}'s body, {body}, not that of other tests, {car}"]
@@ -187,22 +164,26 @@ class OpenScenario(TrackScenario):
         are_kept = np.abs(samples / EVERY - np.round(samples / EVERY)).max() < SAME
         every, scenes = (EVERY, self._scenes) if are_kept else (1, self._played(1))
         return [
-            self._track(name, [scene.bodies[name] for scene in scenes], samples, every) for name in scenes[0].bodies
+            self._track(scenes, [scene.others[number] for scene in scenes], samples, every)
+            for number in range(len(scenes[0].others))
         ]
 
-    def _track(self, name: str, bodies: Sequence[Moved], samples: FloatArray, every: int) -> Track:
-        if len({(body.shape.length, body.shape.width) for body in bodies}) > 1:
+    def _track(self, scenes: Sequence[Played], bodies: Sequence[Moved], samples: FloatArray, every: int) -> Track:
+        name, shape = bodies[0].name, bodies[0].shape
+        if len({(body.name, body.shape.length, body.shape.width) for body in bodies}) > 1:
             problem = f"the body of {name} depends on a searched parameter"
             raise InputError("scenario.search", problem, "values of it in the matrix")
         place, facing, speed = (
             np.stack([_sampled(getattr(body, column), samples / every) for body in bodies], axis=1)
             for column in ("place", "facing", "speed")
         )
+        ahead = np.array([scene.start.facing for scene in scenes])
+        place = np.round((place - [scene.start.place for scene in scenes]) / ahead, DIGITS)
+        facing = np.round(facing / ahead, DIGITS + 3)
         beyond = np.maximum(samples[:, np.newaxis] - [every * (len(body.speed) - 1) for body in bodies], 0.0)
         facing = facing / np.abs(facing)
         place = place + beyond * STEP * speed * facing
         which = self._different[1]
-        shape = bodies[0].shape
         length: Quantity = shape.length
         width: Quantity = shape.width
         deleted = np.array([body.deleted for body in bodies])
@@ -216,8 +197,10 @@ class OpenScenario(TrackScenario):
 
 def _sampled(column: Any, samples: FloatArray) -> Any:
     """A column at fractions of samples, linear in between."""
-    inside = np.minimum(samples, len(column) - 1)
-    below = np.minimum(np.floor(inside + SAME).astype(int), len(column) - 1)
-    share = np.maximum(inside - below, 0.0)
-    share[share < SAME] = 0.0
-    return column[below] + share * (column[np.minimum(below + 1, len(column) - 1)] - column[below])
+    last = len(column) - 1
+    whole = np.floor(samples + SAME)
+    below = np.minimum(whole.astype(int), last)
+    share = samples - whole
+    if (share < SAME).all():
+        return column[below]
+    return column[below] + share * (column[np.minimum(below + 1, last)] - column[below])
