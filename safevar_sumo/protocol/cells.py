@@ -156,14 +156,18 @@ class Cell(NamedTuple):
         return f"{self.matrix.name}, {self.vut_speed:g} km/h{function}, {column}{variation}"
 
     @property
-    def scenario(self) -> tuple[str, Parameters, bool]:
-        """The simulation of the cell: scenario model, parameters, and whether it is by night."""
+    def is_night(self) -> bool:
+        """Whether the cell is simulated by night."""
+        return self.matrix.light == "night" or self.range_or_layer == NIGHT
+
+    @property
+    def scenario(self) -> tuple[str, Parameters]:
+        """The scenario of the cell: model and parameters."""
         test = self.matrix.test_name
         model = next(model for prefix, model in MODELS.items() if test.startswith(prefix))
         parameters = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
         if self.impact_location is not None:
             parameters["impact_location"] = self.impact_location
-        is_night = self.matrix.light == "night" or self.range_or_layer == NIGHT
         if self.range_or_layer == ACCELERATION:
             parameters["target_deceleration"] = TARGET_DECELERATION - _leading_number(self.condition)
         elif self.range_or_layer == OFFSET and "headway" in self.condition:
@@ -172,7 +176,7 @@ class Cell(NamedTuple):
             parameters["start_share"] = 1 + _leading_number(self.condition) / 100
         elif self.range_or_layer == HEADING:
             parameters["heading"] = _leading_number(self.condition)
-        return model, parameters, is_night
+        return model, parameters
 
 
 def _leading_number(condition: str) -> float:

@@ -147,13 +147,13 @@ def passing_cells(protocol: Protocol, colours: npt.NDArray[np.int8]) -> BoolArra
     return np.asarray((colours != UNKNOWN) & np.where(only_not_red, colours != RED, colours <= nominal))
 
 
-def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Impact [km/h], warning [s] and validity of N simulations of a cell, as in `CellResults`; shape (N,) each."""
+def rated_quantities(runs: SimulationRuns) -> CellResults:
+    """The results of N simulations of one cell; shape (N,) each."""
     is_valid = (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
-    return runs.relative_speed * KMH_PER_MS, np.broadcast_to(runs.warning_ttc, is_valid.shape), is_valid
+    return CellResults(runs.relative_speed * KMH_PER_MS, np.broadcast_to(runs.warning_ttc, is_valid.shape), is_valid)
 
 
-def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> CellResults:
+def join_cells(quantities: Sequence[CellResults]) -> CellResults:
     """Join the `rated_quantities` of each cell to the results of all cells for M vehicles."""
     return CellResults(*(np.stack(values, axis=1) for values in zip(*quantities, strict=True)))
 
@@ -206,9 +206,9 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
     by_night = darken(weather)
     tests = []
     for cell in protocol_of(study.matrix.protocol).cells:
-        model, parameters, is_night = cell.scenario
+        model, parameters = cell.scenario
         parameters = {**shared_parameters, **parameters}
-        weathers: list[str | Weather] = [by_night if is_night else weather]
+        weathers: list[str | Weather] = [by_night if cell.is_night else weather]
         tests.append(MatrixTest(name=cell.name, model=model, parameters=parameters, weathers=weathers))
     no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters
     return replace(study, matrix=MatrixTable(tests=tests, point=study.matrix.point), scenario=no_parameters)

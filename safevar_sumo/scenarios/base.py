@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
-from safevar_sumo.scenarios.roads import Frame, Roads, World
+from safevar_sumo.scenarios.roads import Roads, World
 from safevar_sumo.study import FreeParameter, Weather, free_parameters
 
 VUT = "vut"
@@ -106,20 +106,16 @@ ScenarioMemory = Any
 class Layout(NamedTuple):
     """Where the actors of N runs are whose scenarios differ in parameters that a study searches.
 
-    `front` is the position of the vehicle under test on its lane at the start [m], and `speed` its speed [m/s], numbers
-    or of shape (N,); None if no parameter moves it. `target` is the id of the actor that these parameters move. At T
-    samples its front is `along` the frame of the vehicle's lane and to its `left` [m], with the speeds `speeds` [m/s];
-    shape (T, N). `along` is None for a person who walks on the network's footpath. `backwards` is true where the target
-    has turned round.
+    `front` is the position of the vehicle under test on its lane at the start [m], a number or of shape (N,); None if
+    no parameter moves it. `pedestrian` is the id of a person who walks across that lane, "" if no parameter moves one:
+    at T samples, where his recorded way crosses the lane, he is to the `left` of its middle [m], with the `speed`
+    [m/s]; shape (T, N). `backwards` is true where he has turned round.
     """
 
-    frame: Frame
-    front: Quantity
-    speed: Quantity
-    target: str
-    along: FloatArray | None
-    left: Quantity
-    speeds: Quantity
+    front: Quantity | None
+    pedestrian: str = ""
+    left: Quantity = ZERO
+    speed: Quantity = ZERO
     backwards: BoolArray | bool = False
 
 

@@ -146,7 +146,6 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        frame = approach(roads)
         times = np.arange(samples)[:, np.newaxis]
         speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
         start = LATERAL_START if self.lateral_start is None else self.lateral_start
@@ -157,8 +156,7 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             first = np.where(beyond[-1], np.argmax(beyond, axis=0), samples)  # he is back at his place two steps before
             turned = times >= first
             lateral = lateral - 2 * speed * step * np.maximum(times - first + 1, 0)
-        speeds = np.broadcast_to(speed, lateral.shape)
-        return Layout(frame, self._front(roads), None, PEDESTRIAN, None, lateral, speeds, turned)
+        return Layout(self._front(roads), PEDESTRIAN, lateral, speed, turned)
 
     def begin(self, world: World) -> _Memory:
         frame = Frame.through_origin(world.lane_of(VUT))
@@ -265,9 +263,7 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             yield from CarToCar(speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        frame = Frame.of(roads.lane("road_0"))
-        still = np.zeros((samples, 1))
-        return Layout(frame, self._front, None, PARKED_VEHICLE, still + PARKED_POSITION, still, still)
+        return Layout(self._front)
 
     def begin(self, world: World) -> _Parked:
         frame = Frame.through_origin(world.lane_of(VUT))

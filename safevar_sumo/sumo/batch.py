@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -255,8 +256,16 @@ def drive(
     )
 
 
-def enter(system: System, settings: FloatArray, world: World) -> tuple[Prepared, Ads, Motion]:
-    """Put the vehicles of settings onto the road; returns their constants, their ADS and their first motion."""
+class Fleet(NamedTuple):
+    """Vehicles on the road: their constants, their ADS and their first motion."""
+
+    prepared: Prepared
+    ads: Ads
+    motion: Motion
+
+
+def enter(system: System, settings: FloatArray, world: World) -> Fleet:
+    """Put the vehicles of settings onto the road."""
     vehicle = system.vehicle
     n = len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
@@ -264,9 +273,9 @@ def enter(system: System, settings: FloatArray, world: World) -> tuple[Prepared,
     types = vehicle.sumo_type(prepared)
     ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
     if not isinstance(ads, TraciController):
-        return prepared, ads, world.enter(types)
+        return Fleet(prepared, ads, world.enter(types))
     motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
-    return prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion
+    return Fleet(prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion)
 
 
 def _note_warnings(

@@ -16,7 +16,8 @@ from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import Quantity
-from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, TrackScenario, WorldScenario, searchable_in
+from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, TrackScenario, WorldScenario, searchable_in
+from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import stage_networks
@@ -73,24 +74,21 @@ def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) 
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
     layout = scenario.layout(recording, recording.step_length, samples)
-    frame = layout.frame
-    track = recording.tracks[layout.target]
-    along = layout.along
-    if along is None:  # on a footpath, whose place along the lane SUMO knows where it crosses the lane
+    tracks = {name: _extended(track, samples) for name, track in recording.tracks.items()}
+    if layout.pedestrian:
+        track = recording.tracks[layout.pedestrian]
+        frame = Frame.of(recording.lane(recording.first_lanes[VUT]))
         at_lane = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
-        along = frame.along(track.motion[[at_lane], :2])
-    sign = np.where(layout.backwards, -1.0, 1.0)
-    _, _, dir_x, dir_y, _ = track.motion[0]
-    columns = *frame.point(along, layout.left), sign * dir_x, sign * dir_y, layout.speeds
-    motion = np.stack([np.broadcast_to(column, (samples, n)) for column in columns])
+        place = frame.point(frame.along(track.motion[[at_lane], :2]), layout.left)
+        sign = np.where(layout.backwards, -1.0, 1.0)
+        _, _, dir_x, dir_y, _ = track.motion[0]
+        columns = np.broadcast_arrays(np.empty((samples, n)), *place, sign * dir_x, sign * dir_y, layout.speed)[1:]
+        tracks[layout.pedestrian] = track._replace(motion=np.stack(columns, axis=-1))
     return replace(
         recording,
         start=np.broadcast_to(recording.start if layout.front is None else layout.front, n),
-        speed=np.broadcast_to(recording.speed if layout.speed is None else layout.speed, n),
-        tracks={
-            **{name: _extended(other, samples) for name, other in recording.tracks.items()},
-            layout.target: track._replace(motion=np.moveaxis(motion, 0, -1)),
-        },
+        speed=np.broadcast_to(recording.speed, n),
+        tracks=tracks,
     )
 
 

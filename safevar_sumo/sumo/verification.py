@@ -40,7 +40,7 @@ def drive_again(
     point = fleet.points[0]
     stage = stage_of(system, settings)
     with user_errors(system.source), open_points_world(system, settings, stage) as world:
-        _, _, motion = enter(fleet, vehicles, world)
+        motion = enter(fleet, vehicles, world).motion
         observer = observer_of(point.scenario, world, stage)
         is_open = np.ones(n, dtype=bool)
         frame = world.frame

@@ -190,10 +190,9 @@ class SumoWorld:
 
     def _body_of(self, id_: str) -> Body:
         domain = self._domain_of(id_)
-        _, length, width = self.actor_size(id_)
         front = np.array(domain.getPosition(id_))
         along = direction_of(domain.getAngle(id_))
-        return Body.behind(front, along, length, width, domain.getSpeed(id_))
+        return Body.behind(front, along, domain.getLength(id_), domain.getWidth(id_), domain.getSpeed(id_))
 
     def _domain_of(self, id_: str) -> Api:
         return self.api.person if id_ in self.api.person.getIDList() else self.api.vehicle
@@ -229,14 +228,11 @@ class SumoWorld:
         """Write the motion of all actors on the road, by name, at one of `length` samples."""
         for id_, (x, y, angle) in self.actor_poses().items():
             copy, name = copy_and_name(id_)
+            domain = self._domain_of(id_)
             if name not in tracks:
-                tracks[name] = Film(np.full((length, self.n, 5), np.nan), *self.actor_size(id_))
-            tracks[name].motion[sample, copy] = x, y, *direction_of(angle), self._domain_of(id_).getSpeed(id_)
-
-    def actor_size(self, id_: str) -> tuple[bool, float, float]:
-        """Whether an actor is a person, and its length and width [m]."""
-        domain = self._domain_of(id_)
-        return domain is self.api.person, domain.getLength(id_), domain.getWidth(id_)
+                motion = np.full((length, self.n, 5), np.nan)
+                tracks[name] = Film(motion, domain is self.api.person, domain.getLength(id_), domain.getWidth(id_))
+            tracks[name].motion[sample, copy] = x, y, *direction_of(angle), domain.getSpeed(id_)
 
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))
