@@ -162,14 +162,16 @@ class OpenScenario(TrackScenario):
         """All entities but Ego; beyond the end of the scene they go on as they move there."""
         samples = times[:, 0] / STEP
         are_kept = np.abs(samples / EVERY - np.round(samples / EVERY)).max() < SAME
-        every, scenes = (EVERY, self._scenes) if are_kept else (1, self._played(1))
+        every = EVERY if are_kept else 1
+        scenes = self._scenes if are_kept else self._played(every)
         return [
             self._track(scenes, [scene.others[number] for scene in scenes], samples, every)
             for number in range(len(scenes[0].others))
         ]
 
     def _track(self, scenes: Sequence[Played], bodies: Sequence[Moved], samples: FloatArray, every: int) -> Track:
-        name, shape = bodies[0].name, bodies[0].shape
+        name = bodies[0].name
+        shape = bodies[0].shape
         if len({(body.name, body.shape.length, body.shape.width) for body in bodies}) > 1:
             problem = f"the body of {name} depends on a searched parameter"
             raise InputError("scenario.search", problem, "values of it in the matrix")
