@@ -4,6 +4,7 @@ from it.
 
 from __future__ import annotations
 
+import ast
 import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -13,6 +14,7 @@ from typing import Any, get_args
 import msgspec
 from msgspec.inspect import type_info
 
+from safevar_sumo import openscenario
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
@@ -168,8 +170,44 @@ def characteristics() -> str:
     return _table(("vehicle", "characteristic", "unit", "what it is", "real-world counterpart"), seen.values())
 
 
+def messages(folder: Path) -> Iterator[tuple[str, str]]:
+    """The refusals of the modules in a folder, with `...` for what a file says, and the name of the module."""
+
+    def text(node: ast.expr) -> str:
+        match node:
+            case ast.Constant(value=str() as found):
+                return found
+            case ast.JoinedStr(values=parts):
+                return "".join(map(text, parts))
+        return "..."
+
+    for path in sorted(folder.glob("*.py")):
+        tree = ast.parse(path.read_text())
+        named = [
+            (node.targets[0].id, node.value)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+        ]
+        for call in ast.walk(tree):
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
+                place = {"unsupported": 0, "InputError": 1, "unknown_name": 1}.get(call.func.id, len(call.args))
+                for argument in call.args[place : place + 1]:
+                    known = getattr(argument, "id", getattr(argument, "attr", ""))
+                    values = [value for name, value in named if name == known]
+                    for message in map(text, values or [argument]):
+                        if message.strip("."):
+                            yield path.stem, message
+
+
+def refusals() -> str:
+    """What the reader of OpenSCENARIO refuses."""
+    found = dict.fromkeys(messages(Path(openscenario.__file__).parent))
+    return _table(("part", "message"), [(part, f"`{message}`") for part, message in found])
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
+    "refusals": refusals,
     "characteristics": characteristics,
     "study_keys": study_keys,
     "vehicles": models(VEHICLES),

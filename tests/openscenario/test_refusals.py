@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import re
+import runpy
 from pathlib import Path
 
 import pytest
 
+from safevar_sumo import openscenario
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import open_file, play
 from safevar_sumo.openscenario.expressions import evaluate, literal
+from tests.in_process import ROOT
 from tests.openscenario.writing import (
     AT_ONCE,
     EGO,
@@ -22,6 +26,7 @@ from tests.openscenario.writing import (
     private,
     speed,
     teleport,
+    trigger,
     watching,
     write,
 )
@@ -35,6 +40,12 @@ LIMITED = (
     '<ParameterDeclaration name="v" parameterType="double" value="10"><ConstraintGroup>'
     '<ValueConstraint rule="lessThan" value="5"/></ConstraintGroup></ParameterDeclaration>'
 )
+GENERATE = runpy.run_path(str(ROOT / "docs" / "generate.py"))
+TEMPLATES = [
+    ".+".join(map(re.escape, message.split("...")))
+    for _, message in GENERATE["messages"](Path(openscenario.__path__[0]))
+]
+"""The refusals that a page of the manual lists."""
 COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionCondition>"
 
 
@@ -64,12 +75,16 @@ COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionConditio
         ({"car": (teleport(at(-3, 100)), speed(10))}, "road 1 has no lane -3"),
         ({"car": (teleport(at(-2, 100)), speed("$v"))}, "the file declares no parameter v"),
         ({"car": (teleport(at(-2, 100)), speed("fast"))}, "value = 'fast'"),
+        ({"entities": body("Ego") + body("Car").replace("</Vehicle>", "<Trailer/></Vehicle>")}, "the Trailer of Car is not supported"),
+        ({"stop": trigger(watching("Ego", f'<DistanceCondition freespace="true" value="5" rule="lessThan"><Position>{at(-1, 100)}</Position></DistanceCondition>'), "")}, "DistanceCondition with freespace = true is not supported"),
+        ({"stop": trigger(watching("Ego", '<SpeedCondition direction="lateral" value="5" rule="lessThan"/>'), "")}, "SpeedCondition with direction = lateral is not supported"),
     ],
 )  # fmt: skip
 def test_a_refusal_names_what_is_not_supported(tmp_path: Path, parts: dict[str, str], problem: str) -> None:
     with pytest.raises(InputError, match=problem) as caught:
         play(write(tmp_path, **parts), {})  # type: ignore[arg-type]
     assert str(caught.value).count("\n") <= 1
+    assert any(re.fullmatch(template, caught.value.problem) for template in TEMPLATES), caught.value.problem
 
 
 def test_what_happens_less_than_the_file_says_is_remarked(tmp_path: Path) -> None:
