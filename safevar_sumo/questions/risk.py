@@ -43,6 +43,8 @@ VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
 """What varies, by the beginning of the names of its columns."""
+UNDEFINED = ("", "undefined here")
+"""SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
     "characteristic",
     *(f"{output}_{index}{end}" for output in OUTPUTS for index in ("first", "total") for end in ("", LOW, HIGH)),
@@ -187,7 +189,7 @@ def given_data_indices(evaluator: Evaluator, drawn: Evaluations, criterion: Unsa
 
     outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
-    return _table(names, found, {"first": ("S1", "first order, with what is correlated with it")})
+    return _table(names, found, {"first": ("S1", "first order, with what is correlated with it"), "total": UNDEFINED})
 
 
 def _outputs(evaluations: Evaluations, criterion: Unsafe, counts: BoolArray) -> dict[str, FloatArray | None]:
@@ -207,17 +209,17 @@ def _table(names: list[str], found: dict[str, Any], indices: dict[str, tuple[str
     SALib's key and its meaning.
     """
     columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
-    values = dict[str, Any]()
+    values = dict[str, FloatArray]()
+    undefined = np.full(len(names), np.nan)
     for output, of_what in OUTPUTS.items():
-        for index, (key, meaning) in (indices | {"total": indices.get("total", ("", "undefined here"))}).items():
+        of_output = found.get(output, {})
+        for index, (key, meaning) in indices.items():
             name = f"{output}_{index}"
-            value = np.full(len(names), np.nan)
-            half = value
-            if output in found and key in found[output]:
-                value, half = (np.asarray(found[output][key + end], dtype=float) for end in ("", "_conf"))
+            value = np.asarray(of_output.get(key, undefined), dtype=float)
+            half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
             columns |= with_interval(name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f"))
     frame = pd.DataFrame({"characteristic": names, **values})
-    last = "degree_total" if "total" in indices else "degree_first"
+    last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
     return tabulate("What decides", columns, frame)

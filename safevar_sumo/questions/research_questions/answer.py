@@ -173,44 +173,53 @@ def _equal_solutions(case: Case) -> str:
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
     """What a case's frame leaves out."""
-    prefix = f"{case.name}: "
-    rq = table.split("-")[0].upper()
+    remarks = list[str]()
     if table in ("rq1", "rq2"):
-        few = frame.loc[~frame["enough_runs"], "algorithm" if table == "rq1" else "baseline"].unique()
-        if names := ", ".join(map(case.title_of, few)):
-            yield (
-                f"{prefix}too few runs of {names} for a test ({fewest_runs(rq, alpha)} are needed): "
-                "no p-value of pooled solutions is significant."
-            )
-        for metric in case.scoring.metrics:
-            values = solutions_for_metric(case.solutions, metric)[metric.name]
-            if undefined := int(values.isna().sum()):
-                yield f"{prefix}{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
+        remarks += _on_pooled_tests(table, case, frame, alpha)
+    if table in POOLED and (equal := _equal_solutions(case)):
+        remarks.append(equal)
+    if table in ("rq1-runs", "rq2-runs"):
+        remarks += _on_tests_of_runs(table, frame, alpha)
+    if table == "a12" and len(frame):
+        remarks.append(f"* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2.")
+    if table == "combinations" and frame.empty:
+        remarks.append("no critical solution has exactly four characteristics changed.")
+    return (f"{case.name}: {remark}" for remark in remarks)
+
+
+def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
+    """What tests of pooled solutions leave out: algorithms with too few runs, and undefined values."""
+    few = frame.loc[~frame["enough_runs"], "algorithm" if table == "rq1" else "baseline"].unique()
+    if names := ", ".join(map(case.title_of, few)):
+        needed = fewest_runs(table.upper(), alpha)
+        yield (
+            f"too few runs of {names} for a test ({needed} are needed): no p-value of pooled solutions is significant."
+        )
+    for metric in case.scoring.metrics:
+        values = solutions_for_metric(case.solutions, metric)[metric.name]
+        if undefined := int(values.isna().sum()):
+            yield f"{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
+    if table == "rq1":
         is_known = {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}  # in a solution's encounter
         omitted = [name for name, value in case.original.items() if math.isnan(value) or name not in is_known]
-        if table == "rq1" and (undefined_names := ", ".join(omitted)):
-            yield f"{prefix}the original vehicle's {undefined_names} is undefined, so that no test uses it."
-        if table == "rq2" and not case.has_runs:
-            yield (
-                f"{prefix}igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is their "
-                "number of evaluations known."
-            )
-        elif table == "rq2" and len(case.evaluations):
-            texts = describe_evaluations(case, count_evaluations(case))
-            yield f"{prefix}settings that a run simulates, mean: {texts}."
-    if table in POOLED and (equal := _equal_solutions(case)):
-        yield f"{prefix}{equal}"
-    if table in ("rq1-runs", "rq2-runs"):
-        tests = frame.dropna(subset="effect_size")
-        if len(tests):
-            yield f"{prefix}p is corrected by Holm's method for the {number_of(len(tests), 'test')} of {rq}, a family."
-        if few_count := len(tests) - tests["enough_runs"].sum():
-            needed = fewest_runs(rq, alpha, len(tests))
-            yield (
-                f"{prefix}too few runs for {few_count} of {number_of(len(tests), 'test')} of {rq} ({needed} are needed "
-                "after the correction)."
-            )
-    if table == "a12" and len(frame):
-        yield f"{prefix}* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2."
-    if table == "combinations" and frame.empty:
-        yield f"{prefix}no critical solution has exactly four characteristics changed."
+        if omitted:
+            yield f"the original vehicle's {', '.join(omitted)} is undefined, so that no test uses it."
+    elif not case.has_runs:
+        yield (
+            "igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is their number of "
+            "evaluations known."
+        )
+    elif len(case.evaluations):
+        yield f"settings that a run simulates, mean: {describe_evaluations(case, count_evaluations(case))}."
+
+
+def _on_tests_of_runs(table: str, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
+    """How tests of runs are corrected, and which have too few runs."""
+    rq = table.removesuffix("-runs").upper()
+    tests = frame.dropna(subset="effect_size")
+    counted = number_of(len(tests), "test")
+    if len(tests):
+        yield f"p is corrected by Holm's method for the {counted} of {rq}, a family."
+    if few_count := len(tests) - tests["enough_runs"].sum():
+        needed = fewest_runs(rq, alpha, len(tests))
+        yield f"too few runs for {few_count} of {counted} of {rq} ({needed} are needed after the correction)."

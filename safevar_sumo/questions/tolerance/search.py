@@ -234,24 +234,29 @@ class BoxSearch(BoxGeometry):
         """
         number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
         causes = self._causes(settings[:: len(settings) // number][:number])
-        changes = causes - self.original
-        is_vehicle = self.characteristics.of_vehicle
-        sides = np.where(changes > 0, self.domain[1], self.domain[0])
-        shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
-        corners = np.where(is_vehicle, np.sign(changes), shares)  # of the vehicle, in the encounter of the cause
-        known = {corner.tobytes(): corner for corner in [*self.corners, *corners]}
+        known = {corner.tobytes(): corner for corner in [*self.corners, *self._corners_of(causes)]}
         is_new = len(known) > len(self.corners)
         self.corners = list(known.values())
         if not is_new:
             self.gap += RETREAT * (1 - self.gap)
-        # A box that holds a setting with more than a cause's changes holds the cause.
+        self._keep_causes(causes)
+        return is_new
+
+    def _corners_of(self, causes: FloatArray) -> FloatArray:
+        """The directions of the changes of K causes, shape (K, n); of a scenario's parameter its place."""
+        changes = causes - self.original
+        sides = np.where(changes > 0, self.domain[1], self.domain[0])
+        shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
+        return np.where(self.characteristics.of_vehicle, np.sign(changes), shares)
+
+    def _keep_causes(self, causes: FloatArray) -> None:
+        """Know K causes, and forget settings with more than a cause's changes: a box that holds one holds the cause."""
         needs = np.maximum(self.extents(self.unsafe_settings), 0.0)
         for cause in np.maximum(self.extents(causes), 0.0):
             is_kept = ~(needs >= cause).all(axis=(1, 2))
             needs = needs[is_kept]
             self.unsafe_settings = self.unsafe_settings[is_kept]
         self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
-        return is_new
 
     def _causes(self, settings: FloatArray) -> FloatArray:
         """Unsafe settings with as few changes as possible, from K unsafe ones, shape (K, n)."""
@@ -297,17 +302,22 @@ class BoxSearch(BoxGeometry):
         rng = np.random.default_rng((self.seed, 2))
         best = self.shrunk(sides, start)
         for deviation in DEVIATIONS:
-            shape = (PROPOSALS, *start.shape)
-            is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
-            steps = rng.normal(0.0, deviation, shape) * is_moved
-            boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
-            boxes = boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN]
-            chosen = [*islice(self._without_known_failures(boxes), max(self.batch // len(self.corners), 1))]
-            if chosen:
-                boxes = np.array(chosen)
-                is_safe = self.are_safe(boxes)
-                best = max(boxes[is_safe], key=self.log_volume, default=best)
+            larger = self._larger(best, start, deviation, rng)
+            tried = [*islice(self._without_known_failures(larger), max(self.batch // len(self.corners), 1))]
+            if tried:
+                boxes = np.array(tried)
+                best = max(boxes[self.are_safe(boxes)], key=self.log_volume, default=best)
         return best
+
+    def _larger(self, best: FloatArray, start: FloatArray, deviation: float, rng: np.random.Generator) -> FloatArray:
+        """Larger boxes near to the best one, within `start`, shape (B, 2, n): random steps of a random share of the
+        sides.
+        """
+        shape = (PROPOSALS, *start.shape)
+        is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
+        steps = rng.normal(0.0, deviation, shape) * is_moved
+        boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
+        return np.asarray(boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN])
 
     def _without_known_failures(self, boxes: FloatArray) -> Iterator[FloatArray]:
         """Those of B boxes, shape (B, 2, n), that no known failure forbids."""
