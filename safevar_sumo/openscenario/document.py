@@ -216,7 +216,8 @@ def _referenced(child: Element, values: Values, folders: tuple[str, ...], catalo
     """The entry of a catalog that a reference names, with the values that it assigns."""
     catalog, name = (literal(attribute(child, key), values) for key in ("catalogName", "entryName"))
     file, found = _entry(catalog, name, folders)
-    catalogs.append(file)
+    # Another value of a parameter may choose any of them.
+    catalogs += _files(folders) if "$" in attribute(child, "catalogName") else [file]
     given = {
         attribute(each, "parameterRef").lstrip("$"): literal(attribute(each, "value"), values)
         for each in child.iter("ParameterAssignment")
@@ -226,19 +227,25 @@ def _referenced(child: Element, values: Values, folders: tuple[str, ...], catalo
     return entry
 
 
-def _entry(catalog: str, entry: str, folders: tuple[str, ...]) -> tuple[str, Element]:
-    """The file of a catalog, and its entry of that name."""
-    for folder in folders:
-        files = (
+def _files(folders: Sequence[str]) -> list[str]:
+    """The files of catalogs in folders; a folder may be a file itself."""
+    paths = [
+        path
+        for folder in folders
+        for path in (
             [os.path.join(folder, name) for name in sorted(os.listdir(folder))] if os.path.isdir(folder) else [folder]
         )
-        for file in files:
-            if not file.endswith(".xosc") or not os.path.isfile(file):
-                continue
-            found = root_of(file).find("Catalog")
-            if found is not None and found.get("name") == catalog:
-                entries = {each.get("name", ""): each for each in found}
-                if entry not in entries:
-                    raise unsupported(f"the catalog {catalog} has no {entry}", one_of(entries))
-                return file, entries[entry]
+    ]
+    return [path for path in paths if path.endswith(".xosc") and os.path.isfile(path)]
+
+
+def _entry(catalog: str, entry: str, folders: tuple[str, ...]) -> tuple[str, Element]:
+    """The file of a catalog, and its entry of that name."""
+    for file in _files(folders):
+        found = root_of(file).find("Catalog")
+        if found is not None and found.get("name") == catalog:
+            entries = {each.get("name", ""): each for each in found}
+            if entry not in entries:
+                raise unsupported(f"the catalog {catalog} has no {entry}", one_of(entries))
+            return file, entries[entry]
     raise unsupported(f"there is no catalog {catalog} in {', '.join(folders) or 'CatalogLocations'}", "a file with it")

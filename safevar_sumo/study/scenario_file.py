@@ -82,12 +82,13 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
             raise InputError("", f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
     path = path_of(name, places)
     try:
-        return _expanded(tables, open_file(path), places)
+        return _expanded(tables, path, places)
     except InputError as error:
         raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
 
 
-def _expanded(tables: Raw, offered: Source, places: Sequence[str]) -> Parameters:
+def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
+    offered = open_file(path)
     scenario: Parameters = tables["scenario"]
     values = scenario.get("values", {})
     search = scenario.get("search", {})
@@ -101,6 +102,8 @@ def _expanded(tables: Raw, offered: Source, places: Sequence[str]) -> Parameters
     if "ego" in scenario:
         parameters["ego"] = scenario["ego"]
     kept = {key: value for key, value in scenario.items() if key not in ("file", "ego", "values")}
+    if path != offered.concrete:
+        kept["files"] = [_relative(path, places)]  # results depend on it, and a pack has it
     result = {**tables, "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains}}
     matrix = tables.get("matrix")
     searched = {name: domain["original"] for name, domain in domains.items() if name in offered.values}

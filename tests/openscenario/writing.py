@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROAD = """<OpenDRIVE><header revMajor="1" revMinor="6"/>
 <road name="" length="{length}" id="1" junction="-1"><planView>{geometry}</planView><lanes><laneSection s="0">
-<left><lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></left><center><lane id="0"/></center>
+<left><lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></left><center><lane id="0" type="none"/></center>
 <right><lane id="-1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane>
 <lane id="-2" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></right></laneSection></lanes></road></OpenDRIVE>"""
 STRAIGHT = '<geometry s="0" x="10" y="20" hdg="0" length="2000"><line/></geometry>'

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,35 @@ def test_a_path_counts_from_the_study(tmp_path: Path) -> None:
     assert study.scenario.parameters["file"] == "scenario.xosc"
     assert {Path(file) for file in data_files(study).values()} == {tmp_path / "scenario.xosc", tmp_path / "road.xodr"}
     assert assemble(study).points[0].scenario.duration == pytest.approx(14)
+
+
+def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
+    """A logical file and the concrete one; and, if a parameter chooses the catalog, all catalogs."""
+    names = {"cut_in_logical.xosc", "cut_in.xosc", "bodies.xosc", "three_lanes.xodr"}
+    study = study_of(LOGICAL, values={"ego_kmh": 80, "body": "lorry"}, search={"gap_m": {}})
+    assert {Path(path).name for path in data_files(study).values()} == names
+    assert tables_of(load_study(tables_of(study))) == tables_of(study)
+    copytree(FILES, tmp_path / "files")
+    (tmp_path / "files/catalogs/other.xosc").write_text("<OpenSCENARIO><Catalog name='other'/></OpenSCENARIO>")
+    concrete = tmp_path / "files/cut_in.xosc"
+    text = concrete.read_text()
+    concrete.write_text(
+        text.replace('catalogName="bodies"', 'catalogName="$catalog"').replace(
+            "<ParameterDeclarations>",
+            '<ParameterDeclarations><ParameterDeclaration name="catalog" parameterType="string" value="bodies"/>',
+            1,
+        )
+    )
+    study = study_of(
+        str(tmp_path / "files/cut_in_logical.xosc"), values={"ego_kmh": 80, "body": "lorry"}, search={"gap_m": {}}
+    )
+    assert {Path(path).name for path in data_files(study).values()} == {*names, "other.xosc"}
+    (tmp_path / "base.toml").write_text(
+        'extends = "wear"\n[scenario]\nfile = "files/cut_in_logical.xosc"\nvalues = { ego_kmh = 80, body = "lorry" }\n'
+    )
+    (tmp_path / "next.toml").write_text('extends = "base.toml"\n[scenario]\nfile = "files/crossing_pedestrian.xosc"\n')
+    assert "files/cut_in_logical.xosc" in data_files(load_study(tmp_path / "base.toml"))
+    assert not any("cut_in" in path for path in data_files(load_study(tmp_path / "next.toml")))
 
 
 def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None:
