@@ -14,7 +14,7 @@ WIDTH, HEIGHT = 120, 14
 """Size of a bar on a page [px]."""
 LEGEND = {
     "text": "bar: █ together, ▒ alone, · domain, o original, | specified",
-    "html": "range: dark together, light alone, outline the domain, dot the original, tick the specified limit",
+    "html": "range: strong together, faint alone, outline the domain, dot the original, tick the specified limit",
 }
 
 

@@ -30,7 +30,7 @@ from safevar_sumo.replay.comparison import compare_setting, list_differences, wh
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.study import SAFETY_DEGREE, unit_text
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress
@@ -190,7 +190,25 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
     if numbers.get("attacked") and numbers["at_most"] is not None:
         uncertainty = f", and at most {100 * numbers['at_most']:.2f} % of evenly drawn cars are unsafe"
         rows.append(("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}"))
+    tables = study.answers[0].tables if numbers else {}
+    if "uncertainty" in tables:
+        rows.append(("Limits alone", f"one fit at scanned points, then all: {_moved_limits(tables['uncertainty'])}"))
+    if "fits" in tables and numbers.get("margin"):
+        corners = tables["fits"].loc[tables["fits"]["specified"] == "kept", "corners"].dropna()
+        if len(corners):
+            text = f"the worst corner of all limits keeps {corners.min():.2f} to {corners.max():.2f} m, fit by fit"
+            rows.append(("Spread", text))
     return rows
+
+
+def _moved_limits(uncertainty: pd.DataFrame) -> str:
+    """The limits alone that moved, before and after: `brakeTorque 0.53 to 0.58`."""
+    return "; ".join(
+        f"{row['characteristic']} {row[f'own_fit_{end}']:.10g} to {row[f'alone_{end}']:.10g}{unit_text(row['unit'])}"
+        for row in uncertainty.to_dict("records")
+        for end in ("low", "high")
+        if row[f"own_fit_{end}"] != row[f"alone_{end}"]
+    )
 
 
 def _remarks(texts: Sequence[str]) -> pd.DataFrame:

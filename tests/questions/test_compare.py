@@ -223,6 +223,7 @@ def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Pat
     dry, wet = map(str, weathers)
     page = run("report", dry, wet, "--ask", "compare", "--out", "it.html") and Path("it.html").read_text()
     assert sv.compare(dry, wet, pool=POOL).render("html").replace("^2", "²") in page
+    assert ">Compare</a>" in page.partition("</section>")[0], "its verdict stands on the first sheet"
     assert f"python -m safevar_sumo compare {dry} {wet}" in page
     refused("report", dry, "--ask", "compare", "--out", "it.html", message=("--ask: compare cannot be asked about 1",))
     refused("report", dry, dry, "--out", "it.html", message=("twice",))

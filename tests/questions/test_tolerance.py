@@ -6,6 +6,7 @@ import json
 import re
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,8 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import search
-from safevar_sumo.questions.tolerance.alone import AloneSearch
+from safevar_sumo.questions.tolerance.alone import AloneLimit, AloneSearch
+from safevar_sumo.questions.tolerance.rows import uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import BoolArray, FloatArray
@@ -173,6 +175,17 @@ def test_the_names_that_others_read() -> None:
     assert record["verdict"].startswith("Keeps all limits")
     assert "up to 8" in answer.render("text")
     assert len(answer.figure().get_axes()) == 2
+
+
+def test_limits_that_other_fits_move_are_uncertain() -> None:
+    """Brake torque: from 0.5301, inwards 0.54, with the own fit, and from 0.58 with all; the tread's limit stays."""
+    tread, torque, *_ = CharacteristicSet.of(load_study("wear"))
+    scans: list[Any] = [
+        SimpleNamespace(characteristic=tread, safe=(1.6, 8.0)),
+        SimpleNamespace(characteristic=torque, safe=(0.5301, 1.0)),
+    ]
+    alone = [AloneLimit(scans[0], (1.6, 8.0)), AloneLimit(scans[1], (0.58, 1.0))]
+    assert uncertainty_rows(alone) == [("brakeTorque", "-", 0.54, 1.0, 0.58, 1.0)]
 
 
 @pytest.mark.parametrize(

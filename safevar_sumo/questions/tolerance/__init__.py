@@ -28,7 +28,7 @@ from safevar_sumo.questions.tolerance.by_parameter import Parameter
 from safevar_sumo.questions.tolerance.levels import LevelSearch
 from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
-from safevar_sumo.questions.tolerance.rows import CHARACTERISTIC, LIMITS, limit_rows
+from safevar_sumo.questions.tolerance.rows import CHARACTERISTIC, LIMITS, UNCERTAINTY, limit_rows, uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES, WHOLE_POINT_LOSS, OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
@@ -88,6 +88,7 @@ NEAREST: Columns = {
     *("unsafe", "margin", "kept", "scope", "boxes", "up_to", *OF_BOX),
     limits=(*LIMITS, "by_{by}", "scope"),
     intervals=INTERVALS,
+    uncertainty=UNCERTAINTY,
     fits=FITS,
     points=POINTS,
     nearest=NEAREST,
@@ -178,6 +179,8 @@ def tolerance(
     }
     domains = [(one.characteristic.lower, one.characteristic.upper) for one in scans]
     tables["limits"].attrs["bars"] = bars_of(tables["limits"], domains)
+    if moved := uncertainty_rows(alone):
+        tables["uncertainty"] = tabulate("Limits alone: with one fit and with all", UNCERTAINTY, moved)
     if found_together is not None and len(models.members) + len(models.left_out) > 1:
         tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, _fit_rows(models, found_together))
     if is_rated(study):

@@ -51,6 +51,11 @@ class AloneLimit(NamedTuple):
         return self.scan.characteristic
 
     @property
+    def of_own_fit(self) -> Interval | None:
+        """What is safe in the scan with the study's own fit, rounded inwards."""
+        return None if self.scan.safe is None else self.characteristic.rounded_inwards(self.scan.safe)
+
+    @property
     def nearest_failure(self) -> Beyond:
         """What is beyond the end that is nearer to the original."""
         return min(filter(None, self.beyond), key=lambda pair: self._change(*pair), default=None)
@@ -81,12 +86,7 @@ class _Ends:
                 self.beyond[side] = members.setting({item.name: nearest}), own
 
     def limit(self) -> AloneLimit:
-        item = self.item
-        low, high = self.ends
-        safe = (
-            low if low <= item.lower else item.rounded(low, upwards=True),
-            high if high >= item.upper else item.rounded(high, upwards=False),
-        )
+        safe = self.item.rounded_inwards((self.ends[0], self.ends[1]))
         return AloneLimit(self.scan, safe, (self.beyond[0], self.beyond[1]))
 
 

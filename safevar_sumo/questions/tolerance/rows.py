@@ -38,6 +38,17 @@ LIMITS: Columns = {
     "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
     "sentence": "for a maintenance manual; all of these may be obeyed together",
 }
+UNCERTAINTY: Columns = {
+    **CHARACTERISTIC,
+    **{
+        f"{name}_{end}": Column("", f"{end}est value that is safe alone {meaning}", ".10g")
+        for name, meaning in (
+            ("own_fit", "at the points of the scan with the study's own fit"),
+            ("alone", "with every fit, also between points, in all encounters that were met, and under the attack"),
+        )
+        for end in ("low", "high")
+    },
+}
 Ends = tuple[float | None, float | None]
 NOWHERE: Ends = None, None
 
@@ -92,6 +103,15 @@ def limit_rows(
             )
         )
     return LimitRows(rows, broken)
+
+
+def uncertainty_rows(alone: Sequence[AloneLimit]) -> list[tuple[Any, ...]]:
+    """A row of `UNCERTAINTY` for each characteristic whose limit alone is closer than in the scan."""
+    return [
+        (each.characteristic.name, each.characteristic.unit, *(each.of_own_fit or NOWHERE), *(each.safe or NOWHERE))
+        for each in alone
+        if each.safe != each.of_own_fit
+    ]
 
 
 def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None) -> bool:
