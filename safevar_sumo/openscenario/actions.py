@@ -14,7 +14,7 @@ import numpy as np
 
 from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
-from safevar_sumo.openscenario.places import Place, Way, line_of, neighbour, way_of
+from safevar_sumo.openscenario.places import Place, Way, line_of, neighbour, way_of, way_through
 
 if TYPE_CHECKING:
     from safevar_sumo.openscenario.storyboard import Player
@@ -32,6 +32,7 @@ IGNORED = (
     "VariableSetAction",
     "ParameterAction",
     "InfrastructureAction",
+    "SetMonitorAction",
     "TrafficSignalAction",
     "UserDefinedAction",
 )
@@ -261,13 +262,22 @@ def teleport_action(player: Player, action: Element, actor: Actor) -> list[Runni
 
 def assign_route_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """AssignRouteAction: the actor goes on along the roads of a route, beginning with its own."""
-    way = way_of(part(action, "Route"), player.network)
+    return _go_on(actor, way_of(part(action, "Route"), player.network))
+
+
+def acquire_position_action(player: Player, action: Element, actor: Actor) -> list[Running]:
+    """AcquirePositionAction: the actor goes on along the shortest way to a position on a road."""
+    return _go_on(actor, way_through([actor.here, player.place(part(action, "Position/*"))], player.network))
+
+
+def _go_on(actor: Actor, way: Way) -> list[Running]:
+    """Go on along a way."""
     here = actor.here
     if isinstance(here.path, Way) and here.path.chain != way.chain:
         there = here.path.road_at(here.distance, here.left)
         distance = way.distance_to(there.road.id, there.s)
         if distance is None:
-            raise unsupported(f"AssignRouteAction: {actor.name} is not on its route")
+            raise unsupported(f"{actor.name} is not on its route")
         actor.at = here._replace(path=way, distance=distance)
     return []
 
@@ -318,12 +328,18 @@ PRIVATE: dict[str, Callable[[Player, Element, Actor], list[Running]]] = {
     "LaneChangeAction": lane_change_action,
     "LaneOffsetAction": lane_offset_action,
     "AssignRouteAction": assign_route_action,
+    "AcquirePositionAction": acquire_position_action,
     "FollowTrajectoryAction": follow_trajectory_action,
 }
 """Actions of an actor that are supported, by the standard's names."""
 GROUPS = ("LongitudinalAction", "LateralAction", "RoutingAction")
 """Classes of which one action is a child."""
-INIT_ORDER = (("TeleportAction",), ("FollowTrajectoryAction",), ("SpeedAction",), ("AssignRouteAction",))
+INIT_ORDER = (
+    ("TeleportAction",),
+    ("FollowTrajectoryAction",),
+    ("SpeedAction",),
+    ("AssignRouteAction", "AcquirePositionAction"),
+)
 """The order of actions in Init, whose list has none: places, speeds, routes, and then all others."""
 
 

@@ -223,6 +223,18 @@ def collision_condition(player: Player, condition: Element, actor: Actor, window
     return np.zeros(len(player.times[window]), bool)
 
 
+def end_of_road_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+    """EndOfRoadCondition: a scene ends where somebody is at the end of its road."""
+    return np.zeros(len(player.times[window]), bool)
+
+
+def offroad_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+    """OffroadCondition: Ego drives straight on in its lane."""
+    if actor is not player.ego:
+        raise unsupported(f"OffroadCondition of {actor.name} is not supported")
+    return np.zeros(len(player.times[window]), bool)
+
+
 def _along(actor: Actor, other: Actor, window: slice) -> Array:
     """Speed of another actor in an actor's direction [m/s]."""
     return other.speed[window] * (other.facing[window] / actor.facing[window]).real
@@ -291,5 +303,7 @@ BY_ENTITY: dict[str, Callable[[Player, Element, Actor, slice], Array]] = {
     "StandStillCondition": stand_still_condition,
     "AccelerationCondition": acceleration_condition,
     "CollisionCondition": collision_condition,
+    "EndOfRoadCondition": end_of_road_condition,
+    "OffroadCondition": offroad_condition,
 }
 """Conditions that are supported, by the standard's names."""

@@ -181,6 +181,7 @@ def read(file: str, given: Mapping[str, str]) -> Document:
         folders.append(beside(folder, literal(attribute(each, "path"), values)))
     catalogs: list[str] = []
     _resolve(root, values, tuple(folders), catalogs)
+    _name_members(root)
     logic = root.find("RoadNetwork/LogicFile")
     if logic is None:
         raise unsupported(f"{file!r} names no road", "RoadNetwork/LogicFile")
@@ -190,6 +191,18 @@ def read(file: str, given: Mapping[str, str]) -> Document:
             f"the road {road!r} is not there", "the path of an OpenDRIVE file, from the file that names it"
         )
     return Document(root, parameters, values, list(dict.fromkeys(catalogs)), road)
+
+
+def _name_members(root: Element) -> None:
+    """Replace selections of entities (class EntitySelection) by their members, where they act or are watched."""
+    members = {
+        attribute(one, "name"): one.findall("Members/EntityRef") for one in root.findall("Entities/EntitySelection")
+    }
+    if root.find("Entities/EntitySelection/Members/ByType") is not None:
+        raise unsupported("EntitySelection with ByType is not supported")
+    for parent in root.iter() if members else ():
+        if parent.tag in ("Actors", "TriggeringEntities"):
+            parent[:] = [one for each in parent for one in members.get(each.get("entityRef", ""), [each])]
 
 
 def beside(folder: str, path: str) -> str:

@@ -276,10 +276,16 @@ def _nobody(name: str) -> Place:
 
 def way_of(route: Element, network: Network) -> Way:
     """The roads of a route (class Route): the shortest chain from waypoint to waypoint."""
-    places = [place_of(part(point, "Position/*"), network, _nobody) for point in route.findall("Waypoint")]
+    return way_through(
+        [place_of(part(point, "Position/*"), network, _nobody) for point in route.findall("Waypoint")], network
+    )
+
+
+def way_through(places: Sequence[Place], network: Network) -> Way:
+    """The roads of the shortest chain from place to place."""
     ways = tuple(place.path.chain[0] for place in places if isinstance(place.path, Way))
     if len(ways) < len(places) or not ways:
-        raise unsupported("a Route has a waypoint that is not on a road")
+        raise unsupported("a route has a waypoint that is not on a road")
     options = [ways[:1]]
     if len(ways) > 1:  # in which direction the first road is driven
         name = ways[0][0]

@@ -16,7 +16,9 @@ from safevar_sumo.openscenario.road import Piece, Pose
 from tests.openscenario.writing import (
     AT_ONCE,
     at,
+    body,
     event,
+    group,
     lane_change,
     private,
     speed,
@@ -260,3 +262,22 @@ def test_a_state_is_that_of_the_element_with_its_whole_path(tmp_path: Path) -> N
         done = f"<StoryboardElementStateCondition storyboardElementType='event' storyboardElementRef='{name}' state='completeState'/>"
         file = write(tmp_path, event(speed(20, "linear", "time", 3), AT_ONCE.format(2)), stop=trigger(done, ""))
         assert play(file, {}).duration == pytest.approx(5 + 4, abs=2 * STEP)
+
+
+def test_a_selection_acts_and_is_watched_as_its_members(tmp_path: Path) -> None:
+    members = '<Members><EntityRef entityRef="Car"/></Members>'
+    entities = body("Ego") + body("Car", 5.0) + f'<EntitySelection name="All">{members}</EntitySelection>'
+    far = watching("All", '<TraveledDistanceCondition value="30"/>')
+    slower = group(event(speed(5, "linear", "time", 2.0), far), actor="All")
+    of_all = only(play(write(tmp_path, groups=slower, entities=entities), {}))
+    of_car = only(play(write(tmp_path, groups=slower.replace("All", "Car")), {}))
+    assert of_all.speed[-1] == 5
+    assert np.array_equal(of_all.place, of_car.place)
+
+
+def test_who_acquires_a_position_straight_ahead_drives_on(tmp_path: Path) -> None:
+    goal = f"<RoutingAction><AcquirePositionAction><Position>{at(-2, 900)}</Position></AcquirePositionAction></RoutingAction>"
+    end = trigger(watching("Ego", '<EndOfRoadCondition duration="1"/>'), "")
+    found = only(play(write(tmp_path, car=(goal, teleport(at(-2, 100)), speed(10)), stop=end), {}))
+    without = only(play(write(tmp_path, stop=""), {}))
+    assert np.array_equal(found.place, without.place)
