@@ -289,11 +289,14 @@ def find_overlaps(own: Body, other: Body) -> FloatArray:
     """How deeply M pairs of bodies overlap [m], shape (M,), in the direction in which they overlap least; negative
     for bodies that do not touch.
     """
-    overlaps = []
-    for pair in ((own, other), (other, own)):
-        _, extent, distance = _along_axes(*pair)
-        overlaps.append((extent - np.abs(distance)).min(axis=0))
-    return np.asarray(np.minimum(*overlaps))
+    overlaps = _overlaps_along(own, other)
+    return np.minimum(overlaps, _overlaps_along(other, own)) if (overlaps > 0).any() else overlaps
+
+
+def _overlaps_along(own: Body, other: Body) -> FloatArray:
+    """The overlaps in that direction of the own bodies in which they are less deep [m]."""
+    _, extent, distance = _along_axes(own, other)
+    return np.asarray(np.minimum(*(extent - np.abs(distance))))
 
 
 def _along_axes(own: Body, other: Body) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -54,7 +54,11 @@ class RecordedWorld:
         for actor, film in enumerate(films):
             self._motion[: len(film.motion), :, actor] = film.motion.reshape(len(film.motion), -1, 5)
         self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (self._sizes[:, :1] / 2)
-        self._reach = (np.hypot(*self._sizes.T) + np.hypot(recording.length, recording.width)) / 2
+        self._reach = np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T)) / 2
+        """Largest distances of the middles of a vehicle and of each actor that touch, along the way and across [m]."""
+        begins = (self._middles @ recording.along - self._reach[0]).reshape(n_samples, -1)
+        self._begins = np.fmin.reduce(begins, axis=1, initial=np.inf) + recording.length / 2
+        """The first position along the way, at every sample, of a front that may touch somebody [m]."""
         self.n = size * n_scenes
         self.step_length = recording.step_length
         self.sample = 0
@@ -149,6 +153,8 @@ class RecordedWorld:
         against vehicles whose front is on it (`MSLane::detectCollisions`).
         """
         self._struck = {}
+        if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
+            return {}
         vehicles, actors = np.nonzero(self._is_near() & is_open[:, np.newaxis])
         if not len(vehicles):
             return {}
@@ -166,10 +172,12 @@ class RecordedWorld:
         """Which of the A actors each vehicle may have touched since the last step, shape (N, A)."""
         own = self._now.fronts - self._scene.along * (self._scene.length / 2)
         apart = own.reshape(-1, self._size, 1, 2) - self._at_sample(self._middles)[:, np.newaxis]
+        dx, dy = apart.reshape(self.n, -1, 2).transpose(2, 0, 1)
+        east, north = self._scene.along
+        along = np.abs(dx * east + dy * north)
+        across = np.abs(dy * east - dx * north)
         covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
-        reach = self._reach + covered[:, np.newaxis]
-        squares = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
-        return np.asarray(squares.reshape(reach.shape) < reach * reach)
+        return np.asarray((across < self._reach[1]) & (along < self._reach[0] + covered[:, np.newaxis]))
 
     def _overlaps(self, moment: _Moment, vehicles: IntArray, actors: IntArray, is_checked: BoolArray) -> BoolArray:
         """Which vehicles overlap their actor among the pairs that are checked. Two parallel vehicles must overlap by
