@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args,
 
 from safevar_sumo.errors import MAX_JOBS, InputError, check_name, unknown_name, warn
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
 from safevar_sumo.records import JsonObject
@@ -258,6 +259,8 @@ def find_question(name: str) -> Question:
     if not (":" in name or name in QUESTIONS):
         raise InputError("question", f"there is no {name!r}", legal)
     module, _, function = name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
+    if ":" in name:
+        add_import_folders(())
     invalidate_caches()  # the module may have been written a moment ago
     try:
         with user_errors(name):
