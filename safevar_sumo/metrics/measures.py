@@ -93,6 +93,10 @@ def least_time_to_collision(runs: SimulationRuns, thresholds: MetricsTable) -> F
 def largest_deceleration_rate(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """The largest deceleration that would just avoid the collision, v_L^2 / (2 L_s) [m/s^2] (Cooper and Ferguson 1976;
     DRAC of SUMO's SSM device), over the samples with a TTC; shape (N,), NaN as for the least TTC.
+
+    Behind a leader, TTC and DRAC are the device's. With who crosses they are other quantities, and not compared: here
+    the gap closes to a body that is in the vehicle's path; the device predicts at which constant speeds both enter and
+    leave the place that two lanes share, and has a TTC only where one enters before the other has left.
     """
     ttc = time_to_collision(runs)
     is_counted = np.isfinite(ttc) & (ttc > 0)
