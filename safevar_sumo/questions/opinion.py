@@ -188,32 +188,41 @@ def _judge(
     seed: int,
 ) -> tuple[Verdict, str]:
     """The verdict on a cause, and its reason."""
-    if reasons := vehicle.reasons_to_omit(cause["changes"]):
-        return "outside", "; ".join(reasons)
-    own = len(runs.settings) + row
-    there = runs.there
-    fails_there = unsafe.of(runs.theirs)
-    if unsafe.of(runs.ours)[own]:
-        return "outside", "the original vehicle itself is unsafe, so that no change is a cause"
-    if fails_there[own] or not runs.theirs.valid[own] or second_system.measuring.scoring.violation(runs.theirs)[row]:
-        return "outside", f"the original vehicle itself is not safe with the second model: it {there[own]}"
-    if not runs.theirs.valid[row]:
-        return "outside", f"with the second model it {there[row]}"
-    setting = runs.settings[row]
-    if setting[second_system.characteristics.of_vehicle].tobytes() in vehicle.spinning:  # filled by the simulations
-        return "outside", f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
+    if reason := _why_outside(second_system, vehicle, runs, row, cause, unsafe):
+        return "outside", reason
+    of_original = runs.there[len(runs.settings) + row]
+    is_unsafe = bool(unsafe.of(runs.theirs)[row])
     verdict: Verdict = "contradicted"
-    because = f"safe with the second model: it {there[row]}; the original vehicle {there[own]}"
-    if fails_there[row]:
+    because = f"safe with the second model: it {runs.there[row]}; the original vehicle {of_original}"
+    if is_unsafe:
         verdict = "confirmed"
         safe_share = np.max(CHANGE_SHARES, initial=0.0, where=~runs.scaled[row])  # the largest that is still safe
         because = (
-            f"also unsafe with the second model: it {there[row]}; the original vehicle is safe: it {there[own]}. "
+            f"also unsafe with the second model: it {runs.there[row]}; the original vehicle is safe: it {of_original}. "
             f"{safe_share:.0%} to {safe_share + CHANGE_SHARES[0]:.0%} of the changes are enough with the second "
             f"model, {cause['fraction']:.1%} with ours"
         )
-    reason = _why_borderline(second_system, setting, cause["robust_share"], fails_there[row], unsafe, seed)
+    reason = _why_borderline(second_system, runs.settings[row], cause["robust_share"], is_unsafe, unsafe, seed)
     return ("borderline", f"{reason}; {because}") if reason else (verdict, because)
+
+
+def _why_outside(
+    second_system: System, vehicle: SecondVehicle, runs: _Runs, row: int, cause: dict[Any, Any], unsafe: Unsafe
+) -> str:
+    """Why the second model has no verdict on a cause; empty if it has one."""
+    if reasons := vehicle.reasons_to_omit(cause["changes"]):
+        return "; ".join(reasons)
+    own = len(runs.settings) + row
+    if unsafe.of(runs.ours)[own]:
+        return "the original vehicle itself is unsafe, so that no change is a cause"
+    is_too_close = second_system.measuring.scoring.violation(runs.theirs)[row]
+    if unsafe.of(runs.theirs)[own] or not runs.theirs.valid[own] or is_too_close:
+        return f"the original vehicle itself is not safe with the second model: it {runs.there[own]}"
+    if not runs.theirs.valid[row]:
+        return f"with the second model it {runs.there[row]}"
+    if vehicle.has_spun(runs.settings[row][second_system.characteristics.of_vehicle]):
+        return f"its wheels spin with the second model, more than {SPIN_LIMIT:g} m/s faster than the car"
+    return ""
 
 
 def _why_borderline(

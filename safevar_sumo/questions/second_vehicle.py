@@ -181,11 +181,6 @@ class SecondState(NamedTuple):
 class SecondVehicle(Vehicle):
     """A vehicle of the second model for every setting of a study; the contract is `safevar_sumo.vehicles.Vehicle`.
 
-    Attributes
-    ----------
-    spinning
-        The settings, as bytes, of the vehicles whose wheels spun in a simulation.
-
     Raises
     ------
     InputError
@@ -195,7 +190,7 @@ class SecondVehicle(Vehicle):
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
         self._vehicle = vehicle
         self.UNITS = vehicle.UNITS
-        self.spinning = set[bytes]()
+        self._spinning = set[bytes]()
         if vehicle.second_model not in MAPPINGS:
             problem = f"vehicle.model = {study.vehicle.model!r} is no vehicle that the second model can represent"
             raise InputError(study.source, problem, f"one of {', '.join(MAPPINGS)}, or a class derived from one")
@@ -207,6 +202,10 @@ class SecondVehicle(Vehicle):
         originals = {name: row.original for name, row in load_study(shipped).vehicle.characteristics.items()}
         self._original = originals | matching
         self._matching = matching.keys()
+
+    def has_spun(self, setting: FloatArray) -> bool:
+        """Whether the wheels of a vehicle, shape (n,), spun in a simulation so far."""
+        return setting.tobytes() in self._spinning
 
     def reasons_to_omit(self, changes: Mapping[str, float]) -> list[str]:
         """The reason for each changed characteristic that cannot be represented; empty if all can."""
@@ -283,7 +282,7 @@ class SecondVehicle(Vehicle):
             brake = brake + np.minimum(change, plant.brake_rise * step)
             body = advance(plant, body, brake, drive_torque, step)
         spins = np.max(body.wheel_speeds * plant.radius, axis=0) > body.speed + SPIN_LIMIT
-        self.spinning.update(setting.tobytes() for setting in prepared.settings[spins])
+        self._spinning.update(setting.tobytes() for setting in prepared.settings[spins])
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
     def _advance_engine(self, prepared: Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:

@@ -126,10 +126,17 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     return FlatScene(comparison, comparison.runs.trace.step, sample_count, tuple(road), tuple(bodies), *view)
 
 
-def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> tuple[FloatArray, float, float, float]:
-    """The whole road or, in a long scene, what a camera that follows the vehicles shows: left ends, bottom, width,
-    height.
-    """
+class _View(NamedTuple):
+    """The part of the road that is shown, as `FlatScene` names it."""
+
+    left_ends: FloatArray
+    bottom: float
+    width: float
+    height: float
+
+
+def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> _View:
+    """The whole road or, in a long scene, what a camera that follows the vehicles shows."""
     x, y = (np.array([getattr(body, axis) for body in bodies]) for axis in "xy")
     is_vut = np.array([body.is_vut for body in bodies])
     length, half_width = np.array([(body.length, body.width / 2) for body in bodies]).T[:, :, np.newaxis]
@@ -143,7 +150,7 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> tuple[FloatAr
     if width > MAX_LENGTH:
         width = CAMERA_LENGTH
         left_ends = np.clip(x[is_vut].mean(axis=0) - width * CAMERA_LEAD, left_end, max(left_end, right_end - width))
-    return left_ends, bottom - padding, width, height + 2 * padding
+    return _View(left_ends, bottom - padding, width, height + 2 * padding)
 
 
 def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArray:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -111,7 +111,7 @@ def compare(
     settings = _settings_frame(common, pairs, criteria)[is_valid]
     metric = RATING_POINTS.name if all(is_rated(one.study) for one in evaluators) else SAFETY_DEGREE
     a, b = (run.take(is_valid).column(metric) for run in pairs.runs)
-    p, a12, tested = _test(settings.assign(a=a, b=b))
+    tested = _test(settings.assign(a=a, b=b))
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = tuple(one.study.name for one in evaluators)
     titles = titles if len(set(titles)) == 2 else ("A", "B")
@@ -123,7 +123,7 @@ def compare(
         compare_counts(counts, titles[0]),
         compare_limits(of_limits, members),
         of_originals,
-        compare_values(quantity, p, a12),
+        compare_values(quantity, tested.p, tested.a12),
     )
     better, worse = ([*chain(*kind)] for kind in list(zip(*differences, strict=True))[:2])
     changes = [row[-1] for row in of_limits]
@@ -133,8 +133,8 @@ def compare(
         "margin": criteria[0].keep,
         "settings": sum(counts.values()),
         **counts,
-        "p": p,
-        "a12": a12,
+        "p": tested.p,
+        "a12": tested.a12,
         "better_in": len(better),
         "worse_in": len(worse),
         "limits_grown": changes.count("grown") + changes.count("both"),
@@ -146,7 +146,7 @@ def compare(
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         *_verdict(differences, titles, criteria[0], is_measured=bool(ends["benign_scenes"])),
-        _test_in_words(p, a12, tested),
+        _test_in_words(tested),
         *_basis_in_words(common, limits),
         *counted_in_words(study, left_out),
     ]
@@ -215,8 +215,16 @@ def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFram
     return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
 
 
-def _test(frame: pd.DataFrame) -> tuple[float, float, str]:
-    """Test the columns `a` and `b` in pairs: the p-value, A12, and what the pairs are.
+class _PairedTest(NamedTuple):
+    """The p-value and A12 of a test in pairs, and what the pairs are."""
+
+    p: float
+    a12: float
+    pairs: str
+
+
+def _test(frame: pd.DataFrame) -> _PairedTest:
+    """Test the columns `a` and `b` in pairs.
 
     A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs, over the settings
     that were drawn on a line.
@@ -231,7 +239,7 @@ def _test(frame: pd.DataFrame) -> tuple[float, float, str]:
             pairs = means
             unit = "run"
     p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
-    return p, a12, number_of(len(pairs), unit)
+    return _PairedTest(p, a12, number_of(len(pairs), unit))
 
 
 def _verdict(
@@ -257,10 +265,10 @@ def _verdict(
         yield "Needless braking was not measured: no benign scenes are known for this scenario."
 
 
-def _test_in_words(p: float, a12: float, pairs: str) -> str:
-    if np.isnan(p):
+def _test_in_words(tested: _PairedTest) -> str:
+    if np.isnan(tested.p):
         return "There is no pair of results to test."
-    return f"Test of {pairs}: p = {p:.2g}, A12 = {a12:.2f}."
+    return f"Test of {tested.pairs}: p = {tested.p:.2g}, A12 = {tested.a12:.2f}."
 
 
 def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -87,40 +88,57 @@ def find_failures(
     InputError
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
     """
-    unsafe = None if criterion is None else evaluator.parse_criterion(criterion)
+    stated = None if criterion is None else evaluator.parse_criterion(criterion)
     named = [SolutionId.parse(text) for text in solutions]
     original = evaluator.evaluate_original()
     if isinstance(subject, Study):
         if named:
             raise InputError("solution", f"{subject.name!r} is a study and has no solutions", "a results directory")
-        number = RATED_SAMPLED_SETTINGS if is_rated(subject) else SAMPLED_SETTINGS
-        drawn = evaluator.feasible_settings(number, subject.search.seed, feasible_after_filter=True)
-        settings = evaluator.characteristics.filter(drawn)
-        names = [f"drawn:{row}" for row in range(len(settings))]
-        recorded = np.full(len(settings), UNKNOWN)
+        candidates = _drawn_from(subject, evaluator)
     else:
-        table = subject.solutions
-        characteristics = list(evaluator.characteristics.names)
-        named_rows = [row_of_handle(table, handle) for handle in named]
-        distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
-        chosen = list(dict.fromkeys([*named_rows, *distinct]))  # the named ones first
-        settings = table[characteristics].to_numpy(dtype=float)[chosen]
-        handles = handles_of(table)
-        names = [str(handles[row]) for row in chosen]
-        recorded = table["outcome"].to_numpy(dtype=str)[chosen]
-    evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
-    unsafe = unsafe or Unsafe.default_among(evaluations, original)
+        candidates = _solutions_of(subject, named)
+    evaluations = evaluator.evaluate(candidates.settings, TO_EXPLAIN)
+    unsafe = stated or Unsafe.default_among(evaluations, original)
+    names = candidates.names
     if isinstance(subject, Study):
+        left_out = candidates.settings[evaluations.infeasible]
         counts = np.flatnonzero(~evaluations.infeasible)
-        left_out = settings[evaluations.infeasible]
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
-        recorded = recorded[counts]
+        otherwise = 0
     else:
         left_out = _left_out_of_search(subject, unsafe)
+        recorded = candidates.recorded
+        otherwise = int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
     rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
-    otherwise = np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN))
-    return Population(original, evaluations, names, unsafe, rows, bool(named), int(otherwise), left_out)
+    return Population(original, evaluations, names, unsafe, rows, bool(named), otherwise, left_out)
+
+
+class _Candidates(NamedTuple):
+    """Settings, shape (M, n), that may be unsafe, their names, and the outcomes in the results, shape (M,)."""
+
+    settings: FloatArray
+    names: list[str]
+    recorded: npt.NDArray[np.str_]
+
+
+def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
+    """Settings drawn from a study's whole domain."""
+    number = RATED_SAMPLED_SETTINGS if is_rated(study) else SAMPLED_SETTINGS
+    drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
+    settings = evaluator.characteristics.filter(drawn)
+    return _Candidates(settings, [f"drawn:{row}" for row in range(len(settings))], np.full(len(settings), UNKNOWN))
+
+
+def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
+    """The distinct solutions of results, the named ones first."""
+    table = case.solutions
+    characteristics = list(case.characteristics.names)
+    distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
+    chosen = list(dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct]))
+    handles = handles_of(table)
+    settings = table[characteristics].to_numpy(dtype=float)[chosen]
+    return _Candidates(settings, [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen])
 
 
 def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
@@ -133,11 +151,16 @@ def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
     return np.asarray(rows[names].drop_duplicates().to_numpy(dtype=float))
 
 
-def choose_failures(
-    population: Population, evaluator: Evaluator, limit: int, top: int
-) -> tuple[Reasons, list[int], dict[int, list[Cause]]]:
-    """At most `top` failures that matter, the rows of a sample of all failures, and the minimal causes of both by row;
-    of named rows these alone.
+class Chosen(NamedTuple):
+    """Why failures are chosen, by row; the rows of a sample of all failures; and the minimal causes of both, by row."""
+
+    reasons: Reasons
+    sample: list[int]
+    causes: dict[int, list[Cause]]
+
+
+def choose_failures(population: Population, evaluator: Evaluator, limit: int, top: int) -> Chosen:
+    """At most `top` failures that matter, and a sample of all failures; of named rows these alone.
 
     The sample are all failures, if that takes at most about `limit` simulations. What matters: the smallest robust
     failure, a failure for each of `REASONS`, and the simplest failure with each minimal cause that these do not have.
@@ -146,7 +169,7 @@ def choose_failures(
     settings = population.evaluations.settings
     if population.is_named:
         found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
-        return dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True))
+        return Chosen(dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True)))
     limit //= len(assemble(evaluator.study).points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
     reasons = _failures_that_matter(population, evaluator, limit)
@@ -161,7 +184,7 @@ def choose_failures(
             of_this_cause = [row for row in sample if key in keys[row]]
             simplest = min(of_this_cause, key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row))
             reasons[simplest] = DISTINCT_CAUSE
-    return reasons, sample, causes
+    return Chosen(reasons, sample, causes)
 
 
 def _failures_that_matter(population: Population, evaluator: Evaluator, limit: int) -> Reasons:
