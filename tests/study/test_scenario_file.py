@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from shutil import copytree
 from typing import Any
@@ -20,6 +21,7 @@ from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
+from tests.in_process import json_of, run
 from tests.openscenario.writing import AT_ONCE, at, event, lane_change, speed, teleport, trigger, watching, write
 from tests.scenarios.holding import Hold, driven
 
@@ -208,3 +210,32 @@ def test_combinations_that_nobody_can_play_are_left_out_with_a_warning(tmp_path:
         study = study_of(str(path))
     assert study.matrix is not None
     assert [test.over for test in study.matrix.tests] == [{"v": [5]}, {"v": [10]}]
+
+
+VALUES = 'file = "files/cut_in_logical.xosc"\nvalues = { ego_kmh = 80, sideways_mps = 1.5, '
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "tables",
+    [
+        'file = "files/cut_in.xosc"\nvalues = { gap_m = 12 }\n',
+        f"{VALUES}slower_kmh = 20, gap_m = 8 }}\n",
+        f'{VALUES}body = "hatchback", side = -1 }}\nsearch = {{ gap_m = {{}}, slower_kmh = {{ upper = 25 }} }}\n',
+    ],
+    ids=["concrete", "matrix", "search"],
+)
+def test_questions_take_results_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tables: str) -> None:
+    """Compared with itself nothing differs; a pack of it has all files, and every claim is the same."""
+    monkeypatch.chdir(tmp_path)
+    copytree(FILES, "files")
+    Path("scene.toml").write_text(f'extends = "wear"\n[scenario]\n{tables}')
+    budget = ["--runs", "1", "--evaluations", "50", "--algorithms", "rs", "--jobs", "1"]
+    run("study", "scene.toml", *budget, "--out", "results")
+    compared = json_of("compare", "results", "scene.toml", "--samples", "20", "--jobs", "1")
+    assert (compared["numbers"]["only_a_unsafe"], compared["numbers"]["only_b_unsafe"]) == (0, 0)
+    run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 50", "--jobs", "1")
+    with zipfile.ZipFile("pack.zip") as pack:
+        names = {Path(name).name for name in pack.namelist()}
+    assert {Path(path).name for path in data_files(load_study("scene.toml"))} <= names
+    assert json_of("verify", "pack.zip", "--jobs", "1")["numbers"]["passed"] is True
