@@ -57,34 +57,50 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         If a measure does not exist, is invalid, or has a name that is taken.
     """
     further = ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops))
-    measures = {**METRICS, **{metric.name: metric for metric, is_meant in further if is_meant}}
-    shipped = {**measures, **OPTIONAL_METRICS}
-    own: dict[str, Measure] = {}
-    taken = {*RESULT_COLUMNS, *shipped, *study.domains}
-
-    def look_up(name: str, key: str, known: Mapping[str, Measure]) -> Measure:
-        member = lookup.find({**known, **own}, name, key)
-        measure: Measure = member.target
-        if member.code is not None:
-            measure = own[name] = checked_measure(member.code)
-            if measure.name in taken:
-                raise InputError("", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name")
-            own[measure.name] = measure
-            taken.add(measure.name)
-        if measure.function is not None:
-            measures.setdefault(measure.name, measure)
-        return measure
-
+    computed = {**METRICS, **{metric.name: metric for metric, is_meant in further if is_meant}}
+    metrics = {**computed, **OPTIONAL_METRICS}
+    named = _Named(lookup, {*RESULT_COLUMNS, *metrics, *study.domains}, computed)
     for name in study.metrics.also:
         if name in METRICS:
             problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
             raise InputError("", problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
-        if look_up(name, "metrics.also", shipped).of == "settings":
+        if named.look_up(name, "metrics.also", metrics).of == "settings":
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
-    objectives = [look_up(name, OBJECTIVES_KEY, {**shipped, **OBJECTIVES}).facts for name in study.search.objectives]
+    shipped = {**metrics, **OBJECTIVES}
+    objectives = [named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives]
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"
-        raise InputError("", problem, one_of([*shipped, *OBJECTIVES]))
-    metrics = tuple(measure.facts for measure in measures.values() if measure.of == "runs")
-    return Measuring(measures, Scoring(metrics=metrics, objectives=tuple(objectives)))
+        raise InputError("", problem, one_of([*shipped]))
+    of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
+    return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
+
+
+class _Named:
+    """The measures that a study names, as they are looked up.
+
+    Attributes
+    ----------
+    computed
+        Those that are computed, by column.
+    """
+
+    def __init__(self, lookup: Lookup, taken: set[str], computed: dict[str, Measure]) -> None:
+        self.computed = computed
+        self._lookup = lookup
+        self._taken = taken
+        self._own = dict[str, Measure]()
+
+    def look_up(self, name: str, key: str, shipped: Mapping[str, Measure]) -> Measure:
+        """A measure by the name of a shipped one, of a user's class, or of one that was looked up before."""
+        member = self._lookup.find({**shipped, **self._own}, name, key)
+        measure: Measure = member.target
+        if member.code is not None:
+            measure = checked_measure(member.code)
+            if measure.name in self._taken:
+                raise InputError("", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name")
+            self._own |= {name: measure, measure.name: measure}
+            self._taken.add(measure.name)
+        if measure.function is not None:
+            self.computed.setdefault(measure.name, measure)
+        return measure
