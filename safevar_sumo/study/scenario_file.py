@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown_name, warn
-from safevar_sumo.openscenario import EVERY, constraints_of, open_file, play, read, text_of
-from safevar_sumo.openscenario.logical import Source, originals
+from safevar_sumo.openscenario import EVERY, Source, constraints_of, open_file, originals, play, read, text_of
 from safevar_sumo.study.parameters import free_parameters
 from safevar_sumo.study.schema import MatrixTest, Parameters, Weather
 
