@@ -1,6 +1,8 @@
 """The picture of collisions over speed and tread in the study wear_joint.
 
-    python docs/encounters.py docs/pictures/encounters.png
+    python docs/encounters.py docs/pictures/encounters.png [count]
+
+With `count` it prints the numbers of the page, too.
 
 The car has the wear `WORN` besides its tread, with which the study wear, whose speeds are dotted, finds it safe.
 """
@@ -55,7 +57,10 @@ def main(path: str) -> None:
         axis.axvline(grid_speed, color=BLUE, linewidth=1.2, linestyle=":")
     axis.set_xlabel("speed in all tests [km/h]")
     axis.set_ylabel("tread depth [mm]")
-    figure.supxlabel("red: collision; grey: the original is not safe; dotted: speeds of `wear`", fontsize=8)
+    wear = ", ".join(f"{item.name} {WORN[item.name]:g}{item.suffix}" for item in members if item.name in WORN)
+    axis.set_title(f"{wear},\nimpact location {IMPACT_LOCATION:g} %", fontsize=8)
+    colours = "orange: collision; grey: the original is not safe; blue, dotted: speeds of the study wear"
+    figure.supxlabel(colours, fontsize=8)
     figure.savefig(path, dpi=110)
 
 
@@ -101,6 +106,6 @@ def compare_lines(fastest: float) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1])
-    for speed in (max(GRID_SPEEDS), FASTEST):
+    for speed in (max(GRID_SPEEDS), FASTEST) if "count" in sys.argv[2:] else ():
         count_between(speed)
         compare_lines(speed)

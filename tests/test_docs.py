@@ -9,11 +9,13 @@ import importlib.util
 import json
 import re
 import shlex
+import shutil
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
@@ -55,6 +57,32 @@ def run(line: str) -> None:
         assert re.search(rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE), line
     else:
         assert line.startswith(("pip install", "eval ", "#")) or not line, f"a line that nothing runs: {line}"
+
+
+def pictures() -> Any:
+    """The script that draws the pictures of the pages."""
+    spec = importlib.util.spec_from_file_location("pictures", ROOT / "docs" / "pictures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_picture_has_its_command_and_its_page() -> None:
+    texts = "".join((ROOT / page).read_text() for page in PAGES)
+    names = {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
+    assert names == pictures().COMMANDS.keys() == set(re.findall(r"pictures/([\w.]+)\)", texts))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["failure.png", "failure.gif", "stops.png", "encounters.png", "report.png"])
+def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(name: str, tmp_path: Path) -> None:
+    if name == "report.png" and not shutil.which("chromium"):
+        pytest.skip("chromium is not installed")
+    with Image.open(pictures().draw(name, tmp_path)) as drawn, Image.open(ROOT / "docs" / "pictures" / name) as stored:
+        assert drawn.size == stored.size
+        assert getattr(drawn, "n_frames", 1) == getattr(stored, "n_frames", 1)
 
 
 def test_the_version_of_setup_cfg_is_that_of_the_program_its_results_its_citation_and_its_changes() -> None:

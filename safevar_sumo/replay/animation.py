@@ -165,8 +165,11 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
     ) -> Patch:
         return axis.add_patch(Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style))
 
+    if is_beneath:  # an outline: it is not on the road with the other
+        style = {"color": colour, "fill": False, "linewidth": 2.0, "linestyle": "--"}
+        return [draw(-length, -width / 2, length, width, zorder=4, **style)], []
     patches = [
-        draw(-length, -width / 2, length, width, color=colour, alpha=0.6 if is_beneath else 0.9),
+        draw(-length, -width / 2, length, width, color=colour, alpha=0.9),
         draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, color="white", alpha=0.56),
         draw(-length, -width / 2, length, width, zorder=4 - body.row, linewidth=1.5, color=colour, fill=False),
     ]

@@ -1,0 +1,53 @@
+"""All pictures of the pages, drawn anew: `python docs/pictures.py [NAME]...`, by default every one.
+
+Those of published data need the files that `SAFEVAR_PUBLISHED` names the folder of; that of the page needs Chromium.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+PROGRAM = f"{shlex.quote(sys.executable)} -m safevar_sumo"
+FAILURE = f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1.008 --set tireFric=1.004 --set maxBrakeTorque=1201"
+PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
+LIMITED = 'extends = "native"\nname = "native"\n[limits]\ndecel = { at_least = 8 }\n'
+"""The study of the page."""
+ASKED = (
+    "--ask 'tolerance --characteristics decel,tau,reactionTime' --ask 'explain --limit 10000' "
+    "--ask 'risk --samples 1000' --ask 'rules --samples 1000'"
+)
+SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1000"
+COMMANDS = {
+    "failure.png": f"{FAILURE} --plot {{}}",
+    "failure.gif": f"{FAILURE} --animate {{}}",
+    "stops.png": f"{shlex.quote(sys.executable)} {DOCS}/stops.py {{}}",
+    "encounters.png": f"{shlex.quote(sys.executable)} {DOCS}/encounters.py {{}}",
+    "sun_nsga2.png": f"{PROGRAM} validate sun {PUBLISHED}/sun_nsga2.csv --plot {{}}",
+    "rain_nsga2_half.png": f"{PROGRAM} validate rain {PUBLISHED}/rain_nsga2_half.csv --plot {{}}",
+    "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
+    "report.png": f"{PROGRAM} study native.toml --runs 2 --evaluations 200 --out native --quiet && "
+    f"{PROGRAM} report native {ASKED} --out page.html && "
+    f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null",
+}
+"""The command of each picture, in a folder that has the study of the page."""
+
+
+def draw(name: str, folder: Path) -> Path:
+    """Draw a picture into a folder."""
+    picture = folder.resolve() / name
+    with tempfile.TemporaryDirectory() as place:
+        Path(place, "native.toml").write_text(LIMITED, encoding="utf-8")
+        command = COMMANDS[name].format(shlex.quote(str(picture)))
+        subprocess.run(command, shell=True, check=True, cwd=place, stdout=subprocess.DEVNULL)
+    return picture
+
+
+if __name__ == "__main__":
+    for chosen in sys.argv[1:] or COMMANDS:
+        print(draw(chosen, DOCS / "pictures"))
