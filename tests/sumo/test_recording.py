@@ -4,6 +4,7 @@ the encounter, or no command gives a verdict on its driving system.
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -231,4 +232,5 @@ def test_every_command_begins_with_the_reason(still: str) -> None:
         begins_with_the_reason(*command)
     assert run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.startswith(STANDS)
     run("report", "results", "--ask", "rules --samples 32 --unsafe collision", "--out", "page.html")
-    assert f'<div class="first">\n<p>{STANDS}' in Path("page.html").read_text()
+    page = re.sub("</?span>", "", Path("page.html").read_text())  # a sentence has a line of its own
+    assert f'<div class="first">\n<p>{STANDS}' in page
