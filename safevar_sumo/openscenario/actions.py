@@ -85,11 +85,10 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
     start = actor.speed_now
     value = number(target, "value")
     if target.tag == "RelativeTargetSpeed":
+        other = player.other(target)
         if target.get("continuous") == "true":
             raise unsupported("SpeedAction: RelativeTargetSpeed with continuous = true is not supported")
-        other = player.other(target)
-        is_factor = target.get("speedTargetValueType") == "factor"
-        value = other.speed_now * value if is_factor else other.speed_now + value
+        value = _relative_speed(target, other)
         player.depends(other, player.now, f"{actor.name}'s speed relative to {other.name}'s")
     if value < 0:
         raise unsupported(f"{actor.name} drives backwards ({value:.2f} m/s)")
@@ -107,6 +106,12 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
     share = transition.share
     running = actor.begin("along", transition.duration, player.now, lambda time: start + (value - start) * share(time))
     return [running]
+
+
+def _relative_speed(target: Element, other: Actor) -> float:
+    """A speed relative to another actor's [m/s] (enumeration SpeedTargetValueType)."""
+    value = number(target, "value")
+    return other.speed_now * value if target.get("speedTargetValueType") == "factor" else other.speed_now + value
 
 
 def longitudinal_distance_action(player: Player, action: Element, actor: Actor) -> list[Running]:
@@ -155,9 +160,11 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
     steady_time = 0.0
     steady_way = 0.0
     if (target := action.find("FinalSpeed/*")) is not None:
-        if target.tag != "AbsoluteSpeed":
-            raise unsupported(f"SynchronizeAction with {target.tag} is not supported")
         final = number(target, "value")
+        if target.tag == "RelativeSpeedToMaster":
+            if master is not player.ego:
+                raise unsupported(f"RelativeSpeedToMaster: {master.name} may change its speed")
+            final = _relative_speed(target, master)
         for steady in target:
             is_way = steady.tag == "TargetDistanceSteadyState"
             steady_way = number(steady, "distance") if is_way else number(steady, "time") * final

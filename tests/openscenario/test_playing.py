@@ -128,6 +128,17 @@ def test_both_are_at_their_positions_at_the_same_time(tmp_path: Path, start: flo
     assert np.abs(car.speed[round((arrival - before) / STEP) : index] - 15).max(initial=0) < 1e-9
 
 
+def test_a_final_speed_relative_to_ego_is_one_of_that_size(tmp_path: Path) -> None:
+    car = (teleport(at(-2, 100)), speed(10))
+    action = SYNCHRONIZE.format(at(-1, 250), at(-2, 190), 15, "")
+    absolute = only(play(write(tmp_path, event(action), car=car), {}))
+    for value, kind in (-5, "delta"), (0.75, "factor"):
+        relative = f'<RelativeSpeedToMaster value="{value}" speedTargetValueType="{kind}"/>'
+        action = SYNCHRONIZE.replace('<AbsoluteSpeed value="{}">{}</AbsoluteSpeed>', relative)
+        found = only(play(write(tmp_path, event(action.format(at(-1, 250), at(-2, 190))), car=car), {}))
+        assert np.array_equal(found.place, absolute.place)
+
+
 def polyline(*vertices: tuple[float, float, float], timing: str) -> str:
     points = "".join(f'<Vertex time="{time}"><Position>{world(x, y)}</Position></Vertex>' for time, x, y in vertices)
     trajectory = f'<Trajectory name="" closed="false"><Shape><Polyline>{points}</Polyline></Shape></Trajectory>'
