@@ -166,7 +166,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
         return axis.add_patch(Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style))
 
     if is_beneath:  # an outline: it is not on the road with the other
-        style = {"color": colour, "fill": False, "linewidth": 2.0, "linestyle": "--"}
+        style: dict[str, Any] = {"color": colour, "fill": False, "linewidth": 2.0, "linestyle": "--"}
         return [draw(-length, -width / 2, length, width, zorder=4, **style)], []
     patches = [
         draw(-length, -width / 2, length, width, color=colour, alpha=0.9),
