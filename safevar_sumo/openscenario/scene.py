@@ -121,8 +121,8 @@ def _moved(actor: Actor, samples: slice) -> Moved:
         even = np.abs(np.diff(place) - samples.step * STEP * speed[1:] * facing[1:]) < EVEN
         changes = np.flatnonzero((np.diff(speed) != 0) | (np.diff(facing) != 0) | ~even)
         kept = slice(0, int(changes[-1]) + 2 if len(changes) else 1)
-    copies = (column[kept].copy() for column in (place, facing, speed))  # not views that keep all samples
-    return Moved(actor.name, actor.shape, *copies, actor.deleted)
+    # not views that keep all samples
+    return Moved(actor.name, actor.shape, place[kept].copy(), facing[kept].copy(), speed[kept].copy(), actor.deleted)
 
 
 def _remark(player: Player) -> None:
