@@ -1,5 +1,5 @@
-"""MkDocs hook: fills `<!-- generated: NAME -->` in a page with tables made from the code, so that they cannot differ
-from it.
+"""Tables made from the code: `python docs/generate.py NAME` prints one. As a hook of MkDocs, it puts what the command
+prints in place of a line of a page that is this command alone.
 """
 
 from __future__ import annotations
@@ -7,6 +7,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -33,7 +34,7 @@ PLAIN = {
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Called by MkDocs for every page."""
-    return re.sub(r"<!-- generated: (\w+) -->", lambda match: TABLES[match[1]](), markdown)
+    return re.sub(r"^`python docs/generate.py (\w+)`$", lambda match: TABLES[match[1]](), markdown, flags=re.MULTILINE)
 
 
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -216,3 +217,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "metric_columns": metric_columns,
     "results_files": results_files,
 }
+
+if __name__ == "__main__":
+    print(TABLES[sys.argv[1]]())

@@ -8,8 +8,10 @@ import configparser
 import importlib.util
 import json
 import re
+import runpy
 import shlex
 import shutil
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -166,10 +168,21 @@ def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)
     text = "\n".join(generate.on_page_markdown((ROOT / page).read_text()) for page in PAGES)
-    assert "<!-- generated" not in text
+    assert "docs/generate.py" not in text
     for heading in (*VEHICLES, *ADS, "SearchTable"):
         assert f"\n### {heading}\n" in text
     assert "| `evaluations` | integer, at least 1, at most 1e+07 | required |" in text
+
+
+def test_the_line_that_stands_for_a_table_is_the_command_that_prints_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (name,) = re.findall(
+        r"^`python docs/generate.py (\w+)`$", (ROOT / "docs" / "study_file.md").read_text(), re.MULTILINE
+    )
+    monkeypatch.setattr(sys, "argv", ["generate.py", name])
+    runpy.run_path(str(ROOT / "docs" / "generate.py"), run_name="__main__")
+    assert "| `evaluations` | integer, at least 1, at most 1e+07 | required |" in capsys.readouterr().out
 
 
 class Numbers(NamedTuple):
