@@ -99,7 +99,7 @@ class Unsafe:
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision (safe: stops at least 0.30 m short)`, `safety degree below 1.4 m
+        """The criterion in words, rounded: `collision, or stops less than 0.30 m short`, `safety degree below 1.4 m
         (half of the original's, a screening limit)`, `drac > 6, or a collision`.
         """
         if self.points is not None:
@@ -107,11 +107,22 @@ class Unsafe:
         if self.bound is not None:
             return f"{self.bound}{'' if self.is_of_points else ', or a collision'}"
         if self.below is None:
-            kept = f"{self.keep:.2f}" if round(self.keep, 2) == self.keep else f"{self.keep:g}"
+            kept = self._keep_in_words
             where = ", from bumper to bumper" if self.contact else ""
-            return f"collision (safe: stops at least {kept} m short{where})" if self.keep else "collision"
+            return f"collision, or stops less than {kept} m short{where}" if self.keep else "collision"
         share = " (half of the original's, a screening limit)" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
+
+    @property
+    def _keep_in_words(self) -> str:
+        return f"{self.keep:.2f}" if round(self.keep, 2) == self.keep else f"{self.keep:g}"
+
+    @property
+    def smaller_demand(self) -> str:
+        """What to do where the original does not meet the criterion; "" if a collision alone is unsafe."""
+        if self.is_collision and not self.keep:
+            return ""
+        return f"Demand less, with {'--margin' if self.is_collision else '--unsafe'}."
 
     @property
     def in_words(self) -> str:
@@ -164,6 +175,28 @@ class Unsafe:
     def value_in_words(self, value: float) -> str:
         """What a safe vehicle has: `keeps 0.31 m`, `has drac 5.9`."""
         return f"keeps {value:.2f} m" if self.bound is None else f"has {self.bound.measure} {value:.3g}"
+
+    def breach_in_words(self, vehicle: Evaluations) -> str:
+        """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at 3.21 m/s`, `stops 0.04
+        m short, less than 0.30 m`.
+        """
+        degree = float(vehicle.f_safe[0])
+        if self.points is not None:
+            return f"keeps {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
+        if self.bound is not None:
+            measure, comparison, limit = self.bound
+            value = float(vehicle.column(measure)[0])
+            if COMPARISONS[comparison](value, limit):
+                return f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
+        if self.below is not None and (degree >= 0 or self.below < 0):
+            unit = "m" if degree >= 0 else "m/s"
+            text = _on_its_side(degree, self.below, "g", 3)
+            return f"has safety degree {text} {unit}, below {self.below:.3g} {unit}"
+        if vehicle.collided[0]:
+            return f"collides at {abs(degree):.2f} m/s"
+        left = _on_its_side(degree - self.contact, self.keep, "f", 2)
+        verb, end = ("stops", " short") if vehicle.outcome[0] == Outcome.STOPPED else ("keeps", "")
+        return f"{verb} {left} m{end}, less than {self._keep_in_words} m"
 
     @classmethod
     def parse(cls, criterion: Criterion) -> Unsafe:
@@ -244,6 +277,13 @@ class Unsafe:
                 "unsafe", "nothing collides, and the original vehicle has no safety degree to halve", CRITERIA
             )
         return unsafe
+
+
+def _on_its_side(value: float, limit: float, kind: str, digits: int) -> str:
+    """A value with so many digits, or as few more as keep it on its side of a limit."""
+    texts = (f"{value:.{number}{kind}}" for number in range(digits, 17))
+    side = np.sign(value - limit)
+    return next((text for text in texts if np.sign(float(text) - limit) == side), repr(value))
 
 
 def margin_of(study: Study, margin: float | None) -> float:

@@ -11,7 +11,7 @@ from scipy import signal
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, OPTIONAL_METRICS, Measure, Scoring, Unsafe, time_to_collision
-from safevar_sumo.records import NO_CONTACT, Encounter, Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.records import NO_CONTACT, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
@@ -291,3 +291,27 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: 
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
     assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()), equal_nan=True)
     assert np.isnan(comfort(name, speed, collision_speed=3.0)).all()
+
+
+@pytest.mark.parametrize(
+    ("unsafe", "outcome", "degree", "words"),
+    [
+        (Unsafe(), Outcome.COLLISION, -3.214, "collides at 3.21 m/s"),
+        (Unsafe(keep=0.3), Outcome.COLLISION, -3.214, "collides at 3.21 m/s"),
+        (Unsafe(keep=0.3), Outcome.STOPPED, 0.041, "stops 0.04 m short, less than 0.30 m"),
+        (Unsafe(keep=0.3, contact=2.0), Outcome.PASSED, 2.2999, "keeps 0.2999 m, less than 0.30 m"),
+        (Unsafe(below=1.4), Outcome.STOPPED, 0.8, "has safety degree 0.8 m, below 1.4 m"),
+        (Unsafe(below=1.4), Outcome.COLLISION, -2.0, "collides at 2.00 m/s"),
+        (Unsafe(below=-1.4), Outcome.COLLISION, -2.0, "has safety degree -2 m/s, below -1.4 m/s"),
+        (Unsafe.parse("drac > 5.3"), Outcome.STOPPED, 0.8, "has drac 6.77 > 5.3"),
+        (Unsafe.parse("drac > 6.77"), Outcome.STOPPED, 0.8, "has drac 6.774 > 6.77"),
+        (Unsafe.parse("drac > 7"), Outcome.COLLISION, -2.0, "collides at 2.00 m/s"),
+    ],
+)
+def test_what_an_unsafe_vehicle_does_is_said_with_its_value(
+    unsafe: Unsafe, outcome: Outcome, degree: float, words: str
+) -> None:
+    metrics = {"drac": np.array([6.774]), "safety_degree": np.array([degree])}
+    vehicle = made_up_evaluations(np.array([degree]), outcome=np.array([str(outcome)]), metrics=metrics)
+    assert unsafe.of(vehicle)[0]
+    assert unsafe.breach_in_words(vehicle) == words

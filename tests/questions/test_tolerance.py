@@ -420,3 +420,13 @@ def test_gaps_are_between_bumpers() -> None:
     said = run("tolerance", "native", "--characteristics", "decel", "--jobs", "1").stdout
     assert "no vehicle that was tried keeps less than 0.3 m between bumpers" in said
     assert "the car keeps less than 0.3 m from a standing vehicle" in said
+
+
+def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
+    for limits in ((), ("a <= 6",)):
+        answer = answer_of(2, nowhere, unsafe="below=8.5", limits=limits)
+        refusal = "he original itself has safety degree 8 m, below 8.5 m: no limit can be kept"
+        assert answer.failures == (f"t{refusal}",), "a limit is not blamed"
+        assert answer.verdict.startswith(f"T{refusal}. Demand less, with --unsafe.")
+        assert answer.numbers["kept"] is False
+        assert answer.tables["limits"]["kept"].tolist() == ([False, None] if limits else [None, None])

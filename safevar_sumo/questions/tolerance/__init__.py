@@ -117,7 +117,8 @@ def tolerance(
     ----------
     limits
         A limit in the characteristic's unit, such as "treadDepth >= 3", beside those of [limits] in the study; may be
-        repeated. All others get the largest box that is safe then; exit code 3 if a limit is not kept.
+        repeated. All others get the largest box that is safe then; exit code 3 if a limit is not kept or the
+        original itself is unsafe.
     characteristics
         Only these characteristics, separated by commas; all others keep their values. By default all.
     margin
@@ -191,26 +192,30 @@ def tolerance(
     wider = wider_rows(evaluator, specified, found_together, unsafe, margin, fits, attack) if is_safe else []
     if wider:
         tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
-    sentences = verdict_sentences(models, alone, found_together, specified, found.broken, attack, nearest, wider)
+    refusal = "" if is_safe else f"the original itself {criterion.breach_in_words(original)}: no limit can be kept"
+    failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in found.broken)
+    sentences = verdict_sentences(
+        models, alone, found_together, specified, found.broken, attack, nearest, wider, refusal
+    )
     return Answer(
         question="tolerance",
         study=study,
         verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
-        numbers=_numbers(study, criterion, models, found_together, found.broken, attack),
+        numbers=_numbers(study, criterion, models, found_together, not failures, attack),
         tables=tables,
-        failures=tuple(f"limit of {text}" for text in found.broken),
+        failures=failures,
         draw=partial(_draw, scans=scans),
     )
 
 
 def _numbers(
-    study: Study, criterion: Unsafe, models: Models, together: LimitsTogether | None, broken: Sequence[str], attack: int
+    study: Study, criterion: Unsafe, models: Models, together: LimitsTogether | None, is_kept: bool, attack: int
 ) -> dict[str, Any]:
     """The numbers of the answer; without limits together those about them are undefined."""
     numbers: dict[str, Any] = {
         "unsafe": str(criterion),
         "margin": criterion.keep,
-        "kept": not broken,
+        "kept": is_kept,
         "scope": scope_of(study, between=attack > 0),
     }
     if together is None:

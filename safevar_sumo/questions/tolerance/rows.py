@@ -62,7 +62,10 @@ class Failure(NamedTuple):
 
 
 class LimitRows(NamedTuple):
-    """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept."""
+    """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept.
+
+    Nothing is said of limits around an unsafe original.
+    """
 
     rows: list[tuple[Any, ...]]
     broken: list[str]
@@ -89,7 +92,7 @@ def limit_rows(
         ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
         failure = beyond.get(name) or beyond_alone.get(name)
         is_kept = None if limit is None else _is_kept(each, specified, together)
-        if is_kept is False:
+        if is_kept is False and each.safe is not None:
             broken.append(_broken_in_words(each, specified, together, beyond_alone.get(name), models))
         members = models[0].evaluator.characteristics
         rows.append(
@@ -121,10 +124,10 @@ def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None
 
 def _outside(alone: AloneLimit, specified: Ends) -> tuple[float, float]:
     """How far the user's limit is outside what is safe alone [unit], 0 if it is inside, and the end that is."""
-    original = alone.characteristic.original
-    ends = zip(specified, alone.safe or (original, original), (-1, 1), strict=True)
+    assert alone.safe is not None
+    ends = zip(specified, alone.safe, (-1, 1), strict=True)
     by = [(max(sign * (end - safe), 0.0), end) for end, safe, sign in ends if end is not None]
-    return max(by, default=(0.0, original))
+    return max(by, default=(0.0, alone.characteristic.original))
 
 
 def _broken_in_words(
@@ -148,11 +151,10 @@ def _broken_in_words(
         words = "the car is unsafe" if failure is None else failure.words
         value = end if failure is None else failure.setting[members.names.index(item.name)]
         return f"{item.name} {value:.5g}{item.suffix}: {words} (outside by {by:.3g}{item.suffix})"
-    if together is not None and together.broken:
-        fits = {model.fit: model for model in models}
-        fit, setting = next(iter(together.broken.items()))
-        return f"{name}: with all specified limits, {describe(fits[fit], {'': setting})[''].words}"
-    return f"{name}: the original itself is unsafe"
+    assert together is not None
+    fits = {model.fit: model for model in models}
+    fit, setting = next(iter(together.broken.items()))
+    return f"{name}: with all specified limits, {describe(fits[fit], {'': setting})[''].words}"
 
 
 def _failures_alone(alone: Iterable[AloneLimit]) -> dict[str, Failure]:

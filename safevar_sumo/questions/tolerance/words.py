@@ -25,12 +25,13 @@ def verdict_sentences(
     budget: int,
     nearest: Sequence[tuple[Any, ...]],
     wider: Sequence[tuple[Any, ...]],
+    refusal: str,
 ) -> Iterator[str]:
-    """The sentences of the verdict, the decision first."""
+    """The sentences of the verdict, the decision first; a `refusal` says why no limit can be kept."""
     unsafe = models.own.unsafe
     study = models.own.evaluator.study
-    if any(each.safe is None for each in alone):
-        yield f"The original vehicle itself is unsafe ({unsafe.description})."
+    if refusal:
+        yield f"{refusal[:1].upper()}{refusal[1:]}. {unsafe.smaller_demand}".strip()
         return
     if broken:
         yield f"Do not release: {'; '.join(broken)}."
@@ -42,7 +43,7 @@ def verdict_sentences(
     for name, scope, _, verdict in wider:
         yield f"In the wider scope of {name} ({scope}) {verdict}"
     if names := [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]:
-        yield f"Unsafe alone, all others as in the original: {join_phrases(names)}."
+        yield f"Unsafe alone, beyond the limits: {join_phrases(names)}."
     else:
         yield "No single characteristic makes it unsafe."
 
