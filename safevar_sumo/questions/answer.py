@@ -226,7 +226,8 @@ class Answer:
                     console.print(part)
         if self._other_tables:
             print_text(console, self._other_tables)
-        print_text(console, "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()))
+        if self.study is not None:  # `list` has checked nothing
+            print_text(console, "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()))
 
     @property
     def _reader_tables(self) -> dict[str, pd.DataFrame]:

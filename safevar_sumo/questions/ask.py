@@ -183,8 +183,8 @@ class Question:
         def subject_of(source: StudyLike | Results) -> Study | Case:
             subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only)
             shortfall = "" if isinstance(subject, Study) else subject.shortfall
-            for remark in filter(None, (*study_in(subject).origin.remarks, shortfall)):
-                warn(remark)
+            if shortfall:
+                warn(shortfall)
             return reduce_to_point(subject, point)
 
         command = self.command_line([_name(source), *map(_name, others)], point, values)

@@ -101,7 +101,8 @@ def list_models(kind: str | None = None) -> Answer:
     if kind is not None:
         check_name("kind", f"there is no {kind!r} to list", kind, tables)
         tables = {kind: tables[kind]}
-    verdict = f"A study can name {', '.join(f'{frame.iloc[:, 0].nunique()} {name}' for name, frame in tables.items())}."
+    counts = ", ".join(f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items())
+    verdict = f"A study can name {', '.join(own) or counts}."
     no_study: Any = None
     return Answer(question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables)
 

@@ -229,7 +229,10 @@ def export(
     values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
-    write_files(compare_setting(target.study, system, setting), to, out, solution, physics)
+    comparison = compare_setting(target.study, system, setting)
+    write_files(comparison, to, out, solution, physics)
+    if to == "openscenario" and comparison.runs.trace.speed[0, -1] <= 0:
+        return f"{to}: {out}\nnote: Ego starts from standstill, so no study can name {out / SCENARIO}"
     return f"{to}: {out}"
 
 

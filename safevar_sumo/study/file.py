@@ -205,8 +205,9 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
         if _model_and_network(tables.get(key)) != _model_and_network(base.tables.get(key))
     ]
     remarks = base.origin.remarks
+    if base.tables.get("title", "") == base.tables.get("name"):  # it has no title of its own
+        tables["title"] = overrides.get("title", tables["name"])
     if changed_keys:
-        omitted_keys = [key for key in ("title", "published") if key in base.tables and key not in overrides]
         tables = {
             **{key: value for key, value in tables.items() if key not in SYSTEM_KEYS},
             "title": tables.get("name", ""),
@@ -217,13 +218,10 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
                 tables.pop(key, None)
         if "matrix" in changed_keys and "rating" not in overrides:
             tables.pop("rating", None)
-        if omitted_keys:
+        if "published" in base.tables and "published" not in overrides:
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
-            remarks = (
-                *remarks,
-                f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
-                f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}",
-            )
+            text = f"{source}: has a different {differences} than {base.tables.get('name')!r}, so not its [published]"
+            remarks = (*remarks, text)
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 

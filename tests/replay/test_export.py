@@ -8,6 +8,7 @@ import re
 import runpy
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.results import write_imported
@@ -62,9 +64,17 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
     out = results.with_name("out")
     chosen = ("--point", point) if point else ()
-    run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
+    done = run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
+    (results / "printed.txt").write_text(done.stdout)
     there = assemble(at_point(load_study(study), point)) if point else system
     return out, compare_setting(load_study(study), there, setting)
+
+
+def test_export_says_that_no_study_takes_a_file_in_which_ego_stands(exported: tuple[Path, Comparison]) -> None:
+    out, _ = exported
+    stands = "Ego starts from standstill" in out.with_name("results").joinpath("printed.txt").read_text()
+    with pytest.raises(InputError, match="Ego stands at the start") if stands else nullcontext():
+        assemble(load_study("wear", scenario={"file": str(out / "scenario.xosc")}))
 
 
 def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:

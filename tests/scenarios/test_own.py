@@ -17,7 +17,7 @@ from safevar_sumo.sumo import reason_for_sumo
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.in_process import json_of
+from tests.in_process import json_of, run
 from tests.made_up import drawn
 
 MINE = """
@@ -174,8 +174,17 @@ def test_what_a_class_does_not_declare_is_refused(
         assemble(mine(in_tmp, {name: domain}))
 
 
+def test_a_list_of_ones_own_scenario_names_it_and_claims_no_check(in_tmp: Path) -> None:
+    (in_tmp / "own.py").write_text(MINE)
+    printed = run("list", "own:Mine").stdout
+    assert printed.startswith("A study can name own:Mine.\n")
+    assert "passed" not in printed
+
+
 def test_the_list_of_scenarios_has_what_their_classes_declare() -> None:
-    rows = {row["name"]: row for row in json_of("list", "scenarios", "--json")["tables"]["scenarios"]["rows"]}
+    answer = json_of("list", "scenarios", "--json")
+    assert answer["numbers"] == {"passed": True}
+    rows = {row["name"]: row for row in answer["tables"]["scenarios"]["rows"]}
     assert {*rows} == {*SCENARIOS}
     assert "target_deceleration 0.5 to 10 m/s^2" in str(rows["car_to_car"])
 

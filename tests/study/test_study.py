@@ -222,6 +222,16 @@ def test_another_system_inherits_neither_title_nor_published_values(text: str, i
     assert all(": has a different " in remark for remark in study.origin.remarks)
 
 
+def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that_it_extends(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "sun"\n[ads]\nmodel = "krauss"\n')
+    Path("metric.toml").write_text('extends = "mine.toml"\nname = "own"\n')
+    Path("rash.toml").write_text('extends = "metric.toml"\n')
+    Path("headed.toml").write_text('extends = "metric.toml"\ntitle = "A heading"\n')
+    Path("heir.toml").write_text('extends = "headed.toml"\n')
+    titles = [load_study(f"{name}.toml").title for name in ("mine", "metric", "rash", "headed", "heir")]
+    assert titles == ["mine", "own", "rash", "A heading", "A heading"]
+
+
 def test_the_shipped_schema_is_that_of_the_code_and_refuses_mistakes_of_form() -> None:
     assert schema_text() == STUDY_SCHEMA.read_text(encoding="utf-8")
     VALIDATOR.check_schema(VALIDATOR.schema)
