@@ -134,8 +134,8 @@ def study_or_case(
             raise InputError(
                 source,
                 f"is neither a results directory, a study nor a file{did_you_mean(source, names)}",
-                f"a directory that the command `study` has written, {one_of(names)}, or the path of a study file "
-                "(TOML)",
+                "the path of a study file (TOML), a directory that the command `study` has written, or "
+                f"{one_of(names)}",
             )
     if isinstance(source, Results):
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):

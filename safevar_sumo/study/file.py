@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError, about, did_you_mean, one_of, unknown_name
+from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
@@ -69,7 +69,9 @@ def study_path(study: str) -> Path:
     if os.path.exists(study):
         return Path(study)
     problem = f"there is no study or file {study!r}"
-    raise unknown_name("study", problem, study, study_names(), ", or the path of a study file (TOML)")
+    names = study_names()
+    legal = f"the path of a study file (TOML), or {one_of(names)}"
+    raise InputError("study", f"{problem}{did_you_mean(study, names)}", legal)
 
 
 def load_study(study: StudyLike, **changes: Any) -> Study:

@@ -17,7 +17,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import across_fits, explain
+from safevar_sumo.questions.explain import across_fits, explain, failures
 from safevar_sumo.questions.explain.across_fits import are_causes, ranges_across_fits
 from safevar_sumo.questions.explain.causes import (
     RESOLUTION,
@@ -32,6 +32,7 @@ from safevar_sumo.questions.explain.causes import (
 )
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
+from safevar_sumo.study import load_study
 from tests.conftest import FITS
 from tests.in_process import InlinePool
 from tests.questions.conftest import (
@@ -258,3 +259,15 @@ def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
     named = [(done, total) for stage, done, total in shown if stage == "2 of 2, all calls"]
     assert list(dict.fromkeys(named)) == [(0, 4), (3, 4), (3, 5), (5, 5)]
     assert shown[-1] == ("unplanned", 1, 1)
+
+
+def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 4)
+    study = load_study("smoke")
+    answer = explain.compute(study, Evaluator(study, InlinePool(), verified=0), unsafe="below=99", fits=0, top=1)
+    degree = f"{answer.numbers['original_degree']:.3g}"
+    said = f"The original itself has safety degree {degree} m, below 99 m: no change is needed. Demand less, with"
+    assert answer.verdict.startswith(f"{said} --unsafe. 4 of 4 vehicles")
+    assert [len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")] == [0, 0, 0]
+    assert len(answer.tables["solutions"]) == 1
+    assert "Minimal causes" not in answer.render("text")

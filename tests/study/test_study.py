@@ -311,3 +311,10 @@ def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     assert study.matrix is None
     assert [point.scenario.test for point in assemble(study).points] == ["CPNA"]
     assert load_study(tables_of(study)).matrix is None
+
+
+def test_an_unknown_study_is_refused_with_the_path_first() -> None:
+    with pytest.raises(
+        InputError, match=r"'nativ'; did you mean 'native'\?\nexpected: the path of a study file \(TOML\), or"
+    ):
+        load_study("nativ")

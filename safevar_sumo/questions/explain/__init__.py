@@ -163,8 +163,13 @@ def explain(
     population = find_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)
+    # Of an unsafe original no change is a cause; in another encounter it may be safe.
+    is_unsafe_original = not study.scenario.search and bool(population.unsafe.of(population.original)[0])
+    if is_unsafe_original:
+        causes = {row: [] for row in causes}
     changed = evaluator.characteristics.changed(runs.settings[sample])
     needed = count_needed(evaluator.characteristics, changed, [causes[row] for row in sample], len(population.rows))
+    needed = needed.head(0) if is_unsafe_original else needed
     # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
     verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
     of_chosen = [causes[row] for row in reasons]
@@ -338,6 +343,10 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
     contact = assemble(evaluator.study).contact
     runs = population.evaluations
     counts = f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe ({unsafe.description})."
+    if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
+        words = unsafe.breach_in_words(population.original)
+        demand = f" {unsafe.smaller_demand}".rstrip()
+        return f"The original itself {words}: no change is needed.{demand} {counts}"
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
         ends = [
@@ -348,7 +357,7 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
         return " ".join([counts, *ends])
     leading = causes.iloc[0]
     if not leading["changes"]:
-        return f"The original vehicle itself is unsafe: no change is needed. {counts}"
+        return f"The original itself is unsafe in this encounter: no change is needed. {counts}"
     limits = [
         f"{item.short_name} {'above' if value > item.original else 'below'} {item.text(value)}{item.suffix}"
         for item in evaluator.characteristics
