@@ -86,7 +86,7 @@ def opinion(subject: Case, evaluator: Evaluator, *, solution: tuple[str, ...] = 
     )
     columns = {name: column for name, column in COLUMNS.items() if name in frame}
     if safe := [name for name in explained.tables["solutions"]["solution"] if name not in {*causes["solution"]}]:
-        verdict += f" Not unsafe, without a cause: {join_phrases(safe)}."
+        verdict += f" Without a cause (safe, or the original itself is unsafe): {join_phrases(safe)}."
     return Answer(
         question="opinion",
         study=subject.study,
