@@ -14,6 +14,7 @@ from safevar_sumo import explain, tolerance
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.attack import Attack, attack, attack_all
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
 from safevar_sumo.questions.tolerance.levels_together import _nested
@@ -22,7 +23,7 @@ from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from tests.in_process import ROOT, files_of, refused, run
+from tests.in_process import ROOT, InlinePool, files_of, refused, run
 from tests.questions.conftest import box_of, made_up_study, nowhere
 
 SEARCHED = """
@@ -249,3 +250,13 @@ def test_limits_together_that_are_cut_have_no_attack_and_no_proof_of_their_own()
     assert [each.box and each.box.upper.tolist() for each in nested] == [[8, 9], [6, 7], [6, 5]]
     assert [each.attack is None for each in nested] == [False, False, True]
     assert [each.proof is None for each in nested] == [False, False, True]
+
+
+def test_no_limit_is_kept_where_the_original_is_unsafe_up_to_each_value() -> None:
+    study = load_study("wear")
+    evaluator = Evaluator(study, InlinePool(), verified=0)
+    options = {"fits": 0, "attack": 0, "characteristics": ("brakeTorque",)}
+    answer = tolerance.compute(study, evaluator, by="speed=10", margin=99, **options)
+    assert "Up to 10 km/h no limit holds: the original vehicle itself is unsafe" in answer.verdict
+    assert answer.numbers["kept"] is False
+    assert answer.failures == ("the limits hold up to none of these values, not 10 km/h",)

@@ -45,7 +45,8 @@ def answer_by(search: LevelSearch, known: FloatArray, is_together: bool) -> Answ
     with search.evaluator.stage("specified limits between two values"):
         reach = search.reach(levels)
     scopes = [by.scope(study, level.value, between=search.budget > 0) for level in levels]
-    is_kept = not limits or all(level.alone is not None and not level.failures for level in levels)
+    is_safe = levels[0].alone is not None
+    is_kept = all(level.alone is not None and not level.failures for level in levels) if limits else is_safe
     values = ["alone", *(["together"] if is_together else []), *(["kept"] if limits else [])]
     frame = tabulate(
         _title(by),
