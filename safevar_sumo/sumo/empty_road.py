@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +21,28 @@ SLOW_APPROACH = 0.5
 """Who comes closer by less need not reach anybody within a test [m/s]: he follows."""
 
 
+class Reason(StrEnum):
+    """Why a first drive does not lead to the encounter: the ADS brakes or stands, or the others do not wait."""
+
+    BRAKES = "brakes"
+    LATE = "late"
+    STANDS = "stands"
+
+
+class Problem(NamedTuple):
+    """What the original vehicle does wrong on an empty road, with a verb in front."""
+
+    reason: Reason
+    words: str
+
+
 def why_no_verdict(system: System) -> str:
-    """Why simulations tell nothing about the ADS, in a sentence; "" if they do.
+    """Why simulations tell nothing about the ADS, in a sentence; "" if they do."""
+    return sentence_on(find_problems(system), len(system.points))
+
+
+def find_problems(system: System) -> dict[str, Problem]:
+    """What keeps the original vehicle from the encounter, by the name of the point.
 
     At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If it does not reach
     the place of the encounter before the encounter is over, or brakes on its way, the obstacle is not what keeps it
@@ -29,41 +51,49 @@ def why_no_verdict(system: System) -> str:
     try:
         results = simulate_all_points(replace(system, sees_nobody=True), system.characteristics.original[np.newaxis])
     except SimulationError:  # the study's own simulations decide, and report their errors
-        return ""
-    problems = {
+        return {}
+    return {
         result.point.name: problem
         for result in results
         if not result.point.scenario.brakes_fully
         and (problem := _problem(result.runs, result.point.scenario.test_speed))
     }
+
+
+def sentence_on(problems: dict[str, Problem], n_points: int) -> str:
+    """The first problem in a sentence, and at how many of the points it is there; "" without one."""
     if not problems:
         return ""
     point, problem = next(iter(problems.items()))
-    kind = problem.split()[0]  # the first word: distances differ from point to point
-    count = sum(other_problem.startswith(kind) for other_problem in problems.values())
-    where = f" at {count} of {len(results)} points, such as {point}" if len(results) > 1 else ""
+    count = sum(other.reason is problem.reason for other in problems.values())
+    where = f" at {count} of {n_points} points, such as {point}" if n_points > 1 else ""
     return (
-        f"On a first drive, with nobody in sight, the original vehicle {problem}{where}. So its drives with somebody "
-        "in sight do not show how it reacts to them: no verdict."
+        f"On a first drive, with nobody in sight, the original vehicle {problem.words}{where}. So its drives with "
+        "somebody in sight do not show how it reacts to them: no verdict."
     )
 
 
-def _problem(runs: SimulationRuns, test_speed: float | None) -> str:
-    """What the original vehicle, the only one in `runs`, does wrong on an empty road; "" if nothing.
+def _problem(runs: SimulationRuns, test_speed: float | None) -> Problem | None:
+    """What the original vehicle, the only one in `runs`, does wrong on an empty road.
 
-    Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
+    Who still has its test speed at the end, and comes closer to nobody, has driven as it should. Who still has the
+    speed that it began with when the others have left is late.
     """
     trace = runs.trace
     end = int(np.count_nonzero(trace.active)) + 1  # the sample after the last active one ended the run
     gap, speed, brake, position = (values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
-        return "brakes without an obstacle"
+        return Problem(Reason.BRAKES, "brakes without an obstacle")
     approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
     if gap[-1] <= 0 or (keeps_speed and is_alone) or runs.outcome[0] == Outcome.COLLISION:
-        return ""
+        return None
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
+    if runs.outcome[0] == Outcome.PASSED and speed[-1] > max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH:
+        words = f"is late for the encounter: the others have left after {trace.time[end - 1]:.1f} s"
+        return Problem(Reason.LATE, f"{words}, when it has come {distance:.1f}{of_needed} m at {speed[-1]:.1f} m/s")
     commanded = f"with at most {trace.throttle[:end, 0].max():.2g} of the throttle and {brake.max():.2g} of the brake"
-    return f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})"
+    words = f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})"
+    return Problem(Reason.STANDS, words)

@@ -216,6 +216,22 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     ]
 
 
+@pytest.mark.parametrize(("pace", "found"), [(2.5, []), (4.0, ["meeting"])])
+def test_others_who_have_left_in_time_are_the_scenarios_matter(pace: float, found: list[str], in_tmp: Path) -> None:
+    """A deer runs from 12 m beside the lane to 50 m ahead; the car, at 40 km/h, is there after 4.5 s."""
+    (in_tmp / "mine.py").write_text(
+        "from safevar_sumo.scenarios import Track\n\n\nclass Deer:\n    speed = 40.0\n    duration = 12.0\n\n"
+        "    def tracks(self, times):\n"
+        f"        return [Track.of('deer', 'deer', 50.0, -12.0 + {pace} * times, vy={pace}, size=(0.6, 1.5))]\n"
+    )
+    (in_tmp / "mine.toml").write_text(
+        'extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n[matrix]\ntests = []\n'
+    )
+    findings = check(study_to_check("mine.toml"))
+    assert [finding.check for finding in findings] == found
+    assert all("mine.py:4" in finding.where and "have left after" in finding.finding for finding in findings)
+
+
 @pytest.mark.parametrize(
     "study", ["smoke", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lgsvl", "native", "wear"))]
 )

@@ -17,7 +17,7 @@ from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_simulations
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, user_code
-from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
 
@@ -41,9 +41,10 @@ CHECKS: Mapping[str, str] = {
         "command enough throttle while nobody is in sight, where `gap` is infinite; check that the code reads the "
         "quantity that it should react to, with the right sign and unit"
     ),
+    "meeting": "choose values of the scenario's parameters at which the vehicle meets the others before they have left",
 }
-"""The checks, with advice on a failure. All but `reaction`, of which every answer itself warns, also keep a study from
-starting.
+"""The checks, with advice on a failure. All but the last two, of which every answer itself warns, also keep a study
+from starting.
 """
 
 
@@ -79,10 +80,18 @@ def study_to_check(name: str) -> Study:
 def check(study: Study) -> list[Finding]:
     """Check the user code of a study."""
     findings = list(find_defects(study))
-    if not findings and (reason := why_no_verdict(assemble(study))):
-        where = _definition(study, "ads.model", study.ads.model)
-        findings = [Finding("reaction", reason, where, "", "a drive to the encounter, without braking for nobody")]
-    return findings
+    if findings:
+        return findings
+    system = assemble(study)
+    problems = find_problems(system)
+    if not problems:
+        return []
+    words = sentence_on(problems, len(system.points))
+    if next(iter(problems.values())).reason is Reason.LATE:
+        where = _definition(study, "scenario.model", study.scenario.model)
+        return [Finding("meeting", words, where, "", "an encounter while the others are there")]
+    where = _definition(study, "ads.model", study.ads.model)
+    return [Finding("reaction", words, where, "", "a drive to the encounter, without braking for nobody")]
 
 
 def refuse_defects(study: Study) -> None:
