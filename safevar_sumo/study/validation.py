@@ -57,10 +57,10 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     path = [prefix] if prefix else []
     value = raw
     kinds = [table]
-    siblings = ()
+    siblings = dict[str, Any]()
     for name, index in re.findall(r"\.(\w+)|\[([\d.]+)\]", location):
         inner = _inner_type(_meant(kinds[-1], value), name)
-        siblings = tuple(value) if isinstance(value, dict) else ()
+        siblings = value if isinstance(value, dict) else {}
         key: Any = name or (_wrong_key(value, inner) if index == "..." else int(index))
         path = [*path, key]
         value = value[key]
@@ -71,8 +71,11 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
         return _unknown_key(_path_text([*path, field[1]]), field[1], kind, table)
     if field := re.match(r"Object missing required field `(.*)`", problem):
-        hint = did_you_mean(path[-1], {*siblings} - {path[-1]}) if path else ""  # a mistyped table is a new one
-        return InputError("", f"{text}: {field[1]} is missing{hint}".removeprefix(": "))
+        known = [name for name, other in siblings.items() if isinstance(other, dict) and field[1] in other]
+        hint = did_you_mean(path[-1], known) if path else ""  # a mistyped table is a new one
+        needed = ", ".join(one.name for one in msgspec.structs.fields(kind) if one.required)
+        legal = f"{needed} for what is new here" + (f"; else {', '.join(known)}" if known else "")
+        return InputError("", f"{text}: {field[1]} is missing{hint}".removeprefix(": "), legal)
     if problem.startswith("Invalid enum value"):
         return unknown_name("", f"{text} = {quoted}", value, filter(None, get_args(kind)))
     if problem.startswith("Invalid value"):  # of the key that tells which table is meant

@@ -78,6 +78,10 @@ MISTAKES = [
         "[vehicle.characteristics.masss]\noriginal = 9",
         "vehicle.characteristics.masss: unit is missing; did you mean 'mass'?",
     ),
+    (
+        "[vehicle.characteristics.brakes]\noriginal = 9",
+        "vehicle.characteristics.brakes: unit is missing\nexpected: unit, original, lower, upper for what is new here; else ",
+    ),
     ("[vehicle.characteristics.mass]\nupper = 1e300", "1e+300]\nexpected: numbers up to 1e+12"),
     (
         '[metrics]\nalso = ["max_jerk", "max_jerk"]',
