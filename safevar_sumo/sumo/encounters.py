@@ -32,7 +32,9 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
         legal = searchable_in(point.scenario)
         for name, domain in study.scenario.search.items():
             key = f"scenario.search.{name}"
-            check_name("", f"{key}: {type(point.scenario).__name__} has no such parameter to search", name, legal)
+            where = f" (at {point.name} of [matrix])" if point.name else ""
+            problem = f"{key}: {type(point.scenario).__name__} has no such parameter to search{where}"
+            check_name("", problem, name, legal)
             widest = legal[name]
             if widest.unit and domain.unit != widest.unit:
                 raise InputError("", f"{key}.unit = {domain.unit!r}", repr(widest.unit))

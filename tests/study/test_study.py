@@ -80,7 +80,7 @@ MISTAKES = [
     ),
     (
         "[vehicle.characteristics.brakes]\noriginal = 9",
-        "vehicle.characteristics.brakes: unit is missing\nexpected: unit, original, lower, upper for what is new here; else ",
+        "brakes: unit is missing\nexpected: unit, original, lower, upper for what is new here; else ",
     ),
     ("[vehicle.characteristics.mass]\nupper = 1e300", "1e+300]\nexpected: numbers up to 1e+12"),
     (
