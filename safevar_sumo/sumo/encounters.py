@@ -32,8 +32,8 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
         legal = searchable_in(point.scenario)
         for name, domain in study.scenario.search.items():
             key = f"scenario.search.{name}"
-            where = f" (at {point.name} of [matrix])" if point.name else ""
-            problem = f"{key}: {type(point.scenario).__name__} has no such parameter to search{where}"
+            where = f"{key}: {point.name} of [matrix]: " if point.name else f"{key}: "
+            problem = f"{where}{type(point.scenario).__name__} has no such parameter to search"
             check_name("", problem, name, legal)
             widest = legal[name]
             if widest.unit and domain.unit != widest.unit:
