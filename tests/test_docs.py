@@ -7,6 +7,7 @@ from __future__ import annotations
 import configparser
 import importlib.util
 import json
+import os
 import re
 import runpy
 import shlex
@@ -61,9 +62,9 @@ def run(line: str) -> None:
         assert line.startswith(("pip install", "eval ", "#")) or not line, f"a line that nothing runs: {line}"
 
 
-def pictures() -> Any:
-    """The script that draws the pictures of the pages."""
-    spec = importlib.util.spec_from_file_location("pictures", ROOT / "docs" / "pictures.py")
+def script_of_docs(name: str) -> Any:
+    """A script beside the pages, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -74,15 +75,16 @@ def pictures() -> Any:
 def test_every_picture_has_its_command_and_its_page() -> None:
     texts = "".join((ROOT / page).read_text() for page in PAGES)
     names = {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
-    assert names == pictures().COMMANDS.keys() == set(re.findall(r"pictures/([\w.]+)\)", texts))
+    assert names == script_of_docs("pictures").COMMANDS.keys() == set(re.findall(r"pictures/([\w.]+)\)", texts))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["failure.png", "failure.gif", "stops.png", "encounters.png", "report.png"])
 def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(name: str, tmp_path: Path) -> None:
-    if name == "report.png" and not shutil.which("chromium"):
+    if name == "report.png" and not shutil.which("chromium") and not os.environ.get("SAFEVAR_BROWSER"):
         pytest.skip("chromium is not installed")
-    with Image.open(pictures().draw(name, tmp_path)) as drawn, Image.open(ROOT / "docs" / "pictures" / name) as stored:
+    drawn_anew = script_of_docs("pictures").draw(name, tmp_path)
+    with Image.open(drawn_anew) as drawn, Image.open(ROOT / "docs" / "pictures" / name) as stored:
         assert drawn.size == stored.size
         assert getattr(drawn, "n_frames", 1) == getattr(stored, "n_frames", 1)
 
@@ -162,11 +164,7 @@ def test_the_page_on_results_lists_every_key_that_may_change() -> None:
 
 
 def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
-    generate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(generate)
+    generate = script_of_docs("generate")
     text = "\n".join(generate.on_page_markdown((ROOT / page).read_text()) for page in PAGES)
     assert "docs/generate.py" not in text
     for heading in (*VEHICLES, *ADS, "SearchTable"):

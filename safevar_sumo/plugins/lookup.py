@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError, UserCodeError, describe_error, did_you_mean, one_of, subject
+from safevar_sumo.errors import InputError, UserCodeError, check_name, describe_error, did_you_mean, one_of, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins.contract import (
     UserCode,
@@ -252,6 +252,10 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
     """
     with user_errors(subject()), np.errstate():
         if issubclass(member.target, msgspec.Struct):
+            for parameter in parameters:  # a user's class need not forbid what it does not have
+                problem = f"{key}.{parameter}: {name} has no such parameter"
+                if not member.target.__struct_config__.forbid_unknown_fields:
+                    check_name("", problem, parameter, member.target.__struct_encode_fields__)
             return convert_table(parameters, member.target, key)
         try:
             return member.target(**parameters)

@@ -260,7 +260,7 @@ def find_question(name: str) -> Question:
         raise InputError("question", f"there is no {name!r}", legal)
     module, _, function = name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
     if ":" in name:
-        add_import_folders(())
+        add_import_folders(())  # the working directory, which an installed program does not have on its path
     invalidate_caches()  # the module may have been written a moment ago
     try:
         with user_errors(name):

@@ -57,6 +57,16 @@ def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     return load_study("wear", matrix=None, scenario=scenario, **tables)
 
 
+def test_a_parameter_that_a_users_struct_does_not_have_is_refused_also_of_an_inherited_matrix(in_tmp: Path) -> None:
+    """A `msgspec.Struct` that does not forbid unknown fields takes no notice of them."""
+    (in_tmp / "own.py").write_text(MINE)
+    scenario = {"model": "own:Mine", "parameters": {"pase": 3}}
+    with pytest.raises(InputError, match=r"scenario\.parameters\.pase: .*own:Mine' has no such parameter"):
+        assemble(load_study("wear", matrix=None, scenario=scenario))
+    with pytest.raises(InputError, match=r"test 'CPFA': .*own:Mine' has no such parameter"):
+        assemble(load_study("wear", scenario={"model": "own:Mine"}))
+
+
 def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
     """Each encounter is that of a study with these parameters, and the original vehicle meets the same."""
     system = assemble(mine(in_tmp, SEARCH))
