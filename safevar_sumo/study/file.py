@@ -196,15 +196,15 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
 
 def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
     """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none its wider study."""
-    inherited = {key: value for key, value in base.tables.items() if key != "wider"}
-    scenario = overrides.get("scenario")
-    if isinstance(scenario, dict) and "file" in scenario:  # in place of model and matrix
-        inherited = {key: value for key, value in inherited.items() if key not in ("scenario", "matrix", "rating")}
+    left_out = {"wider"}
+    if _names_scenario(overrides.get("scenario"), base.tables.get("scenario")):
+        left_out |= {"scenario", "matrix", "rating"}
+    inherited = {key: value for key, value in base.tables.items() if key not in left_out}
     tables = _merge(inherited, overrides)
     changed_keys = [
         key
         for key in ("weather", "vehicle", "ads", "scenario", "matrix")
-        if _model_and_network(tables.get(key)) != _model_and_network(base.tables.get(key))
+        if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
     ]
     remarks = base.origin.remarks
     if base.tables.get("title", "") == base.tables.get("name"):  # it has no title of its own
@@ -220,11 +220,21 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
                 tables.pop(key, None)
         if "matrix" in changed_keys and "rating" not in overrides:
             tables.pop("rating", None)
-        if "published" in base.tables and "published" not in overrides:
+        dropped = [f"[{key}]" for key, value in base.tables.items() if isinstance(value, dict) and key not in tables]
+        if dropped:
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
-            text = f"{source}: has a different {differences} than {base.tables.get('name')!r}, so not its [published]"
+            of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
+            text = f"{source}: has a different {differences} {of_base}"
             remarks = (*remarks, text)
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
+
+
+def _names_scenario(table: object, base_table: object) -> bool:
+    """Whether a table [scenario] names a file or another model than that of its base, whose matrix is not about it."""
+    if not isinstance(table, dict):
+        return False
+    base_model = base_table.get("model") if isinstance(base_table, dict) else None
+    return "file" in table or table.get("model", base_model) != base_model
 
 
 def _model_and_network(table: object) -> object:

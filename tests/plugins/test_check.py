@@ -224,9 +224,7 @@ def test_others_who_have_left_in_time_are_the_scenarios_matter(pace: float, foun
         "    def tracks(self, times):\n"
         f"        return [Track.of('deer', 'deer', 50.0, -12.0 + {pace} * times, vy={pace}, size=(0.6, 1.5))]\n"
     )
-    (in_tmp / "mine.toml").write_text(
-        'extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n[matrix]\ntests = []\n'
-    )
+    (in_tmp / "mine.toml").write_text('extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n')
     findings = check(study_to_check("mine.toml"))
     assert [finding.check for finding in findings] == found
     assert all("mine.py:4" in finding.where and "have left after" in finding.finding for finding in findings)

@@ -12,7 +12,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions import evaluator
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.scenarios import SCENARIOS
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.sumo import reason_for_sumo
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
@@ -57,14 +57,14 @@ def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     return load_study("wear", matrix=None, scenario=scenario, **tables)
 
 
-def test_a_parameter_that_a_users_struct_does_not_have_is_refused_also_of_an_inherited_matrix(in_tmp: Path) -> None:
+def test_a_parameter_that_a_users_struct_does_not_have_is_refused_also_in_a_matrix(in_tmp: Path) -> None:
     """A `msgspec.Struct` that does not forbid unknown fields takes no notice of them."""
     (in_tmp / "own.py").write_text(MINE)
     scenario = {"model": "own:Mine", "parameters": {"pase": 3}}
     with pytest.raises(InputError, match=r"scenario\.parameters\.pase: .*own:Mine' has no such parameter"):
         assemble(load_study("wear", matrix=None, scenario=scenario))
     with pytest.raises(InputError, match=r"test 'CPFA': .*own:Mine' has no such parameter"):
-        assemble(load_study("wear", scenario={"model": "own:Mine"}))
+        assemble(load_study("wear", scenario={"model": "own:Mine"}, matrix=tables_of(load_study("wear"))["matrix"]))
 
 
 def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
@@ -96,8 +96,6 @@ STUDY = """
 extends = "wear"
 name = "mine"
 title = "A scooter"
-[matrix]
-tests = []
 [scenario]
 model = "own:Mine"
 [scenario.search]

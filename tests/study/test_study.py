@@ -317,6 +317,20 @@ def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     assert load_study(tables_of(study)).matrix is None
 
 
+@pytest.mark.parametrize("model", ["mine:Deer", "along"])
+def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(model: str, in_tmp: Path) -> None:
+    Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\nmodel = "{model}"\n')
+    study = load_study("mine.toml")
+    assert study.matrix is None
+    assert study.origin.remarks == ("mine.toml: has a different scenario than 'wear', so not its [matrix]",)
+    own = load_study("wear", scenario={"model": model}, matrix={"tests": [{"name": "own"}]})
+    assert own.matrix is not None
+    assert [test.name for test in own.matrix.tests] == ["own"]
+    assert own.origin.remarks == ()
+    same = load_study("wear", scenario={"model": "crossing", "parameters": {"speed": 30}})
+    assert (same.matrix, same.origin.remarks) == (load_study("wear").matrix, ())
+
+
 def test_an_unknown_study_is_refused_with_the_path_first() -> None:
     with pytest.raises(
         InputError, match=r"'nativ'; did you mean 'native'\?\nexpected: the path of a study file \(TOML\), or"
