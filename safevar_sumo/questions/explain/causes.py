@@ -282,30 +282,32 @@ def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) 
 def find_boundary_shares(
     evaluator: Evaluator, starts: FloatArray, ends: FloatArray, unsafe: Unsafe, lowest: FloatArray
 ) -> tuple[FloatArray, list[BoundaryState]]:
-    """The first unsafe share above `lowest` of each of M lines, whose end must be unsafe, and what lies just below it.
+    """The first unsafe share of each of M lines, shape (M,), and what lies just below it.
 
-    The error is at most `RESOLUTION` times the line above `lowest`. A setting that cannot be simulated is neither safe
-    nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
+    A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`, shape (M,), on, and
+    its end must be unsafe. Each round simulates the bounds between equal parts of the interval from `low` to `high`, and
+    keeps the part below the first unsafe one. The error is at most `RESOLUTION` times the line above `lowest`. A setting
+    that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
     """
-    number = len(starts)
-    rows = np.arange(number)
+    lines = np.arange(len(starts))
+    always = np.ones(len(starts), dtype=bool)
     low = lowest
-    high = np.ones(number)
-    low_is_valid = np.ones(number, dtype=bool)
+    low_is_valid = always
+    high = np.ones(len(starts))
     for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
-        shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
-        shares[:, -1] = high  # without a rounding error; known to be unsafe
-        inner = settings_on_lines(starts, ends, shares[:, :-1])
+        shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(parts + 1) / parts
+        shares[:, -1] = high  # without a rounding error
+        inner = settings_on_lines(starts, ends, shares[:, 1:-1])
         evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), BOUNDARIES)
-        is_unsafe, is_valid = (
-            np.column_stack([flags.reshape(number, parts - 1), np.ones(number, dtype=bool)])
-            for flags in (unsafe.of(evaluations), evaluations.valid)
-        )
+        shape = (len(starts), parts - 1)
+        is_unsafe = np.column_stack([~always, unsafe.of(evaluations).reshape(shape), always])
+        is_valid = np.column_stack([low_is_valid, evaluations.valid.reshape(shape), always])
         first_unsafe = np.argmax(is_unsafe, axis=1)
-        below = rows, np.maximum(first_unsafe - 1, 0)
-        low_is_valid = np.where(first_unsafe > 0, is_valid[below], low_is_valid)
-        low = np.where(first_unsafe > 0, shares[below], low)
-        high = shares[rows, first_unsafe]
-    states = np.where(low_is_valid, BoundaryState.SAFE, BoundaryState.NOT_SIMULATED)
-    states = np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)
+        high = shares[lines, first_unsafe]
+        low = shares[lines, first_unsafe - 1]
+        low_is_valid = is_valid[lines, first_unsafe - 1]
+    is_at_threshold = (low == lowest) & (lowest > 0)
+    states = np.select(
+        [is_at_threshold, low_is_valid], [BoundaryState.FILTER, BoundaryState.SAFE], BoundaryState.NOT_SIMULATED
+    )
     return high, [BoundaryState(state) for state in states]
