@@ -135,7 +135,7 @@ def study(
     loaded, system = load_for_search(changed)
     if unsafe is not None:
         study_by(loaded, Unsafe.parse(unsafe))  # refuses what no study has, before the search
-    for remark in dict.fromkeys([*loaded.origin.remarks, *system.remarks, *vehicle_remarks(system)]):
+    for remark in dict.fromkeys([*system.remarks, *vehicle_remarks(system)]):
         warn(remark)
     keys = _select_runs(all_runs(loaded), only, shard)
     if not keys:

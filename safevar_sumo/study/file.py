@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError, about, did_you_mean, one_of
+from safevar_sumo.errors import InputError, about, did_you_mean, one_of, warn
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
@@ -44,11 +44,12 @@ SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 
 
 class _RawStudy(NamedTuple):
-    """Unchecked tables of a study, and their origin."""
+    """Unchecked tables of a study, their origin, and remarks for the user on what they do not inherit."""
 
     source: object
     tables: Parameters
     origin: Origin = Origin()
+    remarks: tuple[str, ...] = ()
 
 
 def study_names() -> list[str]:
@@ -77,7 +78,13 @@ def study_path(study: str) -> Path:
 def load_study(study: StudyLike, **changes: Any) -> Study:
     """Read a study strictly, as `safevar_sumo.load_study` does, but for the parameters of its shipped models."""
     raw = _raw_study(study)
-    return _checked_study(_with_overrides(raw, plain_values(changes), raw.source) if changes else raw)
+    if changes:
+        raw = _with_overrides(raw, plain_values(changes), raw.source)
+    with about(raw.source):
+        loaded_study = _converted(raw)
+    for remark in raw.remarks:
+        warn(remark)
+    return loaded_study
 
 
 def plain_values(value: Any) -> Any:
@@ -99,11 +106,6 @@ def _raw_study(study: StudyLike) -> _RawStudy:
     if isinstance(study, Mapping):
         return _with_base(_RawStudy("study", plain_values(study)), Path("."), ())
     return _read_file(study_path(str(study)), visited_paths=())
-
-
-def _checked_study(raw: _RawStudy) -> Study:
-    with about(raw.source):
-        return _converted(raw)
 
 
 def _converted(raw: _RawStudy) -> Study:
@@ -183,15 +185,9 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
-    remarks = () if path.parent == STUDIES else merged_study.origin.remarks  # shipped studies leave keys out on purpose
-    origin = msgspec.structs.replace(
-        merged_study.origin,
-        called=raw.origin.called,
-        places=folders,
-        remarks=remarks,
-        files=(*raw.origin.files, *base_study.origin.files),
-    )
-    return merged_study._replace(origin=origin)
+    remarks = () if path.parent == STUDIES else merged_study.remarks  # shipped studies leave keys out on purpose
+    files = (*raw.origin.files, *base_study.origin.files)
+    return merged_study._replace(origin=Origin(called=raw.origin.called, places=folders, files=files), remarks=remarks)
 
 
 def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
@@ -206,7 +202,7 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
         for key in ("weather", "vehicle", "ads", "scenario", "matrix")
         if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
     ]
-    remarks = base.origin.remarks
+    remarks = base.remarks
     if base.tables.get("title", "") == base.tables.get("name"):  # it has no title of its own
         tables["title"] = overrides.get("title", tables["name"])
     if changed_keys:
@@ -226,7 +222,7 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
             of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
             text = f"{source}: has a different {differences} {of_base}"
             remarks = (*remarks, text)
-    return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
+    return _RawStudy(source, tables, base.origin, remarks)
 
 
 def _names_scenario(table: object, base_table: object) -> bool:

@@ -241,14 +241,13 @@ class Origin(Table, frozen=True, kw_only=True):
     `called` is the study's path as given on the command line, empty if the study was given by its name; `point` is the
     point of the matrix to which the study was reduced, empty for a whole study; `places` are the folders of its file
     and of the files that it extends, where user code is looked up first; `files` are those of these files that are not
-    shipped; `remarks` are for the user.
+    shipped.
     """
 
     called: str = ""
     point: str = ""
     places: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
 
 
 class Study(Table, frozen=True, kw_only=True):

@@ -7,8 +7,11 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import shutil
 import tomllib
+import warnings
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import msgspec
@@ -19,9 +22,10 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.results.manifest import evaluation_keys
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
-from safevar_sumo.study import Limit, Origin, limits_of, load_study, study_names, tables_of, write_study
+from safevar_sumo.study import Limit, Origin, Study, limits_of, load_study, study_names, tables_of, write_study
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import ROOT
 
 SUN = load_study("sun").vehicle.characteristics
 ALL_FIXED = "".join(
@@ -202,6 +206,13 @@ def test_the_first_mistake_is_told_with_file_key_and_value(text: str, told: str,
     assert len(message.splitlines()) <= 2
 
 
+def with_remarks(study: str, **changes: Any) -> tuple[Study, list[str]]:
+    """A study, and what reading it warns of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        return load_study(study, **changes), [str(one.message) for one in caught]
+
+
 @pytest.mark.parametrize(
     ("text", "inherits"),
     [
@@ -217,13 +228,13 @@ def test_the_first_mistake_is_told_with_file_key_and_value(text: str, told: str,
 )
 def test_another_system_inherits_neither_title_nor_published_values(text: str, inherits: bool, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "sun"\n{text}\n')
-    study = load_study(str(tmp_path / "mine.toml"))
+    study, remarks = with_remarks(str(tmp_path / "mine.toml"))
     sun = load_study("sun")
     assert study.name == "mine", "a study without a name is called as its file"
     assert (study.title == sun.title) == inherits
     assert (study.published == sun.published) == inherits
-    assert bool(study.origin.remarks) != inherits
-    assert all(": has a different " in remark for remark in study.origin.remarks)
+    assert bool(remarks) != inherits
+    assert all(": has a different " in remark for remark in remarks)
 
 
 def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that_it_extends(in_tmp: Path) -> None:
@@ -317,18 +328,29 @@ def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     assert load_study(tables_of(study)).matrix is None
 
 
-@pytest.mark.parametrize("model", ["mine:Deer", "along"])
-def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(model: str, in_tmp: Path) -> None:
-    Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\nmodel = "{model}"\n')
-    study = load_study("mine.toml")
+@pytest.mark.parametrize("scenario", [{"model": "mine:Deer"}, {"model": "along"}, {"file": "scenario.xosc"}])
+def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
+    scenario: dict[str, str], in_tmp: Path
+) -> None:
+    shutil.copy(ROOT / "tests" / "openscenario" / "files" / "crossing_pedestrian.xosc", "scenario.xosc")
+    ((key, value),) = scenario.items()
+    Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\n{key} = "{value}"\n')
+    study, remarks = with_remarks("mine.toml")
     assert study.matrix is None
-    assert study.origin.remarks == ("mine.toml: has a different scenario than 'wear', so not its [matrix]",)
-    own = load_study("wear", scenario={"model": model}, matrix={"tests": [{"name": "own"}]})
+    assert remarks == ["mine.toml: has a different scenario than 'wear', so not its [matrix]"]
+    own, remarks = with_remarks("wear", scenario=scenario, matrix={"tests": [{"name": "own"}]})
     assert own.matrix is not None
-    assert [test.name for test in own.matrix.tests] == ["own"]
-    assert own.origin.remarks == ()
-    same = load_study("wear", scenario={"model": "crossing", "parameters": {"speed": 30}})
-    assert (same.matrix, same.origin.remarks) == (load_study("wear").matrix, ())
+    assert ([test.name for test in own.matrix.tests], remarks) == (["own"], [])
+    same, remarks = with_remarks("wear", scenario={"model": "crossing", "parameters": {"speed": 30}})
+    assert (same.matrix, remarks) == (load_study("wear").matrix, [])
+
+
+def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -> None:
+    study, remarks = with_remarks("wear", ads={"model": "krauss"})
+    assert study.spread == {}
+    assert len(remarks) == 1
+    assert remarks[0].endswith("has a different ADS than 'wear', so not its [spread]")
+    assert with_remarks("wear_joint")[1] == [], "a shipped study leaves keys out on purpose"
 
 
 def test_an_unknown_study_is_refused_with_the_path_first() -> None:

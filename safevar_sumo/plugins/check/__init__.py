@@ -7,7 +7,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_simulations
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, user_code
+from safevar_sumo.study.file import WHOLE_TABLES
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
@@ -74,7 +75,8 @@ def study_to_check(name: str) -> Study:
         If the study or the ADS cannot be loaded.
     """
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
-    return load_study(STUDY_OF_AN_ADS, ads={"model": name}) if is_ads else load_study(name)
+    no_data: dict[str, Any] = dict.fromkeys(WHOLE_TABLES, {})  # about the study's own ADS
+    return load_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else load_study(name)
 
 
 def check(study: Study) -> list[Finding]:
