@@ -199,8 +199,10 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
 def _verdict(results: Results, case: Case, system: System) -> str:
     """How many solutions of a case of the results are unsafe, and how little is enough."""
     names = list(system.characteristics.names)
-    if results.original["collision"] and not system.rater and not system.characteristics.scenario:
-        return "The original vehicle itself collides: no change is needed."
+    original = results.original
+    if original["collision"] and not system.rater and not system.characteristics.scenario:
+        words = ending_in_words(original["outcome"], original[SAFETY_DEGREE], system.contact)
+        return f"The original vehicle itself {words}: no change is needed."
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
         return "No solution."

@@ -17,7 +17,7 @@ from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, comp
 from safevar_sumo.campaign.runs import RunKey, RunResult, algorithm_of, all_runs
 from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.errors import InputError, SimulationError, one_of
-from safevar_sumo.metrics import Scoring
+from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
@@ -97,7 +97,8 @@ def run_campaign(
         warn(f"study {study.name!r}: {no_verdict}")
     original = evaluate_original(task, pool)
     if original.collided[0] and not is_rated(study):
-        warn(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
+        words = Unsafe().breach_in_words(original)
+        warn(f"study {study.name!r}: the original vehicle itself {words}: no change is needed")
     results.begin(original)
     verifies = engine_used is Engine.RECORDED
     shares = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from fnmatch import fnmatch
@@ -12,6 +13,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
+import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, load_runs, read_manifest
@@ -244,3 +246,16 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
     done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"])
     assert done.exit_code == 0, done.exception
     assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
+
+
+@SLOW
+def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
+    Path("late.toml").write_text(
+        'extends = "smoke"\n[weather]\nname = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5\n'
+    )
+    searched = run("study", "late.toml", "--runs", "1", "--evaluations", "10", "--json")
+    speed = sv.simulate("late.toml").collision_speed
+    assert speed > 1
+    sentence = f"he original vehicle itself collides at {speed:.2f} m/s: no change is needed"
+    assert f"t{sentence}" in searched.stderr
+    assert json.loads(searched.stdout)["verdict"].startswith(f"T{sentence}.")

@@ -75,7 +75,7 @@ def study_to_check(name: str) -> Study:
         If the study or the ADS cannot be loaded.
     """
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
-    no_data: dict[str, Any] = dict.fromkeys(WHOLE_TABLES, {})  # about the study's own ADS
+    no_data: dict[str, Any] = {key: {} for key in WHOLE_TABLES}  # about the study's own ADS
     return load_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else load_study(name)
 
 
